@@ -1,0 +1,1 @@
+"""Everything that decides: evolution, dispatch, journal, status. Never torch, never a simulator."""

@@ -1,0 +1,1 @@
+"""Everything that computes: tasks, world model, rollouts, training."""
