@@ -1,0 +1,106 @@
+"""The evolved controller: its shape, how a flat vector packs it, and the formula in NumPy.
+
+A single linear layer (Ha & Schmidhuber 2018, section 2.3): a = W [z; h] + b, squashed to CarRacing's ranges.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import ControllerError
+from common.files import write_aside
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class ControllerShape:
+    """What a flat parameter vector means: a linear map from `features` inputs to `actions` outputs, with bias."""
+
+    features: int
+    actions: int = 3
+
+    @property
+    def size(self) -> int:
+        """Length of the flat vector: the weights row by row, then the biases."""
+        return self.actions * (self.features + 1)
+
+    def unpack(self, parameters: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Split `(..., size)` into weights `(..., actions, features)` and biases `(..., actions)`."""
+        if parameters.shape[-1] != self.size:
+            raise ControllerError(
+                f"a controller of {parameters.shape[-1]} parameters does not fit: this world model needs {self.size} "
+                f"({self.actions} actions x ({self.features} features + 1 bias))"
+            )
+        split = self.actions * self.features
+        weights = parameters[..., :split].reshape(*parameters.shape[:-1], self.actions, self.features)
+        return weights, parameters[..., split:]
+
+
+def act(
+    shape: ControllerShape, parameters: NDArray[np.float32], features: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Steering in [-1, 1], gas in [0, 1], brake in [0, 1] for features `(features,)`; the reference for the ONNX graph.
+
+    Source: hardmaru/WorldModelsExperiments, carracing: tanh; gas (tanh + 1) / 2; brake clip(tanh, 0, 1).
+    """
+    weights, biases = shape.unpack(parameters)
+    squashed = np.tanh(weights @ features + biases)
+    steer, gas, brake = squashed
+    return np.array([steer, (gas + 1) / 2, np.clip(brake, 0, 1)], dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Controller:
+    """Parameters `(size,)` float32, and for which task and world model they were evolved."""
+
+    shape: ControllerShape
+    parameters: NDArray[np.float32]
+    task: str
+    bundle: str  # SHA-256 of the bundle's file, hexadecimal
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.parameters.shape != (self.shape.size,) or self.parameters.dtype != np.float32:
+            raise ControllerError(
+                f"a controller needs {self.shape.size} float32 parameters, "
+                f"not {self.parameters.dtype} of shape {self.parameters.shape}"
+            )
+        if not np.isfinite(self.parameters).all():
+            raise ControllerError("a controller's parameters must be finite; this one holds NaN or infinity")
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the parameters' little-endian bytes."""
+        return hashlib.sha256(self.parameters.astype("<f4").tobytes()).hexdigest()
+
+    def save(self, path: Path) -> None:
+        """Write an `.npz` that `load` reads; whole or not at all."""
+        about = {"format": FORMAT, "shape": asdict(self.shape), "task": self.task, "bundle": self.bundle}
+        text = json.dumps({**about, "provenance": self.provenance}, sort_keys=True)
+        with write_aside(path) as file:
+            np.savez(file, parameters=self.parameters, about=np.array(text))
+
+    @classmethod
+    def load(cls, path: Path) -> Controller:
+        """Read a controller file; `ControllerError` says what is wrong with it."""
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                about = json.loads(str(archive["about"]))
+                parameters = archive["parameters"]
+            if about["format"] != FORMAT:
+                raise ControllerError(f"{path} has controller format {about['format']}; this version reads {FORMAT}")
+            shape = ControllerShape(**about["shape"])
+            return cls(shape, parameters, str(about["task"]), str(about["bundle"]), dict(about["provenance"]))
+        except FileNotFoundError:
+            raise ControllerError(f"no controller at {path}") from None
+        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+            raise ControllerError(f"{path} is not a controller file: {error}") from error

@@ -1,0 +1,43 @@
+"""The errors that people see: each text says what happened and what to do about it."""
+
+from __future__ import annotations
+
+
+class DreamfleetError(Exception):
+    """An expected failure; the command line prints its text as one line and exits with `exit_code`."""
+
+    exit_code = 1
+
+
+class UsageError(DreamfleetError):
+    """What the user asked for is not well formed: a flag, a configuration key, a name, a preset."""
+
+    exit_code = 2
+
+
+class BundleError(DreamfleetError):
+    """A world-model bundle is missing, damaged, or not the one that was named."""
+
+
+class ControllerError(DreamfleetError):
+    """A controller file is damaged or does not fit the task or the bundle."""
+
+
+class DatasetError(DreamfleetError):
+    """A folder of recorded episodes is empty, damaged or of another shape."""
+
+
+class JournalError(DreamfleetError):
+    """A run's journal is missing, foreign, damaged, locked or cannot be written."""
+
+
+class ConnectionFailedError(DreamfleetError):
+    """Nobody answered over Zenoh, or the address cannot be listened on."""
+
+
+class RefusedError(DreamfleetError):
+    """The other side answered, and said no."""
+
+
+class MissingExtraError(DreamfleetError):
+    """A verb needs packages of an extra that is not installed."""

@@ -1,0 +1,42 @@
+"""Which hosts give equal bits: CPU feature class, libc, and the versions of the packages that compute a fitness.
+
+Nothing guarantees equal bits across instruction sets or versions, so a run admits one fingerprint unless told otherwise.
+"""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+NUMERIC_PACKAGES = ("numpy", "onnxruntime", "gymnasium", "pygame-ce", "box2d", "box2d-py")
+# The instruction sets that the inference kernels choose between at run time.
+CPU_FEATURES = ("sse4_1", "avx", "avx2", "fma", "f16c", "avx512f", "avx512bw", "avx512vl", "avx512_vnni", "avx512_bf16",
+                "avx_vnni", "amx_tile", "asimd", "asimddp", "sve", "i8mm", "bf16")  # fmt: skip
+
+
+def package_version(name: str) -> str | None:
+    """Installed version of a distribution, or `None`."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def cpu_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:
+    """The features of `CPU_FEATURES` that this processor announces; empty where it does not say."""
+    try:
+        text = cpuinfo.read_text()
+    except OSError:
+        return ()
+    line = next((line for line in text.splitlines() if line.startswith(("flags", "Features"))), "")
+    present = set(line.split())
+    return tuple(feature for feature in CPU_FEATURES if feature in present)
+
+
+def fingerprint() -> str:
+    """One line that is equal on hosts that are expected to compute equal bits."""
+    libc, libc_version = platform.libc_ver()
+    packages = [f"{name}-{found}" for name in NUMERIC_PACKAGES if (found := package_version(name))]
+    features = "+".join(cpu_features()) or platform.processor() or "unknown"
+    return " ".join([platform.machine(), features, f"{libc or platform.system()}-{libc_version}", *packages])

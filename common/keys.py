@@ -1,0 +1,107 @@
+"""Key expressions of protocol version 1, and the names that may stand in them."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import socket
+
+from common.errors import UsageError
+
+PROTOCOL_VERSION = 1
+ROOT = "dreamfleet"
+_PREFIX = f"{ROOT}/v{PROTOCOL_VERSION}"
+_RUN = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
+_WORKER = re.compile(r"[a-z0-9][a-z0-9.-]{0,62}/[0-9a-f]{8}")
+
+
+def check_run_name(name: str) -> str:
+    """Return `name` if it may name a run, else raise `UsageError`."""
+    if not _RUN.fullmatch(name):
+        raise UsageError(
+            f"{name!r} cannot name a run: use 1 to 63 of a-z, 0-9 and '-', and begin with a letter or a digit"
+        )
+    return name
+
+
+def is_worker(identity: str) -> bool:
+    """Whether `identity` has the form `<name>/<life>`."""
+    return bool(_WORKER.fullmatch(identity))
+
+
+def new_worker(name: str | None = None) -> str:
+    """Identity of a worker process: a name (the host's by default) and 8 random hex digits of this life."""
+    raw = (name or socket.gethostname()).lower()
+    clean = re.sub(r"[^a-z0-9.-]+", "-", raw).strip("-.")[:63] or "worker"
+    return f"{clean}/{secrets.token_hex(4)}"
+
+
+def hello(run: str) -> str:
+    """Where a worker asks to join; frozen for ever, outside the version. `*` asks every live run."""
+    return f"{ROOT}/hello/{run}"
+
+
+def job(run: str, worker: str) -> str:
+    """Coordinator to one worker: numbered batches."""
+    return f"{_PREFIX}/{run}/job/{worker}"
+
+
+def result(run: str, worker: str) -> str:
+    """One worker to the coordinator: finished jobs."""
+    return f"{_PREFIX}/{run}/result/{worker}"
+
+
+def beat(run: str, worker: str) -> str:
+    """One worker to the coordinator: what it holds."""
+    return f"{_PREFIX}/{run}/beat/{worker}"
+
+
+def live_worker(run: str, worker: str) -> str:
+    """Liveliness token of a worker."""
+    return f"{_PREFIX}/{run}/live/worker/{worker}"
+
+
+def live_coordinator(run: str, nonce: str) -> str:
+    """Liveliness token of a coordinator; the nonce makes a second one visible."""
+    return f"{_PREFIX}/{run}/live/coordinator/{nonce}"
+
+
+def status(run: str, part: str = "") -> str:
+    """Read-only JSON for people and tools; `part` is empty, generation, workers, history or best."""
+    return f"{_PREFIX}/{run}/status/{part}" if part else f"{_PREFIX}/{run}/status"
+
+
+def control(run: str, verb: str) -> str:
+    """Where pause, resume, drain and stop are asked for."""
+    return f"{_PREFIX}/{run}/control/{verb}"
+
+
+def bundle(run: str, sha256: str) -> str:
+    """The frozen world model, in parts: parameters `offset` and `length`, in bytes."""
+    return f"{_PREFIX}/{run}/bundle/{sha256}"
+
+
+def upload(run: str, worker: str) -> str:
+    """One worker to the coordinator: what a job made that is larger than a result."""
+    return f"{_PREFIX}/{run}/upload/{worker}"
+
+
+def event_generation(run: str) -> str:
+    """Coordinator to anyone, as each generation ends."""
+    return f"{_PREFIX}/{run}/event/generation"
+
+
+def view(run: str, worker: str) -> str:
+    """One worker to anyone: live frames, only while somebody subscribes."""
+    return f"{_PREFIX}/{run}/view/{worker}"
+
+
+def any_worker(kind: str, run: str) -> str:
+    """Every worker's `result`, `beat`, `upload`, `view` or `live/worker` keys of a run."""
+    return f"{_PREFIX}/{run}/{kind}/*/*"
+
+
+def worker_of(key: str) -> str:
+    """The identity `<name>/<life>`: the last two chunks of a worker's key."""
+    name, life = key.rsplit("/", 2)[-2:]
+    return f"{name}/{life}"

@@ -1,0 +1,283 @@
+"""Every message of protocol version 1, as frozen dataclasses.
+
+The annotations are the schema: `common.codec` derives its checks from them. A message is at most `MAX_MESSAGE` bytes;
+batches split, long vectors and files travel in parts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+MAX_MESSAGE = 48 * 1024
+MAX_PART = 40 * 1024  # room for the envelope around a part's bytes
+MAX_LEASES = 1024  # of one worker: so that a beat, which names them all, stays under MAX_MESSAGE
+TAG_BYTES = 8
+
+
+@dataclass(frozen=True)
+class Between:
+    """Inclusive bounds of a number."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Length:
+    """Inclusive bounds of the length of text (characters), bytes, or a list."""
+
+    low: int
+    high: int
+
+
+Count = Annotated[int, Between(0, 2**63 - 1)]
+Seconds = Annotated[float, Between(0.0, 1e9)]
+Digest = Annotated[bytes, Length(32, 32)]
+Tag = Annotated[bytes, Length(TAG_BYTES, TAG_BYTES)]  # a digest's first bytes, where only a worker's own jobs are told apart
+Word = Annotated[str, Length(1, 128)]
+Text = Annotated[str, Length(0, 2000)]
+Part = Annotated[bytes, Length(0, MAX_PART)]
+Kind = Literal["score", "evaluate", "collect"]
+VerdictWord = Literal["accepted", "duplicate", "obsolete", "refused"]
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """What is scored in, frozen with a run: a fitness is a function of this, the parameters and the seeds alone."""
+
+    task: Word
+    bundle: Annotated[str, Length(64, 64)]  # SHA-256 of the bundle's file, hexadecimal
+    horizon: Annotated[int, Between(1, 10**6)]  # an episode's steps at most, when scored for the strategy
+    patience: Annotated[int, Between(0, 10**6)]  # steps without reward before a scored episode is cut; 0: never
+
+    def digest(self, kind: Kind, vector: bytes, seeds: tuple[int, ...]) -> bytes:
+        """A job's identity: SHA-256 over its kind, this specification, the parameters' hash and the seeds."""
+        text = json.dumps({"kind": kind, "seeds": seeds, "spec": asdict(self)}, sort_keys=True)
+        return hashlib.sha256(vector + text.encode()).digest()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Message:
+    """What every message carries beside the protocol version, which the codec adds."""
+
+    SCHEMA: ClassVar[str]
+
+    run_uid: Annotated[str, Length(32, 32)]
+    incarnation: Count
+
+
+@dataclass(frozen=True)
+class VectorPart:
+    """Part of a vector: little-endian bytes from `offset` of the array of `dtype` and `shape` whose hash is `id`."""
+
+    id: Digest
+    dtype: Literal["<f4", "<f8"]
+    shape: Annotated[tuple[Count, ...], Length(1, 4)]
+    offset: Count
+    data: Part
+
+
+@dataclass(frozen=True)
+class Job:
+    """Candidate x episode, the unit of dispatch."""
+
+    kind: Kind
+    task: Word
+    generation: Count
+    candidate: Count
+    episode: Count
+    seeds: Annotated[tuple[Count, ...], Length(1, 64)]
+    vector: Digest
+    digest: Digest
+    stall: Seconds  # no step for so long: hung
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a result; any verdict ends its repetition."""
+
+    digest: Digest
+    verdict: VerdictWord
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobBatch(Message):
+    """Coordinator to one worker; numbers count from 1 without a gap for one worker's life and one coordinator's."""
+
+    SCHEMA: ClassVar[str] = "job"
+
+    nonce: Word
+    number: Count
+    vectors: tuple[VectorPart, ...]
+    jobs: tuple[Job, ...]
+    cancels: tuple[Digest, ...]
+    verdicts: tuple[Verdict, ...]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished job: a fitness, or the error that kept it from one; a collected rollout names its upload."""
+
+    digest: Digest
+    fitness: float | None
+    steps: Count
+    seconds: Seconds
+    error: Text | None
+    upload: Digest | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultBatch(Message):
+    """One worker to the coordinator; repeated until each result has its verdict."""
+
+    SCHEMA: ClassVar[str] = "result"
+
+    fingerprint: Text
+    results: tuple[Result, ...]
+
+
+@dataclass(frozen=True)
+class Running:
+    """A job in a slot's hands, and how many environment steps it has made."""
+
+    tag: Tag
+    steps: Count
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beat(Message):
+    """One worker to the coordinator, at its interval: what it holds."""
+
+    SCHEMA: ClassVar[str] = "beat"
+
+    nonce: Word
+    seen: Count  # every batch up to this number has arrived
+    capacity: Annotated[int, Between(0, MAX_LEASES)]  # slots x the task's width
+    slots: Annotated[int, Between(0, 4096)]
+    queued: Annotated[tuple[Tag, ...], Length(0, MAX_LEASES)]
+    running: Annotated[tuple[Running, ...], Length(0, MAX_LEASES)]
+    unacked: Annotated[tuple[Tag, ...], Length(0, MAX_LEASES)]  # oldest first
+    load: Annotated[float, Between(0.0, 1e6)]  # the host's, over one minute
+    steps_per_second: Annotated[float, Between(0.0, 1e9)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundlePart(Message):
+    """Bytes from `offset` of a bundle of `total` bytes."""
+
+    SCHEMA: ClassVar[str] = "bundle"
+
+    sha256: Digest
+    offset: Count
+    total: Count
+    data: Part
+
+
+@dataclass(frozen=True, kw_only=True)
+class UploadPart(Message):
+    """Bytes from `offset` of what the job `digest` made; `sha256` is of all `total` bytes."""
+
+    SCHEMA: ClassVar[str] = "upload"
+
+    digest: Digest
+    sha256: Digest
+    offset: Count
+    total: Count
+    data: Part
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewFrame(Message):
+    """What a slot sees: a `height x width x 3` picture of 8-bit values, row by row."""
+
+    SCHEMA: ClassVar[str] = "view"
+
+    slot: Count
+    tag: Tag
+    step: Count
+    reward: float
+    height: Annotated[int, Between(1, 256)]
+    width: Annotated[int, Between(1, 256)]
+    picture: Part
+
+
+@dataclass(frozen=True)
+class HelloRequest:
+    """A worker asks to join (JSON, frozen for ever: later versions may only ignore or add optional fields)."""
+
+    SCHEMA: ClassVar[str] = "hello-request"
+
+    protocol_min: Count
+    protocol_max: Count
+    package: Word
+    worker: Word
+    tasks: Annotated[tuple[Word, ...], Length(0, 256)]
+    fingerprint: Text
+    slots: Count
+
+
+@dataclass(frozen=True)
+class HelloReply:
+    """The coordinator's answer (JSON, frozen for ever): accepted, or refused with the reason and the remedy."""
+
+    SCHEMA: ClassVar[str] = "hello-reply"
+
+    accepted: bool
+    protocol_min: Count
+    protocol_max: Count
+    package: Word
+    run: Word
+    run_uid: Word
+    incarnation: Count
+    nonce: Word
+    why: Text
+    remedy: Text
+    spec: dict[str, Any]
+    intervals: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """How often a worker beats and repeats, in seconds; part of the accepting answer."""
+
+    beat: Annotated[float, Between(0.05, 60.0)] = 1.0
+    repeat: Annotated[float, Between(0.05, 60.0)] = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class GenerationEvent:
+    """Coordinator to anyone (JSON), as a generation ends; fitness statistics are over its candidates."""
+
+    SCHEMA: ClassVar[str] = "generation-event"
+
+    v: Count
+    run: Word
+    run_uid: Word
+    incarnation: Count
+    generation: Count
+    mean: float
+    std: float
+    best: float
+    worst: float
+    sigma: float
+    seconds: Seconds
+    environment_steps: Count
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlReply:
+    """Answer to a control verb (JSON)."""
+
+    SCHEMA: ClassVar[str] = "control-reply"
+
+    v: Count
+    run: Word
+    accepted: bool
+    why: Text
+
+
+WIRE: tuple[type[Message], ...] = (JobBatch, ResultBatch, Beat, BundlePart, UploadPart, ViewFrame)
+"""The messages in msgpack; the others are JSON."""

@@ -1,0 +1,28 @@
+"""Who owns which episode seed, so that no controller is judged on a track that it was chosen on.
+
+0-9999 belong to nobody; 10000-19999 test; 20000-999999 validation; training from 2**20 up.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+TEST = range(10_000, 20_000)
+VALIDATION = range(20_000, 1_000_000)
+TRAINING_FIRST = 2**20
+TRAINING_LAST = 2**53 - 1  # a JSON number keeps every one of them
+
+
+def training_seed(run_seed: int, generation: int, episode: int) -> int:
+    """Seed of one training episode: all candidates of a generation share it, no two generations do.
+
+    A hash rather than a sum, so that runs with neighbouring seeds share no track.
+    """
+    text = f"dreamfleet training {run_seed} {generation} {episode}"
+    number = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")
+    return TRAINING_FIRST + number % (TRAINING_LAST - TRAINING_FIRST + 1)
+
+
+def validation_seeds(episodes: int) -> tuple[int, ...]:
+    """The first `episodes` validation seeds: the same tracks at every evaluation, so that its curve is comparable."""
+    return tuple(VALIDATION[:episodes])

@@ -1,0 +1,98 @@
+import numpy as np
+import pytest
+
+from common.errors import JournalError, UsageError
+from coordinator import cma_state
+from coordinator.evolution import Evolution, EvolutionConfig
+
+
+def config(**changes):
+    settings = {"dimension": 12, "population": 8, "sigma0": 0.1, "covariance": "diagonal", "seed": 3}
+    return EvolutionConfig(**{**settings, **changes})
+
+
+def noisy_sphere(candidates, generation):
+    noise = np.random.default_rng(generation).normal(size=len(candidates))
+    return -((candidates - 1.0) ** 2).sum(axis=1) + 0.1 * noise
+
+
+def run(evolution, generations):
+    for generation in generations:
+        evolution.tell(noisy_sphere(evolution.ask(), generation))
+
+
+@pytest.mark.parametrize("covariance", ["diagonal", "full"])
+@pytest.mark.parametrize("checkpoint", [0, 1, 7, 40])
+def test_a_continued_strategy_equals_one_that_never_stopped(covariance, checkpoint):
+    uninterrupted = Evolution(config(covariance=covariance))
+    run(uninterrupted, range(60))
+
+    first = Evolution(config(covariance=covariance))
+    run(first, range(checkpoint))
+    second = Evolution(config(covariance=covariance))
+    second.restore(first.state())
+    run(second, range(checkpoint, 60))
+
+    assert np.array_equal(second.mean, uninterrupted.mean)
+    assert second.sigma == uninterrupted.sigma
+    assert np.array_equal(second.ask(), uninterrupted.ask())
+
+
+def test_a_checkpoint_continues_at_the_real_size():
+    uninterrupted, first = (Evolution(config(dimension=867, population=16)) for _ in range(2))
+    run(uninterrupted, range(10))
+    run(first, range(5))
+    second = Evolution(config(dimension=867, population=16))
+    second.restore(first.state())
+    run(second, range(5, 10))
+    assert np.array_equal(second.mean, uninterrupted.mean)
+
+
+def test_the_state_is_arrays_and_reading_it_needs_no_pickle():
+    evolution = Evolution(config())
+    run(evolution, range(3))
+    assert all(array.dtype != object for array in cma_state.unpack(evolution.state()).values())
+
+
+def test_asking_again_from_a_state_gives_the_same_population():
+    evolution = Evolution(config())
+    run(evolution, range(3))
+    state = evolution.state()
+    asked = evolution.ask()
+    other = Evolution(config())
+    other.restore(state)
+    assert np.array_equal(other.ask(), asked)
+
+
+def test_it_maximises():
+    evolution = Evolution(config())
+    run(evolution, range(200))
+    assert np.abs(evolution.mean - 1).max() < 0.3
+
+
+def test_the_seed_makes_the_run():
+    one, same, other = Evolution(config()), Evolution(config()), Evolution(config(seed=4))
+    assert np.array_equal(one.ask(), same.ask())
+    assert not np.array_equal(one.ask(), other.ask())
+
+
+@pytest.mark.parametrize("fitness", [np.full(8, np.nan), np.zeros(7)])
+def test_tell_refuses_what_pycma_would_swallow(fitness):
+    evolution = Evolution(config())
+    evolution.ask()
+    with pytest.raises(ValueError, match="finite"):
+        evolution.tell(fitness)
+
+
+def test_a_state_of_another_pycma_is_refused_with_the_remedy():
+    evolution = Evolution(config())
+    arrays = cma_state.unpack(evolution.state())
+    arrays["cma"] = np.array("3.2.1")
+    with pytest.raises(JournalError, match=r"pip install cma==3\.2\.1"):
+        evolution.restore(cma_state.pack(arrays))
+
+
+@pytest.mark.parametrize("changes", [{"population": 1}, {"sigma0": 0.0}, {"sigma0": float("nan")}])
+def test_impossible_settings_are_refused(changes):
+    with pytest.raises(UsageError):
+        config(**changes)
