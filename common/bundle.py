@@ -1,0 +1,170 @@
+"""The frozen world model as one content-addressed file: a manifest and its parts in a stored zip.
+
+The file's SHA-256 is its identity. Equal parts give equal files: entries are sorted, uncompressed, without a date.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any
+
+from common.codec import MalformedError, from_plain
+from common.controller import ControllerShape
+from common.errors import BundleError
+from common.files import write_aside
+from common.messages import Between, Word
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+ENCODER, DECODER, POLICY, INITIAL = "encoder.onnx", "decoder.onnx", "policy.onnx", "initial_latents.npy"
+WEIGHTS = "weights.safetensors"  # only in bundles that training goes on from
+REQUIRED = (ENCODER, DECODER, POLICY, INITIAL)
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+_MAX_MANIFEST = 1_000_000
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a bundle is: its shapes, task and preprocessing, the hash of each part, and where it comes from."""
+
+    name: Word
+    task: Word
+    preprocessing: Word
+    picture: tuple[int, ...]  # height, width, channels of what the encoder takes, 8-bit
+    latent: Annotated[int, Between(1, 10_000)]
+    hidden: Annotated[int, Between(1, 100_000)]
+    actions: Annotated[int, Between(1, 1000)]
+    parts: dict[str, Any] = field(default_factory=dict)  # name -> SHA-256; filled in as the bundle is written
+    provenance: dict[str, Any] = field(default_factory=dict)
+    format: int = FORMAT
+
+
+class Bundle:
+    """A verified bundle."""
+
+    def __init__(self, path: Path, sha256: str, manifest: Manifest) -> None:
+        self.path = path
+        self.sha256 = sha256
+        self.manifest = manifest
+
+    @classmethod
+    def open(cls, path: Path) -> Bundle:
+        """Verify a bundle whole: archive, manifest, each part's hash; `BundleError` says what is wrong."""
+        try:
+            sha256 = hash_file(path)
+            with zipfile.ZipFile(path) as archive:
+                manifest = _read_manifest(archive, path)
+                for name in {*REQUIRED, *manifest.parts}:
+                    if hashlib.sha256(archive.read(name)).hexdigest() != manifest.parts.get(name):
+                        raise BundleError(f"{path}: part {name} is damaged; fetch or build the bundle again")
+        except FileNotFoundError:
+            raise BundleError(f"no bundle at {path}") from None
+        except (OSError, zipfile.BadZipFile, KeyError, EOFError, NotImplementedError) as error:
+            raise BundleError(f"{path} is not a whole bundle ({error}); fetch or build it again") from error
+        return cls(path, sha256, manifest)
+
+    @property
+    def controller_shape(self) -> ControllerShape:
+        """What a linear controller on latent and hidden state looks like."""
+        return ControllerShape(self.manifest.latent + self.manifest.hidden, self.manifest.actions)
+
+    def read(self, name: str) -> bytes:
+        """One part's bytes; `BundleError` if the bundle has no such part."""
+        if name not in self.manifest.parts:
+            raise BundleError(f"{self.path} holds no {name}")
+        with zipfile.ZipFile(self.path) as archive:
+            return archive.read(name)
+
+
+def write_bundle(path: Path, manifest: Manifest, parts: Mapping[str, bytes]) -> Bundle:
+    """Write a bundle whole or not at all, and open it."""
+    hashes = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(parts.items())}
+    text = json.dumps({**asdict(manifest), "parts": hashes}, indent=1, sort_keys=True)
+    with write_aside(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in [(MANIFEST, text.encode()), *sorted(parts.items())]:
+            archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+    return Bundle.open(path)
+
+
+class BundleStore:
+    """Bundles by hash in a cache folder; what ships with the package is found too."""
+
+    def __init__(self, root: Path) -> None:
+        self._folder = root / "bundles"
+
+    def find(self, sha256: str) -> Bundle | None:
+        """The verified bundle of this hash; a damaged cached copy is removed, so that it is fetched again."""
+        for path in (self._path(sha256), *shipped_bundles().values()):
+            if path.exists() and hash_file(path) == sha256:
+                return Bundle.open(path)
+        self._path(sha256).unlink(missing_ok=True)
+        return None
+
+    def partial(self, sha256: str) -> Path:
+        """Where a download of this bundle grows; what is there already is its beginning."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        return self._folder / f"{sha256}.part"
+
+    def complete(self, sha256: str) -> Bundle:
+        """Verify a finished download and give it its name; a wrong one is removed."""
+        partial = self.partial(sha256)
+        if (found := hash_file(partial)) != sha256:
+            partial.unlink()
+            raise BundleError(f"the bundle arrived damaged: its hash is {found[:12]}..., not {sha256[:12]}...; try again")
+        partial.replace(self._path(sha256))
+        return Bundle.open(self._path(sha256))
+
+    def _path(self, sha256: str) -> Path:
+        return self._folder / f"{sha256}.zip"
+
+
+def default_cache() -> Path:
+    """`$DREAMFLEET_CACHE`, else `dreamfleet` in the user's cache folder."""
+    given = os.environ.get("DREAMFLEET_CACHE")
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(given) if given else Path(base) / "dreamfleet"
+
+
+def pretrained() -> Path:
+    """The folder of what ships: bundles as `NAME.zip`, controllers as `NAME.npz`."""
+    return Path(str(files("common"))) / "pretrained"
+
+
+def shipped_bundles() -> dict[str, Path]:
+    """The bundles that ship, by name."""
+    return {path.stem: path for path in sorted(pretrained().glob("*.zip"))}
+
+
+def find_bundle(name: str) -> Bundle:
+    """A shipped bundle by name, or any by path."""
+    shipped = shipped_bundles()
+    if name in shipped:
+        return Bundle.open(shipped[name])
+    if not Path(name).exists():
+        raise BundleError(f"no bundle {name!r}: give a file, or one that ships: {', '.join(shipped) or 'none'}")
+    return Bundle.open(Path(name))
+
+
+def hash_file(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _read_manifest(archive: zipfile.ZipFile, path: Path) -> Manifest:
+    if archive.getinfo(MANIFEST).file_size > _MAX_MANIFEST:
+        raise BundleError(f"{path}: the manifest is too large to be one")
+    try:
+        plain = json.loads(archive.read(MANIFEST))
+        if plain["format"] != FORMAT:
+            raise BundleError(f"{path} has bundle format {plain['format']}; this version reads {FORMAT}")
+        return from_plain(Manifest, plain)
+    except (ValueError, TypeError, MalformedError) as error:
+        raise BundleError(f"{path}: the manifest cannot be read ({error})") from error

@@ -1,0 +1,89 @@
+"""Checks of an installation, each with its remedy."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from common.bundle import Bundle, default_cache, shipped_bundles
+from common.errors import DreamfleetError
+from common.fingerprint import package_version
+from common.runs import default_runs_dir
+
+# distribution -> (module, extra); the empty extra is what every role needs
+PACKAGES = {
+    "eclipse-zenoh": ("zenoh", ""),
+    "msgpack": ("msgpack", ""),
+    "numpy": ("numpy", ""),
+    "cma": ("cma", ""),
+    "gymnasium": ("gymnasium", "worker"),
+    "pygame-ce": ("pygame", "worker"),
+    "box2d": ("Box2D", "worker"),
+    "onnxruntime": ("onnxruntime", "worker"),
+    "av": ("av", "views"),
+    "matplotlib": ("matplotlib", "views"),
+    "torch": ("torch", "train"),
+    "onnx": ("onnx", "train"),
+    "safetensors": ("safetensors", "train"),
+}
+LEAST_FREE_BYTES = 200_000_000
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check: what was found, which role needs it, and what to do if it is not there."""
+
+    name: str
+    ok: bool
+    needed: bool
+    found: str
+    role: str
+    remedy: str
+
+
+def examine() -> list[Finding]:
+    """Every check."""
+    return [*_packages(), _one_box2d(), *_bundles(), _writable("cache", default_cache()),
+            _writable("runs", default_runs_dir())]  # fmt: skip
+
+
+def _packages() -> Iterator[Finding]:
+    for name, (module, extra) in PACKAGES.items():
+        found = package_version(name) or (package_version("box2d-py") if name == "box2d" else None)
+        remedy = f"pip install 'dreamfleet[{extra}]'" if extra else "pip install dreamfleet"
+        ok = found is not None and find_spec(module) is not None
+        yield Finding(name, ok, not extra, found or "-", extra or "everything", remedy)
+
+
+def _one_box2d() -> Finding:
+    both = package_version("box2d") and package_version("box2d-py")
+    remedy = "pip uninstall box2d box2d-py, then pip install 'dreamfleet[worker]': both own the module Box2D"
+    return Finding("one Box2D", not both, True, "both box2d and box2d-py" if both else "ok", "worker", remedy)
+
+
+def _bundles() -> Iterator[Finding]:
+    paths = shipped_bundles()
+    for name, path in paths.items():
+        try:
+            found, ok = Bundle.open(path).sha256[:12], True
+        except DreamfleetError as error:
+            found, ok = str(error), False
+        yield Finding(f"bundle {name}", ok, True, found, "world model", "reinstall dreamfleet")
+    if not paths:
+        yield Finding("bundle", False, True, "none shipped", "world model", "reinstall dreamfleet")
+
+
+def _writable(name: str, path: Path) -> Finding:
+    """Whether a folder, or the nearest parent that exists, can be written and has room."""
+    where = next(each for each in (path, *path.absolute().parents) if each.exists())
+    remedy = f"make {where} writable, or point $DREAMFLEET_{'CACHE' if name == 'cache' else 'RUNS_DIR'} elsewhere"
+    try:
+        with tempfile.TemporaryFile(dir=where):
+            free = shutil.disk_usage(where).free
+    except OSError as error:
+        return Finding(f"{name} folder", False, True, f"{path}: {error.strerror}", "everything", remedy)
+    return Finding(f"{name} folder", free > LEAST_FREE_BYTES, True, f"{path}, {free / 1e9:.1f} GB free", "everything", remedy)

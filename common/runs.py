@@ -1,0 +1,245 @@
+"""Runs on disk: one folder a run, its journal read-only, and the list of them. Only the coordinator writes."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common import schema
+from common.codec import MalformedError, from_plain
+from common.controller import ControllerShape
+from common.errors import JournalError, UsageError
+from common.keys import check_run_name
+from common.messages import Between, Count, TaskSpec
+
+JOURNAL = "journal.sqlite"
+BUNDLE = "bundle.zip"
+CONTROLLER = "controller.npz"
+ARCHIVE = "archive"
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What is frozen with a run; a change asks for another run."""
+
+    task: TaskSpec
+    controller: ControllerShape
+    population: Annotated[int, Between(2, 10**5)]
+    episodes: Annotated[int, Between(1, 10**4)]
+    sigma0: float
+    covariance: Literal["diagonal", "full"]
+    seed: Count
+    evaluate_every: Count  # generations; 0: never
+    evaluation_episodes: Annotated[int, Between(1, 10**4)]
+
+    def to_json(self) -> str:
+        """The text kept in the journal."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> RunSettings:
+        """Read what `to_json` wrote; `JournalError` if it is damaged."""
+        try:
+            return from_plain(cls, json.loads(text))
+        except (ValueError, MalformedError) as error:
+            raise JournalError(f"the journal's settings are damaged: {error}") from error
+
+
+@dataclass(frozen=True)
+class StoredResult:
+    """One accepted result."""
+
+    kind: str
+    generation: int
+    candidate: int
+    episode: int
+    seed: int
+    fitness: float
+    steps: int
+    seconds: float
+    worker: str
+    fingerprint: str
+
+
+@dataclass(frozen=True)
+class StoredGeneration:
+    """Statistics of a closed generation over its candidates' fitness."""
+
+    number: int
+    mean: float
+    std: float
+    best: float
+    worst: float
+    sigma: float
+    steps: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class StoredEvaluation:
+    """A finished evaluation of a generation's mean on validation tracks."""
+
+    generation: int
+    episodes: int
+    mean: float
+    std: float
+
+
+class RunFolder:
+    """A run's folder, read-only; close it, or use it in a `with`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.name = path.name
+        self._connection = _connect_read_only(path / JOURNAL)
+
+    def __enter__(self) -> RunFolder:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the journal."""
+        self._connection.close()
+
+    @property
+    def settings(self) -> RunSettings:
+        """What is frozen with the run."""
+        return RunSettings.from_json(self._fact("settings") or "")
+
+    @property
+    def spec(self) -> TaskSpec:
+        """What is scored in."""
+        return self.settings.task
+
+    @property
+    def uid(self) -> str:
+        """The random identity of the run."""
+        return self._fact("uid") or ""
+
+    @property
+    def created(self) -> str:
+        """When the run began, ISO 8601, UTC."""
+        return self._fact("created") or ""
+
+    @property
+    def fingerprint(self) -> str | None:
+        """The fingerprint that the run admits; `None` before its first worker."""
+        return self._fact("fingerprint")
+
+    @property
+    def ended(self) -> str | None:
+        """Why the run ended, or `None` if it did not."""
+        return self._fact("ended")
+
+    @property
+    def bundle_path(self) -> Path:
+        """The run's own copy of its world model."""
+        return self.path / BUNDLE
+
+    @property
+    def controller_path(self) -> Path:
+        """The reported controller; there once the run ended."""
+        return self.path / CONTROLLER
+
+    def candidate(self, generation: int, number: int) -> NDArray[np.float32]:
+        """A candidate's parameters `(size,)` as they travelled."""
+        row = self._one("SELECT vector FROM candidate WHERE generation = ? AND number = ?", generation, number)
+        if row is None:
+            raise JournalError(f"run {self.name} has no candidate {generation}/{number}")
+        return np.frombuffer(row[0], dtype="<f4").astype(np.float32)
+
+    def fitness(self, generation: int, number: int) -> float | None:
+        """What the strategy was told of a candidate; `None` while its generation is open."""
+        row = self._one("SELECT fitness FROM candidate WHERE generation = ? AND number = ?", generation, number)
+        return None if row is None else row[0]
+
+    def results(self, generation: int, number: int, kind: str = "score") -> list[StoredResult]:
+        """A candidate's accepted results, by episode."""
+        query = f"SELECT {_RESULT} FROM result WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"  # noqa: S608
+        return [StoredResult(*row) for row in self._all(query, kind, generation, number)]
+
+    def history(self) -> list[StoredGeneration]:
+        """Every closed generation, oldest first."""
+        query = "SELECT number, mean, std, best, worst, sigma, steps, seconds FROM generation WHERE closed IS NOT NULL"
+        return [StoredGeneration(*row) for row in self._all(query + " ORDER BY number")]
+
+    def evaluations(self) -> list[StoredEvaluation]:
+        """Every finished evaluation of a mean, oldest first."""
+        query = "SELECT generation, episodes, mean, std FROM evaluation WHERE mean IS NOT NULL ORDER BY generation"
+        return [StoredEvaluation(*row) for row in self._all(query)]
+
+    def _fact(self, key: str) -> str | None:
+        row = self._one("SELECT value FROM run WHERE key = ?", key)
+        return None if row is None else str(row[0])
+
+    def _one(self, query: str, *values: Any) -> Any:
+        rows = self._all(query, *values)
+        return rows[0] if rows else None
+
+    def _all(self, query: str, *values: Any) -> list[Any]:
+        try:
+            return self._connection.execute(query, values).fetchall()
+        except sqlite3.DatabaseError as error:
+            raise JournalError(f"the journal of run {self.name} is damaged: {error}") from error
+
+
+_RESULT = "kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint"
+
+
+def default_runs_dir() -> Path:
+    """Where runs live unless told otherwise: `$DREAMFLEET_RUNS_DIR`, else `runs` here."""
+    return Path(os.environ.get("DREAMFLEET_RUNS_DIR", "runs"))
+
+
+def open_run(runs_dir: Path, name: str) -> RunFolder:
+    """A run by name; `JournalError` names those that exist."""
+    path = runs_dir / check_run_name(name)
+    if not (path / JOURNAL).exists():
+        names = ", ".join(each.name for each in run_paths(runs_dir)) or "none yet"
+        raise JournalError(f"no run {name!r} in {runs_dir}; there are: {names}")
+    return RunFolder(path)
+
+
+def run_paths(runs_dir: Path) -> Iterator[Path]:
+    """The folders of all runs, by name."""
+    for journal in sorted(runs_dir.glob(f"*/{JOURNAL}")):
+        yield journal.parent
+
+
+def _connect_read_only(path: Path) -> sqlite3.Connection:
+    # A finished journal on a read-only disk has no shared-memory file to map; nobody writes it either.
+    immutable = "" if os.access(path.parent, os.W_OK) else "&immutable=1"
+    try:
+        connection = sqlite3.connect(f"file:{path.absolute()}?mode=ro{immutable}", uri=True)
+        schema.check(connection, path)
+    except sqlite3.Error as error:
+        raise JournalError(f"{path} cannot be read: {error}") from error
+    return connection
+
+
+@contextmanager
+def run_lock(path: Path) -> Iterator[None]:
+    """Hold a run's folder: whoever writes in it, moves it or deletes it does so alone."""
+    import fcntl
+
+    try:
+        file = (path / "lock").open("w")
+    except OSError as error:
+        raise JournalError(f"cannot write in {path}: {error.strerror}; choose another --runs-dir") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UsageError(f"run {path.name} is held by a live coordinator; stop it first") from None
+        yield

@@ -1,0 +1,88 @@
+"""What a run is, when it stops, and where it is reached: the coordinator's configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from common.bundle import Bundle
+from common.config import option
+from common.errors import UsageError
+from common.messages import TaskSpec
+from common.runs import RunSettings
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What is frozen with a run."""
+
+    task: str = option("car-racing", "what candidates are scored in; a worker must know it")
+    bundle: str = option("tiny", "the frozen world model: a shipped name or a file")
+    population: int = option(32, "candidates a generation")
+    episodes: int = option(2, "episodes a candidate, on the same fresh tracks for all")
+    sigma0: float = option(0.1, "first step size")
+    covariance: Literal["diagonal", "full"] = option("diagonal", "the model of CMA-ES")
+    horizon: int = option(1000, "steps of a scored episode at most")
+    patience: int = option(0, "cut a scored episode after so many steps without reward; 0: never")
+    seed: int = option(1, "makes the run: population and tracks follow from it")
+    evaluate_every: int = option(25, "evaluate the mean every so many generations; 0: never")
+    evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation tracks")
+
+    def __post_init__(self) -> None:
+        bounds = {"population": 2, "episodes": 1, "horizon": 1, "patience": 0, "seed": 0, "evaluate_every": 0}
+        for name, least in {**bounds, "evaluation_episodes": 1}.items():
+            if getattr(self, name) < least:
+                raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
+        if not 0 < self.sigma0 < float("inf"):
+            raise UsageError(f"--sigma0 must be a positive number, not {self.sigma0}")
+
+    def settings(self, bundle: Bundle) -> RunSettings:
+        """What the journal keeps: the bundle by its hash."""
+        return RunSettings(
+            task=TaskSpec(self.task, bundle.sha256, self.horizon, self.patience),
+            controller=bundle.controller_shape,
+            population=self.population,
+            episodes=self.episodes,
+            sigma0=self.sigma0,
+            covariance=self.covariance,
+            seed=self.seed,
+            evaluate_every=self.evaluate_every,
+            evaluation_episodes=self.evaluation_episodes,
+        )
+
+
+@dataclass(frozen=True)
+class LimitsConfig:
+    """When a run ends: at the first limit reached; all are checked as a generation ends. 0: no such limit."""
+
+    generations: int = option(0, "stop after so many generations")
+    steps: int = option(0, "stop after so many environment steps")
+    minutes: float = option(0.0, "stop after so many minutes of generations")
+    target: float | None = option(None, "stop when an evaluated mean reaches this score")
+
+    def __post_init__(self) -> None:
+        for name in ("generations", "steps", "minutes"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise UsageError(f"--{name} must not be negative")
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Where the coordinator is reached; an embedded router listens unless it connects to others."""
+
+    listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
+    connect: tuple[str, ...] = option((), "connect to these stand-alone routers")
+    beat: float = option(1.0, "seconds between a worker's beats")
+    mixed: bool = option(False, "admit workers of any fingerprint; gives up replay to the bit")
+
+    def __post_init__(self) -> None:
+        if not 0.05 <= self.beat <= 60:
+            raise UsageError(f"--beat must be from 0.05 to 60 seconds, not {self.beat}")
+
+
+# The paper's own settings, the article's, and what two cores do in minutes.
+PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {"population": 64, "episodes": 16, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 1024},
+    "article": {"population": 32, "episodes": 4, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 100},
+    "frugal": {"population": 32, "episodes": 2, "sigma0": 0.1, "covariance": "diagonal", "patience": 100},
+}

@@ -1,0 +1,51 @@
+"""From a parameter vector and seeds to jobs."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.messages import Job, Kind, TaskSpec
+
+STALL_SECONDS = 30.0
+
+
+@dataclass(frozen=True)
+class Work:
+    """A job and the vector `(size,)` that it scores, as float32 little-endian bytes."""
+
+    job: Job
+    vector: bytes
+
+
+def travelling(vector: NDArray[np.float64]) -> bytes:
+    """A parameter vector as it travels, is scored, hashed and journalled: float32, little-endian."""
+    return vector.astype("<f4").tobytes()
+
+
+def make_work(
+    spec: TaskSpec, kind: Kind, generation: int, candidate: int, vector: bytes, seeds: Sequence[int]
+) -> list[Work]:
+    """One job an episode; `seeds` holds one seed an episode."""
+    identity = hashlib.sha256(vector).digest()
+    return [
+        Work(
+            Job(
+                kind=kind,
+                task=spec.task,
+                generation=generation,
+                candidate=candidate,
+                episode=episode,
+                seeds=(seed,),
+                vector=identity,
+                digest=spec.digest(kind, identity, (seed,)),
+                stall=STALL_SECONDS,
+            ),
+            vector,
+        )
+        for episode, seed in enumerate(seeds)
+    ]

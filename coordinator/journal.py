@@ -1,0 +1,198 @@
+"""The only writer of a run's journal: every result is on disk before it counts."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from time import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common import schema
+from common.errors import DreamfleetError, JournalError
+from common.messages import Job, Result
+from common.runs import BUNDLE, JOURNAL, RunFolder, RunSettings, StoredEvaluation, StoredGeneration
+from coordinator.evaluation import Evaluation
+
+
+@dataclass(frozen=True)
+class OpenGeneration:
+    """A generation that was asked and not yet told: its state before `ask`, its seeds and its population."""
+
+    number: int
+    state: bytes
+    seeds: tuple[int, ...]
+    vectors: tuple[bytes, ...]  # float32, as they travel
+
+
+class Journal:
+    """Writes of one coordinator's life; nothing is durable before `commit`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with _translated(path):
+            self._connection = sqlite3.connect(path, timeout=5)
+            try:
+                schema.migrate(self._connection, schema.check(self._connection, path))
+                self._connection.execute("PRAGMA journal_mode = WAL")
+                self._connection.execute("PRAGMA synchronous = FULL")
+            except BaseException:
+                self._connection.close()
+                raise
+
+    @classmethod
+    def create(cls, folder: Path, settings: RunSettings, bundle: Path) -> Journal:
+        """A new run in `folder`, which holds its own copy of the bundle; whole or not at all."""
+        path = folder / JOURNAL
+        if path.exists():
+            raise JournalError(f"run {folder.name} exists: choose another --run, or continue it with --resume")
+        aside = path.with_suffix(".new")
+        aside.unlink(missing_ok=True)
+        try:
+            shutil.copyfile(bundle, folder / BUNDLE)
+            with _translated(path):
+                connection = sqlite3.connect(aside)
+                schema.migrate(connection, 0)
+                created = datetime.now(UTC).isoformat(timespec="seconds")
+                facts = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": created}
+                connection.executemany("INSERT INTO run VALUES (?, ?)", facts.items())
+                connection.commit()
+                connection.close()
+            aside.replace(path)
+        except OSError as error:
+            raise JournalError(f"cannot write in {folder}: {error.strerror}; choose another --runs-dir") from error
+        return cls(path)
+
+    def close(self) -> None:
+        """Fold the write-ahead log into the journal and release it."""
+        self._connection.close()
+
+    def commit(self) -> None:
+        """Make everything written so far durable."""
+        with _translated(self.path):
+            self._connection.commit()
+
+    def fact(self, key: str) -> str | None:
+        """One of the run's facts, such as `uid` or `fingerprint`."""
+        row = self._execute("SELECT value FROM run WHERE key = ?", key).fetchone()
+        return None if row is None else str(row[0])
+
+    def set_fact(self, key: str, value: str) -> None:
+        """Write one of the run's facts."""
+        self._execute("INSERT OR REPLACE INTO run VALUES (?, ?)", key, value)
+
+    def drop_fact(self, key: str) -> None:
+        """Forget one of the run's facts."""
+        self._execute("DELETE FROM run WHERE key = ?", key)
+
+    def begin_incarnation(self) -> int:
+        """Number of this life of the coordinator, from 1; durable before anything is published."""
+        number = int(self.fact("incarnation") or 0) + 1
+        self.set_fact("incarnation", str(number))
+        self.commit()
+        return number
+
+    def open_generation(
+        self, number: int, state: bytes, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]
+    ) -> None:
+        """Write a population before it travels, and the strategy's state from before it was asked; two states stay."""
+        self._execute(
+            "INSERT INTO generation (number, seeds, opened, sigma) VALUES (?, ?, ?, ?)",
+            number, json.dumps(list(seeds)), time(), sigma,
+        )  # fmt: skip
+        rows = [(number, index, vector) for index, vector in enumerate(vectors)]
+        self._execute_many("INSERT INTO candidate (generation, number, vector) VALUES (?, ?, ?)", rows)
+        self._execute("INSERT INTO strategy VALUES (?, ?)", number, state)
+        self._execute("DELETE FROM strategy WHERE generation < ?", number - 1)
+
+    def close_generation(self, closed: StoredGeneration, fitness: NDArray[np.float64]) -> None:
+        """Write what the strategy is told."""
+        self._execute_many(
+            "UPDATE candidate SET fitness = ? WHERE generation = ? AND number = ?",
+            [(float(value), closed.number, index) for index, value in enumerate(fitness)],
+        )
+        self._execute(
+            "UPDATE generation SET closed = ?, mean = ?, std = ?, best = ?, worst = ?, steps = ?, seconds = ? "
+            "WHERE number = ?",
+            time(), closed.mean, closed.std, closed.best, closed.worst, closed.steps, closed.seconds, closed.number,
+        )  # fmt: skip
+
+    def add_result(self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int) -> None:
+        """Write an accepted result."""
+        self._execute(
+            "INSERT INTO result VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], result.fitness,
+            result.steps, result.seconds, worker, fingerprint, incarnation,
+        )  # fmt: skip
+
+    def schedule_evaluation(self, evaluation: Evaluation) -> None:
+        """Write that the mean of a generation is to be evaluated."""
+        self._execute(
+            "INSERT INTO evaluation (generation, vector, episodes) VALUES (?, ?, ?)",
+            evaluation.generation, evaluation.vector, evaluation.episodes,
+        )  # fmt: skip
+
+    def finish_evaluation(self, generation: int, mean: float, std: float) -> None:
+        """Write what an evaluation gave."""
+        self._execute("UPDATE evaluation SET mean = ?, std = ? WHERE generation = ?", mean, std, generation)
+
+    def last_generation(self) -> OpenGeneration | None:
+        """The generation that was open when the last incarnation ended; `None` in a new run."""
+        row = self._execute(
+            "SELECT number, state, seeds FROM generation JOIN strategy ON number = generation ORDER BY number DESC"
+        ).fetchone()
+        if row is None:
+            return None
+        vectors = self._execute("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", row[0]).fetchall()
+        return OpenGeneration(row[0], row[1], tuple(json.loads(row[2])), tuple(vector for (vector,) in vectors))
+
+    def closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
+        """Every closed generation and finished evaluation, oldest first."""
+        with RunFolder(self.path.parent) as folder:
+            return folder.history(), folder.evaluations()
+
+    def results_of(self, kind: str, generation: int) -> dict[bytes, tuple[float, int]]:
+        """Fitness and steps of a generation's accepted results, by digest."""
+        query = "SELECT digest, fitness, steps FROM result WHERE kind = ? AND generation = ?"
+        return {digest: (fitness, steps) for digest, fitness, steps in self._execute(query, kind, generation)}
+
+    def pending_evaluations(self) -> list[Evaluation]:
+        """Evaluations that were scheduled and not finished, oldest first."""
+        query = "SELECT generation, vector, episodes FROM evaluation WHERE mean IS NULL ORDER BY generation"
+        return [Evaluation(*row) for row in self._execute(query)]
+
+    def best_evaluation(self) -> tuple[int, float, bytes] | None:
+        """(generation, mean, vector) of the best evaluated mean."""
+        query = "SELECT generation, mean, vector FROM evaluation WHERE mean IS NOT NULL ORDER BY mean DESC, generation"
+        row: tuple[int, float, bytes] | None = self._execute(query).fetchone()
+        return row
+
+    def _execute(self, query: str, *values: Any) -> sqlite3.Cursor:
+        with _translated(self.path):
+            return self._connection.execute(query, values)
+
+    def _execute_many(self, query: str, rows: Sequence[tuple[Any, ...]]) -> None:
+        with _translated(self.path):
+            self._connection.executemany(query, rows)
+
+
+@contextmanager
+def _translated(path: Path) -> Iterator[None]:
+    """SQLite's errors as one line that says what to do."""
+    try:
+        yield
+    except DreamfleetError:
+        raise
+    except sqlite3.OperationalError as error:
+        raise JournalError(f"cannot write {path}: {error}; nothing counted that was not written before") from error
+    except sqlite3.DatabaseError as error:
+        raise JournalError(f"{path} is damaged or no journal: {error}; restore it from a copy") from error

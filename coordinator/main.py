@@ -1,0 +1,71 @@
+"""From a request to a served run: the folder, its lock, its journal, the service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+
+from common.bundle import Bundle, find_bundle
+from common.errors import JournalError
+from common.keys import check_run_name
+from common.messages import Intervals
+from common.runs import BUNDLE, RunSettings, open_run, run_lock
+from common.session import Network
+from coordinator.config import LimitsConfig, RunConfig
+from coordinator.fleet import Fleet
+from coordinator.journal import Journal
+from coordinator.run import Run
+from coordinator.service import Service
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What to serve; without `config` the run is continued."""
+
+    name: str
+    runs_dir: Path
+    config: RunConfig | None
+    limits: LimitsConfig
+    network: Network
+    beat: float = 1.0
+    mixed: bool = False
+
+
+def serve_run(
+    request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None
+) -> Run:
+    """Serve a new or continued run until it ends or is stopped; `on_stoppable` is handed the way to stop it."""
+    folder = request.runs_dir / check_run_name(request.name)
+    settings, bundle = _settle(request, folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise JournalError(f"cannot write in {request.runs_dir}: {error.strerror}; choose another --runs-dir") from error
+    with run_lock(folder):
+        if request.config is None:
+            journal = Journal(folder / "journal.sqlite")
+        else:
+            journal = Journal.create(folder, settings, bundle.path)
+        service = Service(
+            request.name, folder, request.network, Intervals(request.beat, request.beat), mixed=request.mixed
+        )
+        on_stoppable(service.stop)
+        try:
+            return service.serve(lambda: Run(journal, settings, request.limits, Fleet(request.beat), monotonic()))
+        finally:
+            journal.close()
+
+
+def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle]:
+    """What the run is, and its verified bundle."""
+    if request.config is not None:
+        bundle = find_bundle(request.config.bundle)
+        return request.config.settings(bundle), bundle
+    with open_run(request.runs_dir, request.name) as stored:
+        settings = stored.settings
+    bundle = Bundle.open(folder / BUNDLE)
+    if bundle.sha256 != settings.task.bundle:
+        raise JournalError(f"{bundle.path} is not the bundle that this run was started with; restore the folder")
+    return settings, bundle

@@ -1,0 +1,262 @@
+"""A run's life: ask, dispatch, journal, tell. Owns the pure parts; knows no transport.
+
+Everything that happens is written before it counts: `advance` commits, and only then may batches leave.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from common.controller import Controller
+from common.errors import JournalError
+from common.messages import HelloRequest, Result, ResultBatch
+from common.runs import CONTROLLER, RunSettings, StoredEvaluation, StoredGeneration
+from common.seeds import training_seed
+from coordinator.config import LimitsConfig
+from coordinator.evaluation import Evaluation
+from coordinator.evolution import Evolution, EvolutionConfig
+from coordinator.fleet import Fleet
+from coordinator.generation import Generation
+from coordinator.jobs import travelling
+from coordinator.journal import Journal
+
+
+@dataclass
+class OpenEvaluation:
+    """An evaluation in progress: scores by digest."""
+
+    evaluation: Evaluation
+    digests: list[bytes]
+    scores: dict[bytes, float]
+
+
+class Run:
+    """One incarnation of a run, new or continued."""
+
+    def __init__(self, journal: Journal, settings: RunSettings, limits: LimitsConfig, fleet: Fleet, now: float) -> None:
+        self.settings = settings
+        self.limits = limits
+        self.fleet = fleet
+        self.history: list[StoredGeneration] = []
+        self.evaluations: list[StoredEvaluation] = []
+        self.ended: str | None = None
+        self.paused: str | None = None
+        self._untold: list[StoredGeneration] = []
+        self._journal = journal
+        self._evaluating: dict[int, OpenEvaluation] = {}
+        self.uid = journal.fact("uid") or ""
+        self.fingerprint = journal.fact("fingerprint")
+        self.incarnation = journal.begin_incarnation()
+        self._evolution = Evolution(
+            EvolutionConfig(
+                settings.controller.size, settings.population, settings.sigma0, settings.covariance, settings.seed
+            )
+        )
+        self.opened = now
+        self.generation = self._begin(now)
+
+    @property
+    def sigma(self) -> float:
+        """The strategy's overall step size."""
+        return self._evolution.sigma
+
+    def refusal(self, request: HelloRequest, mixed: bool) -> tuple[str, str] | None:
+        """Why a worker cannot join and what to do about it; `None` if it may."""
+        task = self.settings.task.task
+        if task not in request.tasks:
+            known = ", ".join(request.tasks) or "none"
+            return f"this run scores in {task!r}, which the worker does not know (it knows: {known})", (
+                "install the package that registers this task on the worker's host"
+            )
+        if mixed or self.fingerprint in (None, request.fingerprint):
+            return None
+        return f"fingerprints differ: the run has [{self.fingerprint}], the worker [{request.fingerprint}]", (
+            "install the same package versions on a host of the same CPU features, or start the coordinator with --mixed"
+        )
+
+    def admit(self, request: HelloRequest, now: float) -> None:
+        """Welcome a worker; the first one's fingerprint becomes the run's."""
+        if self.fingerprint is None:
+            self.fingerprint = request.fingerprint
+            self._journal.set_fact("fingerprint", request.fingerprint)
+        self.fleet.welcome(request.worker, request.slots, request.fingerprint, now)
+
+    def results(self, worker: str, batch: ResultBatch, now: float) -> None:
+        """Judge a worker's results; the first wanted ones are written and counted."""
+        for result in batch.results:
+            _, work = self.fleet.result(worker, result, now)
+            if work is not None:
+                self._journal.add_result(work.job, result, worker, batch.fingerprint, self.incarnation)
+                if work.job.kind == "score":
+                    self._score(result)
+                else:
+                    self._evaluated(work.job.generation, result)
+
+    def advance(self, now: float) -> None:
+        """Close what is complete, open what follows, and make all of it durable."""
+        while self.ended is None and self.paused is None and self.generation.complete and not self.fleet.hurry:
+            self._close(now)
+        poison = self.fleet.poison()
+        if poison is not None and self.paused is None:
+            work, errors = poison
+            reasons = "; ".join(f"{worker}: {error}" for worker, error in errors.items())
+            self.pause(f"candidate {work.job.generation}/{work.job.candidate} failed on two workers ({reasons})")
+        if self.fleet.hurry and not self._evaluating and self.ended is None:
+            self._end(self._stop_reason() or "stopped")
+        self._journal.commit()
+
+    def pause(self, why: str) -> None:
+        """Dispatch nothing more until the run is resumed."""
+        self.paused = why
+        self.fleet.paused = True
+
+    def take_closed(self) -> list[StoredGeneration]:
+        """Generations closed since the last call."""
+        closed, self._untold = self._untold, []
+        return closed
+
+    @property
+    def evaluation_progress(self) -> tuple[int, int]:
+        """Episodes of open evaluations: done, wanted."""
+        open_ones = self._evaluating.values()
+        return sum(len(each.scores) for each in open_ones), sum(len(each.digests) for each in open_ones)
+
+    @property
+    def best(self) -> StoredEvaluation | None:
+        """The best evaluated mean."""
+        return max(self.evaluations, key=lambda each: each.mean, default=None)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of all closed generations."""
+        return sum(each.steps for each in self.history)
+
+    def controller(self) -> Controller:
+        """What the run reports: its best evaluated mean, else the last mean; never the luckiest sample."""
+        best = self._journal.best_evaluation()
+        generation, score, vector = best or (len(self.history) - 1, None, travelling(self._evolution.mean))
+        provenance = {"run_uid": self.uid, "generation": generation, "validation_mean": score}
+        return Controller(
+            self.settings.controller,
+            np.frombuffer(vector, dtype="<f4").astype(np.float32),
+            self.settings.task.task,
+            self.settings.task.bundle,
+            {**provenance, "settings": asdict(self.settings), "steps": self.steps},
+        )
+
+    def _begin(self, now: float) -> Generation:
+        """The first generation of a new run, or the one that was open when the last incarnation ended."""
+        last = self._journal.last_generation()
+        if last is None:
+            return self._open(0, now)
+        self._evolution.restore(last.state)
+        vectors = tuple(travelling(x) for x in self._evolution.ask())
+        if vectors != last.vectors:
+            raise JournalError(
+                f"generation {last.number} cannot be continued: the strategy asks for another population than the "
+                "journal holds; use the host and package versions that wrote it"
+            )
+        self.history, self.evaluations = self._journal.closed()
+        generation = Generation(last.number, self.settings.task, last.vectors, last.seeds)
+        for digest, (fitness, steps) in self._journal.results_of("score", last.number).items():
+            generation.record(digest, fitness, steps)
+        for evaluation in self._journal.pending_evaluations():
+            self._reopen(evaluation)
+        if (reason := self._stop_reason()) is not None and not generation.done:
+            self.fleet.hurry = bool(self._evaluating)
+            self.ended = None if self._evaluating else reason
+        else:
+            self._journal.drop_fact("ended")
+            self.fleet.offer(generation.missing)
+        return generation
+
+    def _open(self, number: int, now: float) -> Generation:
+        state, sigma = self._evolution.state(), self._evolution.sigma
+        vectors = [travelling(x) for x in self._evolution.ask()]
+        seeds = [training_seed(self.settings.seed, number, episode) for episode in range(self.settings.episodes)]
+        self._journal.open_generation(number, state, sigma, seeds, vectors)
+        generation = Generation(number, self.settings.task, vectors, seeds)
+        self.opened = now
+        self.fleet.forget(before=number - 1)
+        self.fleet.offer(generation.missing)
+        return generation
+
+    def _close(self, now: float) -> None:
+        fitness = self.generation.fitness()
+        closed = StoredGeneration(
+            number=self.generation.number,
+            mean=float(fitness.mean()),
+            std=float(fitness.std()),
+            best=float(fitness.max()),
+            worst=float(fitness.min()),
+            sigma=self._evolution.sigma,
+            steps=self.generation.steps,
+            seconds=now - self.opened,
+        )
+        self._evolution.tell(fitness)
+        self._journal.close_generation(closed, fitness)
+        self.history.append(closed)
+        self._untold.append(closed)
+        reason = self._stop_reason()
+        every = self.settings.evaluate_every
+        if every and (closed.number % every == every - 1 or reason):
+            self._evaluate(closed.number)
+        # Opened also when the run ends here: a later life with wider limits then goes on from it.
+        self.generation = self._open(closed.number + 1, now)
+        if reason:
+            self.fleet.withdraw("score")
+            self.fleet.hurry = True
+
+    def _evaluate(self, generation: int) -> None:
+        evaluation = Evaluation(generation, travelling(self._evolution.mean), self.settings.evaluation_episodes)
+        self._journal.schedule_evaluation(evaluation)
+        self._reopen(evaluation)
+
+    def _reopen(self, evaluation: Evaluation) -> None:
+        work = evaluation.work(self.settings.task)
+        known = self._journal.results_of("evaluate", evaluation.generation)
+        scores = {digest: fitness for digest, (fitness, _) in known.items()}
+        self._evaluating[evaluation.generation] = OpenEvaluation(
+            evaluation, [each.job.digest for each in work], scores
+        )
+        self.fleet.offer([each for each in work if each.job.digest not in scores])
+        self._finish_evaluation(evaluation.generation)
+
+    def _score(self, result: Result) -> None:
+        assert result.fitness is not None
+        self.generation.record(result.digest, result.fitness, result.steps)
+
+    def _evaluated(self, generation: int, result: Result) -> None:
+        assert result.fitness is not None
+        self._evaluating[generation].scores[result.digest] = result.fitness
+        self._finish_evaluation(generation)
+
+    def _finish_evaluation(self, generation: int) -> None:
+        each = self._evaluating[generation]
+        if len(each.scores) < len(each.digests):
+            return
+        scores = np.array([each.scores[digest] for digest in each.digests])
+        finished = StoredEvaluation(generation, len(scores), float(scores.mean()), float(scores.std()))
+        self._journal.finish_evaluation(generation, finished.mean, finished.std)
+        self.evaluations.append(finished)
+        del self._evaluating[generation]
+
+    def _stop_reason(self) -> str | None:
+        limits = self.limits
+        if limits.generations and len(self.history) >= limits.generations:
+            return f"{len(self.history)} generations"
+        if limits.steps and self.steps >= limits.steps:
+            return f"{self.steps} environment steps"
+        if limits.minutes and sum(each.seconds for each in self.history) >= 60 * limits.minutes:
+            return f"{limits.minutes:g} minutes"
+        best = self.best
+        if limits.target is not None and best is not None and best.mean >= limits.target:
+            return f"the mean of generation {best.generation} reached {best.mean:.1f}"
+        return None
+
+    def _end(self, reason: str) -> None:
+        self.ended = reason
+        self._journal.set_fact("ended", reason)
+        self.controller().save(self._journal.path.parent / CONTROLLER)

@@ -1,0 +1,302 @@
+"""The coordinator on Zenoh: one owner thread, one queue; callbacks only enqueue, or answer from a ready snapshot.
+
+Life: startup (session, lock on the name, queryables) -> loop (events, advance, commit, dispatch) -> shutdown.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import queue
+import secrets
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import zenoh
+
+from common import keys
+from common.codec import Inbox, encode, encode_json, encoding
+from common.errors import RefusedError
+from common.fingerprint import package_version
+from common.messages import (
+    MAX_PART,
+    Beat,
+    BundlePart,
+    ControlReply,
+    GenerationEvent,
+    HelloReply,
+    HelloRequest,
+    Intervals,
+    JobBatch,
+    ResultBatch,
+)
+from common.runs import BUNDLE
+from common.session import LEASE_MS, Network, enqueue_into, open_session
+from coordinator.fleet import Send
+from coordinator.run import Run
+from coordinator.status import Snapshot, take_snapshot
+
+log = logging.getLogger(__name__)
+TICK = 0.05  # seconds: the longest that a loss waits to be acted upon
+DRAIN = 256  # events that share one commit at most
+SNAPSHOT_INTERVAL = 0.2
+
+
+class Service:
+    """Serves one run until it ends or `stop` is called."""
+
+    def __init__(self, name: str, folder: Path, network: Network, intervals: Intervals, *, mixed: bool = False) -> None:
+        self._name = name
+        self._bundle = folder / BUNDLE
+        self._network = network
+        self._intervals = intervals
+        self._mixed = mixed
+        self._nonce = secrets.token_hex(8)
+        self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._inbox = Inbox()
+        self._stopping = False
+
+    def stop(self) -> None:
+        """End the loop soon; the run can be continued. Safe in a signal handler."""
+        self._stopping = True
+        self._events.put(("wake", None))
+
+    def serve(self, run_maker: Callable[[], Run], on_ready: Callable[[Run], None] = lambda _run: None) -> Run:
+        """Claim the name on the wire, make the run, serve it; the run as it was when the service left."""
+        with open_session(self._network) as session, ExitStack() as stack:
+            token = self._claim(session, stack)
+            stack.callback(token.undeclare)
+            self._run = run_maker()
+            self._started = monotonic()
+            self._snapshot = self._take_snapshot()
+            declared = self._declare(session)
+            log.info("run %s, incarnation %d, generation %d", self._name, self._run.incarnation,
+                     self._run.generation.number)  # fmt: skip
+            on_ready(self._run)
+            self._loop(session)
+            self._snapshot = self._take_snapshot()
+            for each in declared:
+                each.undeclare()
+        return self._run
+
+    def _claim(self, session: zenoh.Session, stack: ExitStack) -> Any:
+        """Refuse to be a second coordinator; a foreign token that outlives a lease is a live one."""
+        mine = keys.live_coordinator(self._name, self._nonce)
+        foreign: set[str] = set()
+        changes: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        watcher = session.liveliness().declare_subscriber(
+            keys.live_coordinator(self._name, "*"), enqueue_into(changes, "token"), history=True
+        )
+        stack.callback(watcher.undeclare)
+        deadline = monotonic() + 0.3
+        while (left := deadline - monotonic()) > 0:
+            try:
+                _, sample = changes.get(timeout=left)
+            except queue.Empty:
+                break
+            if sample.kind == zenoh.SampleKind.DELETE:
+                foreign.discard(str(sample.key_expr))
+            elif str(sample.key_expr) != mine:
+                if not foreign:
+                    deadline = monotonic() + LEASE_MS / 1000 + 1
+                foreign.add(str(sample.key_expr))
+            if not foreign and deadline - monotonic() > 1:
+                break
+        if foreign:
+            raise RefusedError(f"run {self._name} has a live coordinator already: stop it, or choose another --run")
+        return session.liveliness().declare_token(mine)
+
+    def _declare(self, session: zenoh.Session) -> list[Any]:
+        name, events = self._name, self._events
+        subscribe, answer = session.declare_subscriber, session.declare_queryable
+        return [
+            subscribe(keys.any_worker("result", name), enqueue_into(events, "result")),
+            subscribe(keys.any_worker("beat", name), enqueue_into(events, "beat")),
+            session.liveliness().declare_subscriber(
+                keys.any_worker("live/worker", name), enqueue_into(events, "token"), history=True
+            ),
+            answer(keys.hello(name), enqueue_into(events, "hello")),
+            answer(keys.control(name, "*"), enqueue_into(events, "control")),
+            answer(keys.status(name), _callback(self._answer_status)),
+            answer(keys.status(name, "*"), _callback(self._answer_status)),
+            answer(keys.bundle(name, self._run.settings.task.bundle), _callback(self._answer_bundle)),
+        ]
+
+    def _loop(self, session: zenoh.Session) -> None:
+        taken = monotonic()
+        while not self._stopping and self._run.ended is None:
+            self._drain()
+            now = monotonic()
+            self._run.fleet.tick(now)
+            self._run.advance(now)
+            for send in self._run.fleet.dispatch(now):
+                session.put(keys.job(self._name, send.identity), self._batch(send), encoding=encoding(JobBatch))
+            self._publish_closed(session)
+            if now - taken >= SNAPSHOT_INTERVAL:
+                self._snapshot, taken = self._take_snapshot(), now
+
+    def _drain(self) -> None:
+        """Handle what has arrived, waiting at most a tick for the first."""
+        try:
+            kind, event = self._events.get(timeout=TICK)
+        except queue.Empty:
+            return
+        for _ in range(DRAIN):
+            self._handle(kind, event)
+            try:
+                kind, event = self._events.get_nowait()
+            except queue.Empty:
+                return
+        self._handle(kind, event)
+
+    def _handle(self, kind: str, event: Any) -> None:
+        now = monotonic()
+        if kind == "hello":
+            self._hello(event, now)
+        elif kind == "control":
+            self._control(event)
+        elif kind == "token":
+            if event.kind == zenoh.SampleKind.DELETE:
+                self._run.fleet.depart(keys.worker_of(str(event.key_expr)), now)
+        elif kind == "result":
+            results = self._inbox.decode(ResultBatch, event.payload.to_bytes())
+            if results is not None and self._ours(results.run_uid):
+                self._run.results(keys.worker_of(str(event.key_expr)), results, now)
+        elif kind == "beat":
+            beat = self._inbox.decode(Beat, event.payload.to_bytes())
+            if beat is not None and self._ours(beat.run_uid) and beat.nonce == self._nonce:
+                self._run.fleet.beat(keys.worker_of(str(event.key_expr)), beat, now)
+
+    def _ours(self, run_uid: str) -> bool:
+        if run_uid != self._run.uid:
+            self._inbox.dropped["foreign run"] += 1
+        return run_uid == self._run.uid
+
+    def _hello(self, query: zenoh.Query, now: float) -> None:
+        with query:
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            request = self._inbox.decode_json(HelloRequest, payload)
+            if request is None or not keys.is_worker(request.worker):
+                reply = self._hello_reply("the request is not a hello", "update dreamfleet on the worker's host")
+            elif not request.protocol_min <= keys.PROTOCOL_VERSION <= request.protocol_max:
+                reply = self._hello_reply(
+                    f"the worker speaks protocol {request.protocol_min} to {request.protocol_max}, this run "
+                    f"{keys.PROTOCOL_VERSION}",
+                    f"install dreamfleet {package_version('dreamfleet')} on the worker's host",
+                )
+            elif refusal := self._run.refusal(request, self._mixed):
+                reply = self._hello_reply(*refusal)
+            else:
+                self._run.admit(request, now)
+                reply = self._hello_reply()
+            query.reply(keys.hello(self._name), encode_json(reply), encoding="application/json")
+
+    def _hello_reply(self, why: str = "", remedy: str = "") -> HelloReply:
+        return HelloReply(
+            accepted=not why,
+            protocol_min=keys.PROTOCOL_VERSION,
+            protocol_max=keys.PROTOCOL_VERSION,
+            package=package_version("dreamfleet") or "unknown",
+            run=self._name,
+            run_uid=self._run.uid,
+            incarnation=self._run.incarnation,
+            nonce=self._nonce,
+            why=why,
+            remedy=remedy,
+            spec={} if why else asdict(self._run.settings.task),
+            intervals={} if why else asdict(self._intervals),
+        )
+
+    def _control(self, query: zenoh.Query) -> None:
+        with query:
+            verb = str(query.key_expr).rsplit("/", 1)[-1]
+            if verb == "stop":
+                self.stop()
+            why = "" if verb == "stop" else f"{verb!r} is not a control verb that this version knows; it knows: stop"
+            reply = ControlReply(v=keys.PROTOCOL_VERSION, run=self._name, accepted=not why, why=why)
+            query.reply(query.key_expr, encode_json(reply), encoding="application/json")
+
+    def _batch(self, send: Send) -> bytes:
+        content = send.content
+        return encode(
+            JobBatch(
+                run_uid=self._run.uid,
+                incarnation=self._run.incarnation,
+                nonce=self._nonce,
+                number=send.number,
+                vectors=tuple(content.vectors),
+                jobs=tuple(work.job for work in content.work),
+                cancels=tuple(content.cancels),
+                verdicts=tuple(content.verdicts),
+            )
+        )
+
+    def _publish_closed(self, session: zenoh.Session) -> None:
+        for closed in self._run.take_closed():
+            event = GenerationEvent(
+                v=keys.PROTOCOL_VERSION,
+                run=self._name,
+                run_uid=self._run.uid,
+                incarnation=self._run.incarnation,
+                generation=closed.number,
+                mean=closed.mean,
+                std=closed.std,
+                best=closed.best,
+                worst=closed.worst,
+                sigma=closed.sigma,
+                seconds=closed.seconds,
+                environment_steps=self._run.steps,
+            )
+            session.put(keys.event_generation(self._name), encode_json(event), encoding="application/json")
+            log.info("generation %d: mean %.1f, best %.1f", closed.number, closed.mean, closed.best)
+
+    def _take_snapshot(self) -> Snapshot:
+        now = monotonic()
+        return take_snapshot(self._run, self._name, dict(self._inbox.dropped), now - self._started, now)
+
+    def _answer_status(self, query: zenoh.Query) -> None:
+        """In the queryable's own thread: reads the last snapshot and nothing else."""
+        with query:
+            for part in _parts(str(query.key_expr), keys.status(self._name)):
+                payload = self._snapshot.answer(part, dict(query.parameters.values))
+                query.reply(keys.status(self._name, part), payload, encoding="application/json")
+
+    def _answer_bundle(self, query: zenoh.Query) -> None:
+        """In the queryable's own thread: reads a file that nobody writes."""
+        with query:
+            sha256 = self._run.settings.task.bundle
+            values = dict(query.parameters.values)
+            try:
+                offset, length = int(values.get("offset", "0")), int(values.get("length", str(MAX_PART)))
+            except ValueError:
+                query.reply_err(json.dumps({"why": "offset and length must be whole numbers"}).encode())
+                return
+            total = self._bundle.stat().st_size
+            with self._bundle.open("rb") as file:
+                file.seek(min(max(offset, 0), total))
+                data = file.read(min(max(length, 0), MAX_PART))
+            part = BundlePart(
+                run_uid=self._run.uid,
+                incarnation=self._run.incarnation,
+                sha256=bytes.fromhex(sha256),
+                offset=min(max(offset, 0), total),
+                total=total,
+                data=data,
+            )
+            query.reply(keys.bundle(self._name, sha256), encode(part), encoding=encoding(BundlePart))
+
+
+def _callback(answer: Callable[[zenoh.Query], None]) -> Any:
+    return zenoh.handlers.Callback(answer, indirect=False)
+
+
+def _parts(key: str, root: str) -> list[str]:
+    """Which parts of the status a query's key expression asks for; a wildcard asks for all below the root."""
+    if key == root:
+        return [""]
+    part = key.removeprefix(f"{root}/")
+    return ["generation", "workers", "history", "best"] if "*" in part else [part]

@@ -1,0 +1,79 @@
+"""What the coordinator has given this worker and no slot has taken yet. Pure.
+
+Batches may come twice, late or out of order; each counts once, and a vector may be spread over several.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+
+from common.messages import Job, JobBatch, TaskSpec, VectorPart
+
+KEPT_VECTORS = 64  # beside those that queued jobs need
+
+
+class Backlog:
+    """Queued jobs in the order in which they came, and the vectors that they score."""
+
+    def __init__(self, spec: TaskSpec) -> None:
+        self._spec = spec
+        self.begin()
+        self._jobs: OrderedDict[bytes, Job] = OrderedDict()
+        self._vectors: OrderedDict[bytes, bytearray] = OrderedDict()
+
+    def begin(self) -> None:
+        """A new coordinator's life: its batches count from 1 again."""
+        self.seen = 0
+        self._ahead: set[int] = set()
+
+    def clear(self) -> None:
+        """Forget what is queued: a new coordinator's life gives it again."""
+        self._jobs.clear()
+
+    @property
+    def queued(self) -> list[bytes]:
+        """Digests of the queued jobs."""
+        return list(self._jobs)
+
+    def take_in(self, batch: JobBatch) -> list[tuple[Job, str]]:
+        """Queue a batch's jobs once; those whose digest is not theirs come back with what is wrong."""
+        if batch.number <= self.seen or batch.number in self._ahead:
+            return []
+        self._ahead.add(batch.number)
+        while self.seen + 1 in self._ahead:
+            self.seen += 1
+            self._ahead.discard(self.seen)
+        for part in batch.vectors:
+            self._add_part(part)
+        for digest in batch.cancels:
+            self._jobs.pop(digest, None)
+        refused = []
+        for job in batch.jobs:
+            if job.digest != self._spec.digest(job.kind, job.vector, job.seeds) or job.task != self._spec.task:
+                refused.append((job, "the job's digest is not of its content"))
+            else:
+                self._jobs[job.digest] = job
+        self._trim()
+        return refused
+
+    def next(self) -> tuple[Job, bytes] | None:
+        """The first job whose vector is whole, with the vector."""
+        for digest, job in self._jobs.items():
+            vector = self._vectors.get(job.vector)
+            if vector is not None and hashlib.sha256(vector).digest() == job.vector:
+                del self._jobs[digest]
+                return job, bytes(vector)
+        return None
+
+    def _add_part(self, part: VectorPart) -> None:
+        vector = self._vectors.setdefault(part.id, bytearray())
+        self._vectors.move_to_end(part.id)
+        if part.offset == len(vector):  # parts come in order; one that was missed comes again with its batch
+            vector.extend(part.data)
+
+    def _trim(self) -> None:
+        needed = {job.vector for job in self._jobs.values()}
+        surplus = [identity for identity in self._vectors if identity not in needed]
+        for identity in surplus[: max(0, len(surplus) - KEPT_VECTORS)]:
+            del self._vectors[identity]

@@ -1,0 +1,77 @@
+"""Fetching the frozen world model by its hash: in parts, resumable, verified."""
+
+from __future__ import annotations
+
+import logging
+import queue
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from common import keys
+from common.bundle import Bundle, BundleStore
+from common.codec import Inbox
+from common.errors import BundleError
+from common.messages import MAX_PART, BundlePart
+
+log = logging.getLogger(__name__)
+WINDOW = 8  # queries in flight: enough to fill a link with a long way
+ATTEMPTS = 3  # damaged downloads before giving up
+SILENCES = 20  # rounds without any part before giving up
+QUERY_TIMEOUT = 3.0
+
+
+def obtain(session: zenoh.Session, run: str, sha256: str, store: BundleStore, inbox: Inbox) -> Bundle:
+    """The bundle from the cache, or fetched from the coordinator."""
+    bundle = store.find(sha256)
+    if bundle is not None:
+        return bundle
+    for attempt in range(1, ATTEMPTS + 1):
+        _download(session, keys.bundle(run, sha256), sha256, store.partial(sha256), inbox)
+        try:
+            bundle = store.complete(sha256)
+        except BundleError as error:
+            log.warning("attempt %d of %d: %s", attempt, ATTEMPTS, error)
+            continue
+        log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6)
+        return bundle
+    raise BundleError(f"the bundle {sha256[:12]}... arrived damaged {ATTEMPTS} times: check the coordinator's copy")
+
+
+def _download(session: zenoh.Session, key: str, sha256: str, path: Path, inbox: Inbox) -> None:
+    """Append to `path` until it is as long as the bundle."""
+    total, silences = None, 0
+    try:
+        file = path.open("ab")
+    except OSError as error:
+        raise BundleError(f"cannot write {path}: {error.strerror}; point $DREAMFLEET_CACHE elsewhere") from error
+    with file:
+        while total is None or file.tell() < total:
+            offsets = [file.tell() + index * MAX_PART for index in range(WINDOW if total else 1)]
+            parts = _ask(session, key, [each for each in offsets if total is None or each < total], inbox)
+            for part in sorted(parts, key=lambda part: part.offset):
+                total = part.total
+                if part.sha256.hex() == sha256 and part.offset == file.tell() and part.data:
+                    file.write(part.data)
+            if total is not None and file.tell() > total:
+                file.truncate(0)  # the beginning of something else
+            silences = 0 if parts else silences + 1
+            if silences >= SILENCES:
+                raise BundleError("the coordinator no longer answers for its bundle; start the worker again later")
+
+
+def _ask(session: zenoh.Session, key: str, offsets: list[int], inbox: Inbox) -> list[BundlePart]:
+    replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    done = object()
+    for offset in offsets:
+        handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
+        session.get(f"{key}?offset={offset};length={MAX_PART}", handler, timeout=QUERY_TIMEOUT)
+    parts, left = [], len(offsets)
+    while left:
+        reply = replies.get()
+        if reply is done:
+            left -= 1
+        elif reply.ok is not None and (part := inbox.decode(BundlePart, reply.ok.payload.to_bytes())) is not None:
+            parts.append(part)
+    return parts

@@ -1,0 +1,27 @@
+"""How one worker works."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from common.config import option
+from common.errors import UsageError
+from common.keys import check_run_name
+from common.messages import MAX_LEASES
+
+
+@dataclass(frozen=True)
+class WorkerConfig:
+    """How one worker works."""
+
+    run: str | None = option(None, "name of the run (default: the only live one)")
+    name: str | None = option(None, "name of this worker (default: the host's)")
+    slots: int = option(0, "scoring processes; 0: one a core")
+    drain_timeout: float = option(30.0, "seconds that running episodes may take after the first Ctrl-C")
+    exit_when_done: bool = option(False, "leave when the run has ended, instead of waiting for its coordinator")
+
+    def __post_init__(self) -> None:
+        if self.run is not None:
+            check_run_name(self.run)
+        if not 0 <= self.slots <= MAX_LEASES:
+            raise UsageError(f"--slots must be from 0 to {MAX_LEASES}, not {self.slots}")

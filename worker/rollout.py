@@ -1,0 +1,65 @@
+"""The episode loop, blind to what the task is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.tasks.api import Policy
+
+IDLE_COST = 0.1  # CarRacing's own cost of a step
+
+
+@dataclass(frozen=True)
+class Score:
+    """An episode's outcome: fitness, and environment steps made."""
+
+    fitness: float
+    steps: int
+
+
+@dataclass(frozen=True)
+class Course:
+    """One episode: its seed, its steps at most, and when a hopeless one is cut (`patience` 0: never)."""
+
+    seed: int
+    horizon: int
+    patience: int = 0
+
+
+def rollout(
+    environment: gymnasium.Env[Any, Any],
+    policy: Policy,
+    parameters: NDArray[np.float32],
+    course: Course,
+    on_step: Callable[[int], None] = lambda _steps: None,
+) -> Score:
+    """Drive one episode; the sum of its rewards, in step order, in double precision.
+
+    An episode cut after `patience` steps without a positive reward is charged what standing still would have cost up
+    to the horizon, so that cut and uncut candidates compare.
+    """
+    if not np.isfinite(parameters).all():
+        raise ValueError("the controller's parameters hold NaN or infinity")
+    observation, _ = environment.reset(seed=course.seed)
+    policy.begin(parameters)
+    fitness, idle, steps, ended = 0.0, 0, 0, False
+    while steps < course.horizon and not ended:
+        observation, reward, terminated, truncated, _ = environment.step(policy.act(observation))
+        fitness += float(reward)
+        steps += 1
+        on_step(steps)
+        ended = terminated or truncated
+        idle = 0 if float(reward) > 0 else idle + 1
+        if course.patience and idle >= course.patience and not ended:
+            fitness -= IDLE_COST * (course.horizon - steps)
+            break
+    if not math.isfinite(fitness):
+        raise ValueError("the episode's rewards do not add up to a number")
+    return Score(fitness, steps)

@@ -1,0 +1,41 @@
+"""What a slot does with a job: the task's environment and policy, made once, used for every job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.bundle import Bundle
+from common.messages import Kind, TaskSpec
+from worker.rollout import Course, Score, rollout
+from worker.tasks.api import find_task
+
+FULL_EPISODE = 10**6  # steps: the environment's own limit ends it
+
+
+class Scorer:
+    """Scores one job at a time."""
+
+    def __init__(self, spec: TaskSpec, bundle: Bundle) -> None:
+        task = find_task(spec.task)
+        self._spec = spec
+        self._environment = task.make_environment()
+        self._policy = task.make_policy(bundle)
+
+    def score(
+        self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None
+    ) -> Score:
+        """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode."""
+        return rollout(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
+
+    def course(self, kind: Kind, seed: int) -> Course:
+        """The episode that a job of this kind and seed is."""
+        if kind == "evaluate":
+            return Course(seed, FULL_EPISODE)
+        return Course(seed, self._spec.horizon, self._spec.patience)
+
+    def close(self) -> None:
+        """Release the environment."""
+        self._environment.close()

@@ -1,0 +1,263 @@
+"""A worker: joins a run, scores what it is given, delivers until acknowledged.
+
+Life: connect -> join -> fetch the bundle -> start slots -> serve -> leave. One owner thread, one queue; Zenoh
+callbacks and slot readers only enqueue.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import random
+from contextlib import ExitStack
+from time import monotonic
+from typing import Any
+
+import zenoh
+
+from common import keys
+from common.bundle import BundleStore, default_cache
+from common.codec import Inbox, encode, encoding
+from common.errors import ConnectionFailedError, RefusedError
+from common.fingerprint import fingerprint
+from common.messages import MAX_LEASES, TAG_BYTES, Beat, JobBatch, Result, ResultBatch, Running
+from common.session import Network, enqueue_into, open_session
+from worker.admission import Admission, ask, make_request
+from worker.backlog import Backlog
+from worker.bundle_fetch import obtain
+from worker.config import WorkerConfig
+from worker.outbox import Outbox
+from worker.slot import Slot, SlotEvent
+from worker.tasks.api import find_task, known_tasks
+
+log = logging.getLogger(__name__)
+RETRY = 1.0  # seconds between attempts to connect or join
+GONE = 5.0  # seconds without a coordinator after which a run counts as over
+SMOOTHING = 0.3  # weight of the newest interval in the throughput
+
+
+class Worker:
+    """One worker process."""
+
+    def __init__(self, config: WorkerConfig, network: Network, tasks: tuple[str, ...] = ()) -> None:
+        self.identity = keys.new_worker(config.name)
+        self.inbox = Inbox()
+        self._config = config
+        self._network = network
+        self._tasks = (*known_tasks(), *tasks)
+        self._slot_count = config.slots or len(os.sched_getaffinity(0))
+        self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._stops = 0
+        self._slots: list[Slot] = []
+        self._coordinators: set[str] = set()
+        self._finished = self._steps_finished = 0
+
+    def stop(self) -> None:
+        """First: finish what runs and leave; second: leave now. Safe in a signal handler."""
+        self._stops += 1
+        self._events.put(("wake", None))
+
+    def serve(self) -> None:
+        """Work until told to stop, or until the run is over if so configured."""
+        with ExitStack() as stack:
+            session = self._connect()
+            if session is None:
+                return
+            stack.callback(session.close)
+            admission = self._join(session)
+            if admission is None:
+                return
+            self._admission = admission
+            bundle = obtain(session, admission.run, admission.spec.bundle, BundleStore(default_cache()), self.inbox)
+            stack.callback(self._stop_slots)
+            self._slots = [
+                Slot(number, admission.spec, bundle.path, self._events) for number in range(self._slot_count)
+            ]
+            self._backlog = Backlog(admission.spec)
+            self._outbox = Outbox(admission.intervals.repeat)
+            declared = self._declare(session)
+            log.info("joined run %s as %s, %d slots", admission.run, self.identity, self._slot_count)
+            self._loop(session)
+            for each in declared:
+                each.undeclare()
+            log.info("leaving: %d jobs, %d environment steps", self._finished, self._steps_finished)
+
+    def _connect(self) -> zenoh.Session | None:
+        """A session, however long the router takes to come up; `None` if told to stop meanwhile."""
+        said = False
+        while not self._stops:
+            try:
+                return open_session(self._network, timeout=RETRY)
+            except ConnectionFailedError:
+                if not said:
+                    log.warning("waiting for a coordinator at %s", ", ".join(self._network.connect))
+                said = True
+                self._pause()
+        return None
+
+    def _join(self, session: zenoh.Session) -> Admission | None:
+        said = False
+        request = make_request(self.identity, self._tasks, self._slot_count)
+        while not self._stops:
+            admission = ask(session, self._config.run, request, self.inbox)
+            if admission is not None:
+                return admission
+            if not said:
+                log.warning("waiting for %s", f"run {self._config.run}" if self._config.run else "a run")
+            said = True
+            self._pause()
+        return None
+
+    def _pause(self) -> None:
+        """Wait a moment, with jitter, or until told to stop."""
+        deadline = monotonic() + RETRY * random.uniform(0.5, 1.5)  # noqa: S311 - jitter, no secret
+        while not self._stops and (left := deadline - monotonic()) > 0:
+            try:
+                self._events.get(timeout=left)
+            except queue.Empty:
+                return
+
+    def _declare(self, session: zenoh.Session) -> list[Any]:
+        run = self._admission.run
+        coordinators = keys.live_coordinator(run, "*")
+        return [
+            session.declare_subscriber(keys.job(run, self.identity), enqueue_into(self._events, "job")),
+            session.liveliness().declare_subscriber(
+                coordinators, enqueue_into(self._events, "coordinator"), history=True
+            ),
+            session.liveliness().declare_token(keys.live_worker(run, self.identity)),
+        ]
+
+    def _loop(self, session: zenoh.Session) -> None:
+        now = monotonic()
+        self._alone_since: float | None = None
+        self._beat_at, self._rate, self._counted = now, 0.0, (now, 0)
+        drain_until = None
+        while not self._left(drain_until):
+            self._wait()
+            now = monotonic()
+            if self._stops and drain_until is None:
+                drain_until = now + self._config.drain_timeout
+                self._backlog.clear()
+                log.info("draining: running episodes finish, queued jobs go back")
+            if drain_until is None:
+                self._fill_slots()
+            for results in self._outbox.due(now):
+                self._send_results(session, results)
+            if now >= self._beat_at:
+                self._beat_at = now + self._admission.intervals.beat
+                self._send_beat(session, now, capacity=0 if drain_until else self._capacity())
+            self._rejoin(session)
+
+    def _left(self, drain_until: float | None) -> bool:
+        if self._stops > 1:
+            return True
+        if drain_until is not None:
+            busy = any(slot.job is not None for slot in self._slots) or len(self._outbox)
+            return not busy or monotonic() > drain_until
+        alone = self._alone_since
+        return self._config.exit_when_done and alone is not None and monotonic() - alone > GONE
+
+    def _wait(self) -> None:
+        """Handle what has arrived, waiting until the next beat or repetition at most."""
+        timeout = min(max(self._beat_at - monotonic(), 0.0), self._admission.intervals.repeat / 4)
+        try:
+            self._handle(*self._events.get(timeout=timeout))
+            while True:
+                self._handle(*self._events.get_nowait())
+        except queue.Empty:
+            pass
+
+    def _handle(self, kind: str, event: Any) -> None:
+        if kind == "job":
+            self._take_batch(event.payload.to_bytes())
+        elif kind == "slot":
+            self._take_slot_event(event)
+        elif kind == "coordinator":
+            nonce = str(event.key_expr).rsplit("/", 1)[-1]
+            change = self._coordinators.discard if event.kind == zenoh.SampleKind.DELETE else self._coordinators.add
+            change(nonce)
+            self._alone_since = None if self._coordinators else monotonic()
+
+    def _take_batch(self, payload: bytes) -> None:
+        batch = self.inbox.decode(JobBatch, payload)
+        if batch is None:
+            return
+        if (batch.run_uid, batch.nonce) != (self._admission.run_uid, self._admission.nonce):
+            self.inbox.dropped["foreign coordinator"] += 1
+            return
+        for job, why in self._backlog.take_in(batch):
+            self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
+        self._outbox.settle(verdict.digest for verdict in batch.verdicts)
+
+    def _take_slot_event(self, event: SlotEvent) -> None:
+        result = self._slots[event.slot].handle(event)
+        if result is not None:
+            self._finished += 1
+            self._steps_finished += result.steps
+            self._outbox.add(result)
+
+    def _capacity(self) -> int:
+        width = find_task(self._admission.spec.task).width
+        return min(sum(slot.ready for slot in self._slots) * width, MAX_LEASES // 2)
+
+    def _fill_slots(self) -> None:
+        if len(self._outbox) > 4 * len(self._slots):
+            return
+        for slot in self._slots:
+            if slot.ready and slot.job is None and (work := self._backlog.next()) is not None:
+                slot.submit(*work)
+
+    def _send_results(self, session: zenoh.Session, results: tuple[Result, ...]) -> None:
+        run = self._admission
+        batch = ResultBatch(
+            run_uid=run.run_uid, incarnation=run.incarnation, fingerprint=fingerprint(), results=results
+        )
+        session.put(keys.result(run.run, self.identity), encode(batch), encoding=encoding(ResultBatch))
+
+    def _send_beat(self, session: zenoh.Session, now: float, capacity: int) -> None:
+        running = [slot for slot in self._slots if slot.job is not None]
+        steps = self._steps_finished + sum(slot.steps for slot in running)
+        (then, before), self._counted = self._counted, (now, steps)
+        if now > then:
+            self._rate += SMOOTHING * (max(steps - before, 0) / (now - then) - self._rate)
+        beat = Beat(
+            run_uid=self._admission.run_uid,
+            incarnation=self._admission.incarnation,
+            nonce=self._admission.nonce,
+            seen=self._backlog.seen,
+            capacity=capacity,
+            slots=len(self._slots),
+            queued=_tags(self._backlog.queued),
+            running=tuple(Running(slot.job.digest[:TAG_BYTES], slot.steps) for slot in running if slot.job),
+            unacked=_tags(self._outbox.digests),
+            load=os.getloadavg()[0],
+            steps_per_second=self._rate,
+        )
+        session.put(keys.beat(self._admission.run, self.identity), encode(beat), encoding=encoding(Beat))
+
+    def _rejoin(self, session: zenoh.Session) -> None:
+        """Follow the run into its coordinator's next life; what runs goes on, what is unacknowledged is kept."""
+        if not self._coordinators or self._admission.nonce in self._coordinators:
+            return
+        request = make_request(self.identity, self._tasks, self._slot_count)
+        admission = ask(session, self._admission.run, request, self.inbox)
+        if admission is None:
+            return
+        if (admission.run_uid, admission.spec) != (self._admission.run_uid, self._admission.spec):
+            raise RefusedError(f"run {admission.run} is another run now; start this worker again to join it")
+        self._admission = admission
+        self._backlog.begin()
+        self._backlog.clear()
+        self._outbox.resend_all()
+        self._beat_at = 0.0
+        log.info("run %s goes on, incarnation %d", admission.run, admission.incarnation)
+
+    def _stop_slots(self) -> None:
+        for slot in self._slots:
+            slot.stop()
+
+
+def _tags(digests: list[bytes]) -> tuple[bytes, ...]:
+    return tuple(digest[:TAG_BYTES] for digest in digests[:MAX_LEASES])

@@ -1,0 +1,64 @@
+"""What a task is: an environment, and what a controller sees of it and may do.
+
+The only module that a third party imports. Register a task under the entry-point group `dreamfleet.tasks`; the dream
+and the real track satisfy the same protocol, so that no caller can tell them apart.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from common.bundle import Bundle
+from common.errors import UsageError
+
+GROUP = "dreamfleet.tasks"
+
+
+class Policy(Protocol):
+    """A frozen world model under one controller."""
+
+    def begin(self, parameters: NDArray[np.float32]) -> None:
+        """Begin an episode with this controller's flat vector."""
+
+    def act(self, observation: Any) -> Any:
+        """The environment's next action."""
+
+
+class Task(Protocol):
+    """One thing to score in."""
+
+    name: str
+    width: int  # episodes that a slot scores at once
+
+    def make_environment(self) -> gymnasium.Env[Any, Any]:
+        """A new environment; its observations are what the policy takes."""
+
+    def make_policy(self, bundle: Bundle) -> Policy:
+        """The policy of a bundle; `BundleError` if the bundle is of another task."""
+
+
+def known_tasks() -> tuple[str, ...]:
+    """Names of the registered tasks."""
+    return tuple(sorted(point.name for point in entry_points(group=GROUP)))
+
+
+def find_task(name: str) -> Task:
+    """A registered task by name, or any as `module:attribute`; `UsageError` lists the registered ones."""
+    for point in entry_points(group=GROUP):
+        if point.name == name:
+            registered: Task = point.load()()
+            return registered
+    module, _, attribute = name.partition(":")
+    if not attribute:
+        raise UsageError(f"unknown task {name!r}: known are {', '.join(known_tasks()) or 'none'}")
+    try:
+        task: Task = getattr(import_module(module), attribute)()
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"task {name!r} cannot be loaded: {error}") from error
+    return task

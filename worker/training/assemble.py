@@ -1,0 +1,86 @@
+"""From trained weights to a bundle."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from common.bundle import DECODER, ENCODER, INITIAL, POLICY, WEIGHTS, Bundle, Manifest, write_bundle
+from common.fingerprint import package_version
+from worker.tasks.preprocessing import PREPROCESSING, SIZE
+from worker.training import train_mdnrnn, train_vae
+from worker.training.checkpoint import load_weights
+from worker.training.dataset import episodes, load
+from worker.training.encode import ENCODED
+from worker.worldmodel.export import Weights, export_decoder, export_encoder, export_policy
+from worker.worldmodel.mdnrnn import MDNRNNConfig
+from worker.worldmodel.vae import VAEConfig
+
+QUALITY = "quality.json"
+INITIAL_LATENTS = 256
+
+
+def record_quality(folder: Path, figures: dict[str, float]) -> None:
+    """Keep a model's figures beside the data, for the manifest."""
+    path = folder / QUALITY
+    known = json.loads(path.read_text()) if path.exists() else {}
+    path.write_text(json.dumps({**known, **figures}, indent=1))
+
+
+def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundle:
+    """Build the bundle of a data folder whose models are trained."""
+    vae = load_weights(folder / train_vae.CHECKPOINT)
+    rnn = load_weights(folder / train_mdnrnn.CHECKPOINT)
+    quality = folder / QUALITY
+    provenance = {
+        "episodes": len(episodes(folder)),
+        "quality": json.loads(quality.read_text()) if quality.exists() else {},
+        "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
+    }
+    parts = graphs(vae, rnn, initial_latents(folder))
+    if with_weights:
+        tensors = {f"vae.{key}": value for key, value in vae.items()} | {f"mdnrnn.{k}": v for k, v in rnn.items()}
+        parts[WEIGHTS] = save(tensors, {"vae": json.dumps(asdict(VAEConfig())), "mdnrnn": json.dumps(asdict(MDNRNNConfig()))})
+    return write_bundle(out, manifest(name, provenance), parts)
+
+
+def manifest(name: str, provenance: dict[str, Any]) -> Manifest:
+    """The manifest of today's models."""
+    return Manifest(
+        name=name,
+        task="car-racing",
+        preprocessing=PREPROCESSING,
+        picture=(SIZE, SIZE, 3),
+        latent=VAEConfig().latent,
+        hidden=MDNRNNConfig().hidden,
+        actions=MDNRNNConfig().actions,
+        provenance=provenance,
+    )
+
+
+def graphs(vae: Weights, rnn: Weights, initial: NDArray[np.float32]) -> dict[str, bytes]:
+    """The parts that every bundle has."""
+    buffer = io.BytesIO()
+    np.save(buffer, initial)
+    return {
+        ENCODER: export_encoder(vae, VAEConfig()),
+        DECODER: export_decoder(vae, VAEConfig()),
+        POLICY: export_policy(vae, rnn, VAEConfig(), MDNRNNConfig()),
+        INITIAL: buffer.getvalue(),
+    }
+
+
+def initial_latents(folder: Path) -> NDArray[np.float32]:
+    """First `mu` and `logvar` of recorded drives, `(N, 2, latent)`: where dreams begin."""
+    firsts = []
+    for path in episodes(folder, ENCODED)[:INITIAL_LATENTS]:
+        arrays = load(path, "mu", "logvar")
+        firsts.append(np.stack([arrays["mu"][0], arrays["logvar"][0]]))
+    return np.stack(firsts).astype(np.float32)

@@ -1,0 +1,60 @@
+"""Checkpoints as safetensors: weights, Adam's moments, and how far training has come. No pickle."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from common.errors import DatasetError
+from common.files import write_aside
+
+
+def save_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam, progress: dict[str, Any]) -> None:
+    """Write a checkpoint whole or not at all; `progress` is anything that JSON holds."""
+    tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
+    for index, state in optimiser.state_dict()["state"].items():
+        tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
+    data = save({name: tensor.contiguous() for name, tensor in tensors.items()}, {"progress": json.dumps(progress)})
+    with write_aside(path) as file:
+        file.write(data)
+
+
+def load_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam | None) -> dict[str, Any] | None:
+    """Put a checkpoint back and return its progress; `None` if there is none yet."""
+    if not path.exists():
+        return None
+    try:
+        with safe_open(path, "pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+            progress: dict[str, Any] = json.loads(file.metadata()["progress"])
+        weights = {name: tensor for name, tensor in tensors.items() if name.startswith("model.")}
+        model.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
+    except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
+        raise DatasetError(f"checkpoint {path} does not fit or is damaged ({error}); delete it to begin anew") from error
+    if optimiser is not None:
+        _restore_adam(optimiser, {name: tensor for name, tensor in tensors.items() if name.startswith("adam.")})
+    return progress
+
+
+def load_weights(path: Path) -> dict[str, NDArray[np.float32]]:
+    """A checkpoint's weights as arrays; `DatasetError` if it is not there."""
+    if not path.exists():
+        raise DatasetError(f"no {path}: train it first with `dreamfleet train {path.stem}`")
+    with safe_open(path, "np") as file:
+        names = [name for name in file.keys() if name.startswith("model.")]  # noqa: SIM118 - no mapping
+        return {name.removeprefix("model."): file.get_tensor(name) for name in names}
+
+
+def _restore_adam(optimiser: torch.optim.Adam, tensors: dict[str, torch.Tensor]) -> None:
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, tensor in tensors.items():
+        _, index, key = name.split(".")
+        state.setdefault(int(index), {})[key] = tensor
+    optimiser.load_state_dict({**optimiser.state_dict(), "state": state})

@@ -1,0 +1,114 @@
+"""Collecting drives: one compressed `.npz` an episode, each a pure function of (seed, number)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import DatasetError, UsageError
+from common.files import write_aside
+from common.threads import pin_thread_pools
+from worker.tasks.preprocessing import PREPROCESSING, picture
+from worker.training.drivers import DRIVERS
+
+ENVIRONMENT = "CarRacing-v3"
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """How much and what is driven."""
+
+    episodes: int = 400
+    steps: int = 300
+    seed: int = 0
+    anywhere: float = 0.6  # share of episodes that start somewhere on the track instead of at its beginning
+    patience: int = 120  # steps after the last new tile before an episode ends
+
+    def __post_init__(self) -> None:
+        for name in ("episodes", "steps", "patience"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"--{name} must be at least 1, not {getattr(self, name)}")
+        if self.seed < 0:
+            raise UsageError(f"--seed must not be negative, not {self.seed}")
+
+
+def episode_path(folder: Path, number: int) -> Path:
+    """Where an episode lies."""
+    return folder / "episodes" / f"{number:06d}.npz"
+
+
+def collect(folder: Path, config: CollectConfig, jobs: int) -> Iterator[int]:
+    """Drive the episodes that are not there yet in `jobs` processes; yields the frames of each as it is written."""
+    missing = [number for number in range(config.episodes) if not episode_path(folder, number).exists()]
+    try:
+        (folder / "episodes").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
+    if not missing:
+        return
+    pin_thread_pools()
+    with get_context("spawn").Pool(min(jobs, len(missing)), initializer=_start_process) as pool:
+        yield from pool.imap_unordered(_collect_one, [(folder, config, number) for number in missing])
+
+
+def _start_process() -> None:
+    os.environ["SDL_VIDEODRIVER"] = "dummy"
+
+
+def _collect_one(task: tuple[Path, CollectConfig, int]) -> int:
+    folder, config, number = task
+    arrays = drive(config, number)
+    with write_aside(episode_path(folder, number)) as file:
+        np.savez_compressed(file, **arrays)
+    return len(arrays["action"])
+
+
+def drive(config: CollectConfig, number: int) -> dict[str, NDArray[Any]]:
+    """One episode of T steps: `picture` (T, 64, 64, 3) before each `action` (T, 3), then `reward` (T,)."""
+    random = np.random.default_rng([config.seed, number])
+    name = list(DRIVERS)[number % len(DRIVERS)]
+    driver = DRIVERS[name](random)
+    environment = gymnasium.make(ENVIRONMENT)
+    observation, _ = environment.reset(seed=int(random.integers(2**20, 2**31)))
+    if random.random() < config.anywhere:
+        observation = _put_anywhere(environment, random)
+    pictures, actions, rewards = [], [], []
+    idle, ended = 0, False
+    while len(actions) < config.steps and idle < config.patience and not ended:
+        action = driver.act()
+        pictures.append(picture(observation))
+        observation, reward, terminated, truncated, _ = environment.step(action)
+        actions.append(action)
+        rewards.append(reward)
+        idle = 0 if float(reward) > 0 else idle + 1
+        ended = terminated or truncated
+    environment.close()
+    return {
+        "picture": np.stack(pictures),
+        "action": np.stack(actions),
+        "reward": np.array(rewards, dtype=np.float32),
+        "ended": np.array(ended),
+        "driver": np.array(name),
+        "preprocessing": np.array(PREPROCESSING),
+    }
+
+
+def _put_anywhere(environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:
+    """Move the car to a random tile, turned and shifted a little, past the opening's zoom."""
+    from gymnasium.envs.box2d.car_dynamics import Car
+
+    inner: Any = environment.unwrapped
+    _, beta, x, y = inner.track[random.integers(len(inner.track))]
+    shift, turn = random.normal(0, 2.0), random.normal(0, 0.25)
+    inner.car.destroy()
+    inner.car = Car(inner.world, beta + turn, x + shift * np.cos(beta), y + shift * np.sin(beta))
+    inner.t = 1.0  # the camera zooms in during the first second
+    return environment.step(np.zeros(3, dtype=np.float32))[0]

@@ -1,0 +1,76 @@
+"""Recorded episodes on disk, streamed: memory holds a few dozen of them, never all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import DatasetError
+from worker.tasks.preprocessing import PREPROCESSING, SIZE
+
+POOL_EPISODES = 48  # whose frames are shuffled together: about 100 MB
+VALIDATION_EVERY = 20  # every 20th episode is held out, whole
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def episodes(folder: Path, kind: str = "episodes") -> list[Path]:
+    """The episodes of a data set, `episodes` or `encoded`, by number; `DatasetError` if there are too few."""
+    paths = sorted((folder / kind).glob("[0-9]*.npz"))
+    if len(paths) < 2:
+        verb = "dreamfleet collect" if kind == "episodes" else "dreamfleet encode"
+        raise DatasetError(f"{folder} holds {len(paths)} {kind}; at least 2 are needed: run `{verb} --data {folder}`")
+    return paths
+
+
+def split(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Episodes to train on and episodes held out."""
+    held_out = list(paths[::VALIDATION_EVERY])
+    return [path for path in paths if path not in set(held_out)], held_out
+
+
+def load(path: Path, *names: str) -> Arrays:
+    """The named arrays of one episode; `DatasetError` if the file is damaged or lacks one."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in names}
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise DatasetError(f"{path} is damaged ({error}); delete it and run the verb that wrote it again") from error
+
+
+def load_pictures(path: Path) -> NDArray[np.uint8]:
+    """An episode's pictures `(T, 64, 64, 3)`; `DatasetError` if they are of another preprocessing."""
+    arrays = load(path, "picture", "preprocessing")
+    pictures: NDArray[np.uint8] = arrays["picture"]
+    if str(arrays["preprocessing"]) != PREPROCESSING or pictures.shape[1:] != (SIZE, SIZE, 3) or not len(pictures):
+        raise DatasetError(f"{path} holds pictures of another preprocessing or shape; collect into an empty folder")
+    return pictures
+
+
+def picture_batches(
+    paths: Sequence[Path], batch: int, seed: int, first_pool: int = 0
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Endless shuffled batches `(batch, 64, 64, 3)` with the number of their pool; a pure function of its arguments."""
+    pool = first_pool
+    while True:
+        random = np.random.default_rng([seed, pool])
+        chosen = random.choice(len(paths), size=min(POOL_EPISODES, len(paths)), replace=False)
+        pictures = np.concatenate([load_pictures(paths[index]) for index in chosen])
+        order = random.permutation(len(pictures))
+        for start in range(0, max(len(order) - batch, 0) + 1, batch):
+            yield pool, pictures[order[start : start + batch]]
+        pool += 1
+
+
+def pad(sequences: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Sequences `(T_i, ...)` of unequal length as one `(N, max T, ...)`, zero where one has ended."""
+    longest = max(len(sequence) for sequence in sequences)
+    padded = np.zeros((len(sequences), longest, *sequences[0].shape[1:]), dtype=np.float32)
+    for row, sequence in zip(padded, sequences, strict=True):
+        row[: len(sequence)] = sequence
+    return padded

@@ -1,0 +1,80 @@
+"""Random drivers: what the first world model learns from.
+
+Three kinds of noise, so that the model sees straight, weaving and spinning cars; all lean on the gas, for a car that
+stands teaches nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+HELD_FRAMES = 20
+
+
+class Driver(Protocol):
+    """Chooses an action `(3,)`: steering in [-1, 1], gas and brake in [0, 1]."""
+
+    def act(self) -> NDArray[np.float32]:
+        """The next action."""
+
+
+class HeldDriver:
+    """A uniform action, held for 20 frames (the article's data)."""
+
+    def __init__(self, random: np.random.Generator) -> None:
+        self._random = random
+        self._left = 0
+        self._action = np.zeros(3)
+
+    def act(self) -> NDArray[np.float32]:
+        """The held action, or a new one."""
+        if self._left == 0:
+            steer, pedal = self._random.uniform(-1, 1), self._random.uniform(-0.5, 1)
+            self._action = _controls(steer, pedal)
+            self._left = HELD_FRAMES
+        self._left -= 1
+        return self._action.astype(np.float32)
+
+
+class OrnsteinUhlenbeckDriver:
+    """Steering and pedal drift around slight gas and return to it."""
+
+    def __init__(self, random: np.random.Generator) -> None:
+        self._random = random
+        self._centre = np.array([0.0, random.uniform(0.1, 0.5)])
+        self._value = self._centre.copy()
+
+    def act(self) -> NDArray[np.float32]:
+        """One step of the process: return rate 0.05, noise 0.12 and 0.06."""
+        noise = self._random.normal(size=2) * (0.12, 0.06)
+        self._value += 0.05 * (self._centre - self._value) + noise
+        return _controls(*self._value).astype(np.float32)
+
+
+class RandomWalkDriver:
+    """Steering and pedal walk between their bounds (ctallec's Brownian data)."""
+
+    def __init__(self, random: np.random.Generator) -> None:
+        self._random = random
+        self._value = np.array([random.uniform(-0.3, 0.3), random.uniform(0.0, 0.6)])
+
+    def act(self) -> NDArray[np.float32]:
+        """One step: noise 0.14 in steering, 0.07 in the pedal."""
+        self._value += self._random.normal(size=2) * (0.14, 0.07)
+        self._value = np.clip(self._value, (-1.0, -0.4), (1.0, 1.0))
+        return _controls(*self._value).astype(np.float32)
+
+
+DRIVERS: dict[str, type[HeldDriver] | type[OrnsteinUhlenbeckDriver] | type[RandomWalkDriver]] = {
+    "held": HeldDriver,
+    "ornstein-uhlenbeck": OrnsteinUhlenbeckDriver,
+    "random-walk": RandomWalkDriver,
+}
+
+
+def _controls(steer: float, pedal: float) -> NDArray[np.float64]:
+    """One pedal for both: positive is gas, negative is brake."""
+    return np.array([np.clip(steer, -1, 1), np.clip(pedal, 0, 1), np.clip(-pedal, 0, 1)])

@@ -1,0 +1,48 @@
+"""Recorded pictures as latents, once, so that the MDN-RNN trains on them many times; each drive also mirrored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from common.errors import DatasetError
+from common.files import write_aside
+from worker.training.checkpoint import load_checkpoint
+from worker.training.dataset import episodes, load, load_pictures
+from worker.training.train_vae import CHECKPOINT, as_tensor
+from worker.worldmodel.vae import VAE, VAEConfig
+
+ENCODED = "encoded"
+
+
+def encode(folder: Path) -> Iterator[int]:
+    """Encode the episodes that are not encoded yet, and all again when the VAE is newer; yields the frames of each."""
+    model = VAE(VAEConfig())
+    if load_checkpoint(folder / CHECKPOINT, model, None) is None:
+        raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
+    model.eval()
+    trained = (folder / CHECKPOINT).stat().st_mtime
+    for path in episodes(folder):
+        target = folder / ENCODED / path.name
+        if target.exists() and target.stat().st_mtime > trained:
+            continue
+        pictures = load_pictures(path)
+        drive = load(path, "action", "reward")
+        mu, logvar = _latents(model, pictures)
+        mirrored_mu, mirrored_logvar = _latents(model, np.ascontiguousarray(pictures[:, :, ::-1]))
+        with write_aside(target) as file:
+            np.savez(
+                file, mu=mu, logvar=logvar, mirrored_mu=mirrored_mu, mirrored_logvar=mirrored_logvar,
+                action=drive["action"], reward=drive["reward"],
+            )  # fmt: skip
+        yield len(pictures)
+
+
+def _latents(model: VAE, pictures: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    with torch.no_grad():
+        parts = [model.encode(as_tensor(pictures[start : start + 100])) for start in range(0, len(pictures), 100)]
+    return torch.cat([mu for mu, _ in parts]).numpy(), torch.cat([logvar for _, logvar in parts]).numpy()

@@ -1,0 +1,30 @@
+"""`dreamfleet encode`: pictures to latents."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+SUMMARY = "encode a data set's pictures with its trained VAE"
+EXTRAS = ("train",)
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Encode what is not encoded yet."""
+    from worker.training.dataset import episodes
+    from worker.training.encode import encode
+    from worker.training.progress import progress_bar
+
+    total = len(episodes(args.data))
+    frames = 0
+    with progress_bar("encode", total, "episodes") as bar:
+        for done, count in enumerate(encode(args.data), start=1):
+            frames += count
+            bar.move(done)
+    print(f"{args.data}: {frames} frames encoded, each also mirrored")
+    return 0
