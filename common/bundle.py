@@ -117,7 +117,9 @@ class BundleStore:
         partial = self.partial(sha256)
         if (found := hash_file(partial)) != sha256:
             partial.unlink()
-            raise BundleError(f"the bundle arrived damaged: its hash is {found[:12]}..., not {sha256[:12]}...; try again")
+            raise BundleError(
+                f"the bundle arrived damaged: its hash is {found[:12]}..., not {sha256[:12]}...; try again"
+            )
         partial.replace(self._path(sha256))
         return Bundle.open(self._path(sha256))
 

@@ -51,7 +51,8 @@ class Client:
         if not documents:
             which = f"run {run!r}" if run else "any run"
             raise ConnectionFailedError(
-                f"no coordinator of {which} answers through {self._where}: it is not running, or you lack the right to ask"
+                f"no coordinator of {which} answers through {self._where}: it is not running, or you lack the "
+                "right to ask"
             )
         return documents[0]
 

@@ -120,13 +120,17 @@ def _plain(value: Any) -> Any:
 
 
 @cache
-def _field_names(kind: type[Any]) -> tuple[str, ...]:
+def _field_names(kind: Any) -> tuple[str, ...]:
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()
 
 
-@cache
 def _checker(hint: Any) -> Check:
-    """Compile a type annotation into a function that returns the checked value or raises."""
+    """A type annotation as a function that returns the checked value or raises."""
+    return _compile(hint)
+
+
+@cache
+def _compile(hint: Any) -> Check:
     if is_dataclass(hint) and isinstance(hint, type):
         return _dataclass_checker(hint)
     origin = get_origin(hint)

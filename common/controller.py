@@ -45,9 +45,7 @@ class ControllerShape:
         return weights, parameters[..., split:]
 
 
-def act(
-    shape: ControllerShape, parameters: NDArray[np.float32], features: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def act(shape: ControllerShape, parameters: NDArray[np.float32], features: NDArray[np.float32]) -> NDArray[np.float32]:
     """Steering in [-1, 1], gas in [0, 1], brake in [0, 1] for features `(features,)`; the reference for the ONNX graph.
 
     Source: hardmaru/WorldModelsExperiments, carracing: tanh; gas (tanh + 1) / 2; brake clip(tanh, 0, 1).

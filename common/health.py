@@ -86,4 +86,6 @@ def _writable(name: str, path: Path) -> Finding:
             free = shutil.disk_usage(where).free
     except OSError as error:
         return Finding(f"{name} folder", False, True, f"{path}: {error.strerror}", "everything", remedy)
-    return Finding(f"{name} folder", free > LEAST_FREE_BYTES, True, f"{path}, {free / 1e9:.1f} GB free", "everything", remedy)
+    return Finding(
+        f"{name} folder", free > LEAST_FREE_BYTES, True, f"{path}, {free / 1e9:.1f} GB free", "everything", remedy
+    )

@@ -36,7 +36,9 @@ class Length:
 Count = Annotated[int, Between(0, 2**63 - 1)]
 Seconds = Annotated[float, Between(0.0, 1e9)]
 Digest = Annotated[bytes, Length(32, 32)]
-Tag = Annotated[bytes, Length(TAG_BYTES, TAG_BYTES)]  # a digest's first bytes, where only a worker's own jobs are told apart
+Tag = Annotated[
+    bytes, Length(TAG_BYTES, TAG_BYTES)
+]  # a digest's first bytes, where only a worker's own jobs are told apart
 Word = Annotated[str, Length(1, 128)]
 Text = Annotated[str, Length(0, 2000)]
 Part = Annotated[bytes, Length(0, MAX_PART)]

@@ -90,8 +90,8 @@ def _explain(network: Network, error: zenoh.ZError) -> str:
     if network.listen:
         return f"cannot listen on {', '.join(network.listen)}: {_first_line(error)}"
     return (
-        f"nobody answers at {', '.join(network.connect)}: start `dreamfleet coordinator` there, or name another address "
-        "with --connect tcp/HOST:PORT"
+        f"nobody answers at {', '.join(network.connect)}: start `dreamfleet coordinator` there, or name another "
+        "address with --connect tcp/HOST:PORT"
     )
 
 
@@ -101,4 +101,4 @@ def _first_line(error: Exception) -> str:
 
 def enqueue_into(inbox: queue.SimpleQueue[Any], kind: str) -> Callable[[Any], None]:
     """A Zenoh callback that only enqueues `(kind, event)`: a slow callback looks like a frozen process."""
-    return zenoh.handlers.Callback(lambda event: inbox.put((kind, event)), indirect=False)  # type: ignore[return-value]
+    return zenoh.handlers.Callback(lambda event: inbox.put((kind, event)), indirect=False)

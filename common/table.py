@@ -11,7 +11,13 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-STATE_STYLES = {"running": "green", "evaluating": "cyan", "paused": "bold red", "ended": "bold", "waiting for workers": "yellow"}
+STATE_STYLES = {
+    "running": "green",
+    "evaluating": "cyan",
+    "paused": "bold red",
+    "ended": "bold",
+    "waiting for workers": "yellow",
+}
 SPARKS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 60
 
@@ -43,7 +49,8 @@ def _facts(status: dict[str, Any]) -> Table:
     grid.add_column(style="dim")
     grid.add_column()
     grid.add_row(
-        "task", f"{task['task']}, {task['horizon']} steps", "population", f"{settings['population']} x {settings['episodes']}",
+        "task", f"{task['task']}, {task['horizon']} steps", "population",
+        f"{settings['population']} x {settings['episodes']}",
     )  # fmt: skip
     grid.add_row(
         "last generation", _spread(last) if last else "-",

@@ -41,6 +41,7 @@ class Normals:
         self.generator = np.random.Generator(np.random.PCG64(seed))
 
     def __call__(self, *shape: int) -> NDArray[np.float64]:
+        """Draw an array of `shape`, as pycma asks for it."""
         return self.generator.standard_normal(shape)
 
 

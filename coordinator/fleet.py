@@ -287,7 +287,9 @@ class Fleet:
         if self.paused:
             return given
         loads = {name: len(member.leases) for name, member in self.members.items() if member.credit > 0}
-        evaluating = sum(wanted.work.job.kind == "evaluate" and bool(wanted.holders) for wanted in self._wanted.values())
+        evaluating = sum(
+            wanted.work.job.kind == "evaluate" and bool(wanted.holders) for wanted in self._wanted.values()
+        )
         passed_over = []
         while self._queue and loads:
             entry = heapq.heappop(self._queue)

@@ -33,16 +33,16 @@ class RunRequest:
     mixed: bool = False
 
 
-def serve_run(
-    request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None
-) -> Run:
+def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
     """Serve a new or continued run until it ends or is stopped; `on_stoppable` is handed the way to stop it."""
     folder = request.runs_dir / check_run_name(request.name)
     settings, bundle = _settle(request, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise JournalError(f"cannot write in {request.runs_dir}: {error.strerror}; choose another --runs-dir") from error
+        raise JournalError(
+            f"cannot write in {request.runs_dir}: {error.strerror}; choose another --runs-dir"
+        ) from error
     with run_lock(folder):
         if request.config is None:
             journal = Journal(folder / "journal.sqlite")

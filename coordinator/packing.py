@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from common.messages import MAX_MESSAGE, MAX_PART, Verdict, VectorPart
+from common.messages import MAX_MESSAGE, MAX_PART, VectorPart, Verdict
 from coordinator.jobs import Work
 
 # Bytes of msgpack, rounded up: the envelope, and each item beside its variable part.
@@ -46,8 +46,7 @@ def pack(work: Sequence[Work], cancels: Sequence[bytes], verdicts: Sequence[Verd
     return [batch for batch in batches if batch.size > _ENVELOPE]
 
 
-def _pack_work(each: Work, batches: list[Content], room: object) -> None:
-    assert callable(room)
+def _pack_work(each: Work, batches: list[Content], room: Callable[[int], Content]) -> None:
     if batches[-1].has(each.job.vector) and batches[-1].size + _JOB <= MAX_MESSAGE:
         room(_JOB).work.append(each)
         return

@@ -73,7 +73,8 @@ class Run:
         if mixed or self.fingerprint in (None, request.fingerprint):
             return None
         return f"fingerprints differ: the run has [{self.fingerprint}], the worker [{request.fingerprint}]", (
-            "install the same package versions on a host of the same CPU features, or start the coordinator with --mixed"
+            "install the same package versions on a host of the same CPU features, or start the coordinator with "
+            "--mixed"
         )
 
     def admit(self, request: HelloRequest, now: float) -> None:
@@ -218,9 +219,7 @@ class Run:
         work = evaluation.work(self.settings.task)
         known = self._journal.results_of("evaluate", evaluation.generation)
         scores = {digest: fitness for digest, (fitness, _) in known.items()}
-        self._evaluating[evaluation.generation] = OpenEvaluation(
-            evaluation, [each.job.digest for each in work], scores
-        )
+        self._evaluating[evaluation.generation] = OpenEvaluation(evaluation, [each.job.digest for each in work], scores)
         self.fleet.offer([each for each in work if each.job.digest not in scores])
         self._finish_evaluation(evaluation.generation)
 

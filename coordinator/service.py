@@ -38,7 +38,7 @@ from common.runs import BUNDLE
 from common.session import LEASE_MS, Network, enqueue_into, open_session
 from coordinator.fleet import Send
 from coordinator.run import Run
-from coordinator.status import Snapshot, take_snapshot
+from coordinator.status import PARTS, Snapshot, take_snapshot
 
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a loss waits to be acted upon
@@ -121,8 +121,7 @@ class Service:
             ),
             answer(keys.hello(name), enqueue_into(events, "hello")),
             answer(keys.control(name, "*"), enqueue_into(events, "control")),
-            answer(keys.status(name), _callback(self._answer_status)),
-            answer(keys.status(name, "*"), _callback(self._answer_status)),
+            *(answer(keys.status(name, part), _callback(self._answer_status(part))) for part in PARTS),
             answer(keys.bundle(name, self._run.settings.task.bundle), _callback(self._answer_bundle)),
         ]
 
@@ -258,20 +257,23 @@ class Service:
         now = monotonic()
         return take_snapshot(self._run, self._name, dict(self._inbox.dropped), now - self._started, now)
 
-    def _answer_status(self, query: zenoh.Query) -> None:
-        """In the queryable's own thread: reads the last snapshot and nothing else."""
-        with query:
-            for part in _parts(str(query.key_expr), keys.status(self._name)):
-                payload = self._snapshot.answer(part, dict(query.parameters.values))
+    def _answer_status(self, part: str) -> Callable[[zenoh.Query], None]:
+        """An answer in the queryable's own thread: it reads the last snapshot and nothing else."""
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                payload = self._snapshot.answer(part, query.parameters)
                 query.reply(keys.status(self._name, part), payload, encoding="application/json")
+
+        return answer
 
     def _answer_bundle(self, query: zenoh.Query) -> None:
         """In the queryable's own thread: reads a file that nobody writes."""
         with query:
             sha256 = self._run.settings.task.bundle
-            values = dict(query.parameters.values)
+            asked = query.parameters
             try:
-                offset, length = int(values.get("offset", "0")), int(values.get("length", str(MAX_PART)))
+                offset, length = int(asked.get("offset") or 0), int(asked.get("length") or MAX_PART)
             except ValueError:
                 query.reply_err(json.dumps({"why": "offset and length must be whole numbers"}).encode())
                 return
@@ -292,11 +294,3 @@ class Service:
 
 def _callback(answer: Callable[[zenoh.Query], None]) -> Any:
     return zenoh.handlers.Callback(answer, indirect=False)
-
-
-def _parts(key: str, root: str) -> list[str]:
-    """Which parts of the status a query's key expression asks for; a wildcard asks for all below the root."""
-    if key == root:
-        return [""]
-    part = key.removeprefix(f"{root}/")
-    return ["generation", "workers", "history", "best"] if "*" in part else [part]

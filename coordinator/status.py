@@ -5,14 +5,22 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from common.fingerprint import package_version
 from coordinator.fleet import Member
 from coordinator.run import Run
 
 SCHEMA = 1
+PARTS = ("", "generation", "workers", "history", "best")
 PAGE = 100  # rows of a page at most, so that a reply stays under the message limit
+
+
+class Parameters(Protocol):
+    """A query's parameters."""
+
+    def get(self, key: str) -> str | None:
+        """One of them, if it was given."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +33,7 @@ class Snapshot:
     history: list[dict[str, Any]]
     best: dict[str, Any]
 
-    def answer(self, part: str, parameters: Mapping[str, str]) -> bytes:
+    def answer(self, part: str, parameters: Parameters) -> bytes:
         """The JSON of one part; `workers` and `history` are paged by `offset` and `limit`."""
         head = {"schema": SCHEMA, "run": self.status["run"], "run_uid": self.status["run_uid"]}
         if part in ("workers", "history"):
@@ -102,7 +110,9 @@ def _waste(run: Run) -> dict[str, Any]:
     return {
         "discarded_steps": discarded,
         "share": round(discarded / (discarded + accepted), 4) if discarded else 0.0,
-        **{name: counts[name] for name in ("reissued", "duplicate", "obsolete", "errors", "resent_batches", "silences")},
+        **{
+            name: counts[name] for name in ("reissued", "duplicate", "obsolete", "errors", "resent_batches", "silences")
+        },
     }
 
 

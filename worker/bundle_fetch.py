@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import queue
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 import zenoh
@@ -20,6 +21,7 @@ WINDOW = 8  # queries in flight: enough to fill a link with a long way
 ATTEMPTS = 3  # damaged downloads before giving up
 SILENCES = 20  # rounds without any part before giving up
 QUERY_TIMEOUT = 3.0
+PAUSE = 0.5  # seconds after a round without any part
 
 
 def obtain(session: zenoh.Session, run: str, sha256: str, store: BundleStore, inbox: Inbox) -> Bundle:
@@ -57,6 +59,8 @@ def _download(session: zenoh.Session, key: str, sha256: str, path: Path, inbox: 
             if total is not None and file.tell() > total:
                 file.truncate(0)  # the beginning of something else
             silences = 0 if parts else silences + 1
+            if not parts:
+                sleep(PAUSE)
             if silences >= SILENCES:
                 raise BundleError("the coordinator no longer answers for its bundle; start the worker again later")
 

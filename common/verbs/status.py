@@ -45,7 +45,9 @@ def run(args: argparse.Namespace) -> int:
                 if args.json:
                     live.console.print_json(data=status)
                 else:
-                    live.update(run_panel(status, list(client.pages("workers", name)), list(client.pages("history", name))))
+                    live.update(
+                        run_panel(status, list(client.pages("workers", name)), list(client.pages("history", name)))
+                    )
                 time.sleep(REFRESH)
                 try:
                     status = client.status(name)

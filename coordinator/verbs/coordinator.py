@@ -7,8 +7,9 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from common.config import add_flags, choose_preset, load, read_toml
 from common.errors import UsageError
@@ -17,6 +18,7 @@ from common.session import DEFAULT_ENDPOINT, Network
 from coordinator.config import PRESETS, LimitsConfig, NetworkConfig, RunConfig
 
 if TYPE_CHECKING:
+    from coordinator.main import RunRequest
     from coordinator.run import Run
 
 SUMMARY = "start a run: CMA-ES decides, workers score"
@@ -41,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
     logging.getLogger("coordinator").setLevel(logging.INFO)
     file = read_toml(args.config, SECTIONS)
-    sources = {"flags": args, "environment": os.environ, "file": file}
+    sources: Any = {"flags": args, "environment": os.environ, "file": file}
     config = load(RunConfig, "run", preset=choose_preset(PRESETS, args.preset), **sources)
     limits = load(LimitsConfig, "limits", **sources)
     network = load(NetworkConfig, "network", **sources)
@@ -75,14 +77,13 @@ def _refuse_frozen(args: argparse.Namespace, file: dict[str, object]) -> None:
         raise UsageError(f"{what}: frozen with run {args.resume}; start another run to change it")
 
 
-def _stop_on_signals(stop: object) -> None:
-    assert callable(stop)
+def _stop_on_signals(stop: Callable[[], None]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop())
 
 
-def _report(run: Run, request: object) -> None:
-    name, folder = request.name, request.runs_dir / request.name  # type: ignore[attr-defined]
+def _report(run: Run, request: RunRequest) -> None:
+    name, folder = request.name, request.runs_dir / request.name
     if run.ended is None:
         print(f"left run {name} open; continue it with: dreamfleet coordinator --resume {name}", file=sys.stderr)
         return

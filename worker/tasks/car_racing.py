@@ -24,7 +24,7 @@ class CarRacing:
     width = 1
 
     def make_environment(self) -> gymnasium.Env[Any, Any]:
-        """gymnasium's own environment; the observation is the 64x64 picture."""
+        """Gymnasium's own environment; the observation is the 64x64 picture."""
         return PictureObservation(gymnasium.make(ENVIRONMENT))
 
     def make_policy(self, bundle: Bundle) -> CarRacingPolicy:
@@ -70,4 +70,5 @@ class CarRacingPolicy:
         action, self._hidden, self._cell, self.latent = self._step.step(
             observation[None], self._parameters, self._hidden, self._cell
         )
-        return action[0]
+        chosen: NDArray[np.float32] = action[0]
+        return chosen

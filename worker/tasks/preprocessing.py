@@ -20,7 +20,7 @@ def _row_weights() -> NDArray[np.float32]:
     edges = np.arange(SIZE + 1) * 21
     sources = np.arange(SCENE_ROWS) * 16
     overlap = np.minimum(edges[1:, None], sources + 16) - np.maximum(edges[:-1, None], sources)
-    return np.clip(overlap, 0, 16).astype(np.float32)
+    return np.asarray(np.clip(overlap, 0, 16), dtype=np.float32)
 
 
 _ROWS = _row_weights()

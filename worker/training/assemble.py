@@ -47,7 +47,9 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundl
     parts = graphs(vae, rnn, initial_latents(folder))
     if with_weights:
         tensors = {f"vae.{key}": value for key, value in vae.items()} | {f"mdnrnn.{k}": v for k, v in rnn.items()}
-        parts[WEIGHTS] = save(tensors, {"vae": json.dumps(asdict(VAEConfig())), "mdnrnn": json.dumps(asdict(MDNRNNConfig()))})
+        parts[WEIGHTS] = save(
+            tensors, {"vae": json.dumps(asdict(VAEConfig())), "mdnrnn": json.dumps(asdict(MDNRNNConfig()))}
+        )
     return write_bundle(out, manifest(name, provenance), parts)
 
 

@@ -37,7 +37,9 @@ def load_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
         weights = {name: tensor for name, tensor in tensors.items() if name.startswith("model.")}
         model.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
     except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
-        raise DatasetError(f"checkpoint {path} does not fit or is damaged ({error}); delete it to begin anew") from error
+        raise DatasetError(
+            f"checkpoint {path} does not fit or is damaged ({error}); delete it to begin anew"
+        ) from error
     if optimiser is not None:
         _restore_adam(optimiser, {name: tensor for name, tensor in tensors.items() if name.startswith("adam.")})
     return progress

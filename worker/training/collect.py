@@ -67,7 +67,7 @@ def _collect_one(task: tuple[Path, CollectConfig, int]) -> int:
     folder, config, number = task
     arrays = drive(config, number)
     with write_aside(episode_path(folder, number)) as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
     return len(arrays["action"])
 
 
@@ -80,14 +80,16 @@ def drive(config: CollectConfig, number: int) -> dict[str, NDArray[Any]]:
     observation, _ = environment.reset(seed=int(random.integers(2**20, 2**31)))
     if random.random() < config.anywhere:
         observation = _put_anywhere(environment, random)
-    pictures, actions, rewards = [], [], []
+    pictures: list[NDArray[np.uint8]] = []
+    actions: list[NDArray[np.float32]] = []
+    rewards: list[float] = []
     idle, ended = 0, False
     while len(actions) < config.steps and idle < config.patience and not ended:
         action = driver.act()
         pictures.append(picture(observation))
         observation, reward, terminated, truncated, _ = environment.step(action)
         actions.append(action)
-        rewards.append(reward)
+        rewards.append(float(reward))
         idle = 0 if float(reward) > 0 else idle + 1
         ended = terminated or truncated
     environment.close()
@@ -109,6 +111,8 @@ def _put_anywhere(environment: gymnasium.Env[Any, Any], random: np.random.Genera
     _, beta, x, y = inner.track[random.integers(len(inner.track))]
     shift, turn = random.normal(0, 2.0), random.normal(0, 0.25)
     inner.car.destroy()
-    inner.car = Car(inner.world, beta + turn, x + shift * np.cos(beta), y + shift * np.sin(beta))
+    inner.car = Car(  # type: ignore[no-untyped-call]
+        inner.world, beta + turn, x + shift * np.cos(beta), y + shift * np.sin(beta)
+    )
     inner.t = 1.0  # the camera zooms in during the first second
     return environment.step(np.zeros(3, dtype=np.float32))[0]

@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from common.progress import append_curve
 from worker.training.checkpoint import load_checkpoint, save_checkpoint
 from worker.training.dataset import episodes, load, pad, split
 from worker.training.encode import ENCODED
 from worker.training.presets import TrainConfig
-from worker.training.progress import append_curve
 from worker.training.train_vae import Report
 from worker.worldmodel.mdnrnn import MDNRNN, MDNRNNConfig, latent_loss, reward_loss
 
@@ -78,7 +78,7 @@ def load_drives(paths: Sequence[Path], mirrored: NDArray[np.bool_]) -> Drives:
         arrays = load(path, f"{prefix}mu", f"{prefix}logvar", "action", "reward")
         columns["mu"].append(arrays[f"{prefix}mu"])
         columns["logvar"].append(arrays[f"{prefix}logvar"])
-        columns["action"].append(arrays["action"] * (FLIP if flip else 1))
+        columns["action"].append(arrays["action"] * (FLIP if flip else FLIP**2))
         columns["reward"].append(arrays["reward"])
         columns["mask"].append(np.ones(len(arrays["reward"]), dtype=np.float32))
     return Drives(**{name: torch.from_numpy(pad(arrays)) for name, arrays in columns.items()})

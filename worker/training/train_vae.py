@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from common.progress import append_curve
 from worker.training.checkpoint import load_checkpoint, save_checkpoint
 from worker.training.dataset import episodes, load_pictures, picture_batches, split
 from worker.training.presets import TrainConfig
-from worker.training.progress import append_curve
 from worker.worldmodel.vae import VAE, VAEConfig
 
 CHECKPOINT = "vae.safetensors"

@@ -22,5 +22,6 @@ def run(args: argparse.Namespace) -> int:
 
     bundle = assemble(args.data, args.out, args.out.stem, with_weights=args.with_weights)
     size = bundle.path.stat().st_size / 1e6
-    print(f"{bundle.path}: {size:.1f} MB, sha256 {bundle.sha256}, controllers of {bundle.controller_shape.size} parameters")
+    parameters = bundle.controller_shape.size
+    print(f"{bundle.path}: {size:.1f} MB, sha256 {bundle.sha256}, controllers of {parameters} parameters")
     return 0

@@ -22,9 +22,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Collect what is missing."""
+    from common.progress import progress_bar
     from worker.training.collect import collect
     from worker.training.presets import find_preset
-    from worker.training.progress import progress_bar
 
     config = find_preset(args.preset).collect
     changes = {name: getattr(args, name) for name in ("episodes", "seed") if getattr(args, name) is not None}

@@ -19,9 +19,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
+    from common.progress import progress_bar
     from worker.training.assemble import record_quality
     from worker.training.presets import find_preset
-    from worker.training.progress import progress_bar
     from worker.training.train_mdnrnn import train_mdnrnn
 
     config = find_preset(args.preset).mdnrnn

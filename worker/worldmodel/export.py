@@ -93,7 +93,7 @@ def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
         kernel, bias = weight(f"decoder.{layer}.weight"), weight(f"decoder.{layer}.bias")
         value = graph.node("ConvTranspose", value, kernel, bias, strides=[2, 2])
         value = graph.node("Sigmoid" if layer == 6 else "Relu", value)
-    value = graph.node("Mul", value, graph.constant(np.float32(255)))
+    value = graph.node("Mul", value, graph.constant(np.array(255, np.float32)))
     value = graph.node("Cast", graph.node("Round", value), to=TensorProto.UINT8)
     value = graph.node("Transpose", value, perm=[0, 2, 3, 1])
     graph.give(value, "picture", TensorProto.UINT8, SIZE, SIZE, 3)
@@ -121,16 +121,6 @@ def export_policy(vae: Weights, rnn: Weights, vae_config: VAEConfig, rnn_config:
     graph.give(next_cell, "next_cell", TensorProto.FLOAT, hidden_size)
     graph.give(latent, "latent", TensorProto.FLOAT, rnn_config.latent)
     return graph.build()
-
-
-def policy_flops(vae_config: VAEConfig, rnn_config: MDNRNNConfig) -> int:
-    """Floating-point operations of one policy step: two a multiply-add of its matrix products."""
-    sizes, channels = (31, 14, 6, 2), (3, *vae_config.channels)
-    convolutions = sum(side**2 * 16 * channels[i] * channels[i + 1] for i, side in enumerate(sizes))
-    features = rnn_config.latent + rnn_config.hidden
-    latent = 4 * channels[-1] * rnn_config.latent
-    lstm = 4 * rnn_config.hidden * (features + rnn_config.actions)
-    return 2 * (convolutions + latent + lstm + rnn_config.actions * features)
 
 
 def _encode(graph: GraphBuilder, picture: str, vae: Weights, config: VAEConfig) -> str:
@@ -163,9 +153,7 @@ def _act(graph: GraphBuilder, parameters: str, features: str, config: MDNRNNConf
     return str(graph.node("Max", moved, graph.constant(low)))
 
 
-def _advance(
-    graph: GraphBuilder, inputs: Sequence[str], cell: str, rnn: Weights, hidden_size: int
-) -> tuple[str, str]:
+def _advance(graph: GraphBuilder, inputs: Sequence[str], cell: str, rnn: Weights, hidden_size: int) -> tuple[str, str]:
     """One LSTM step as one matrix product; torch orders the gates input, forget, cell, output."""
     kernel = np.concatenate([rnn["lstm.weight_ih_l0"], rnn["lstm.weight_hh_l0"]], axis=1).T
     bias = rnn["lstm.bias_ih_l0"] + rnn["lstm.bias_hh_l0"]

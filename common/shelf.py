@@ -1,0 +1,23 @@
+"""Where a controller named on the command line lies: a file, a run's own, or one that ships."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from common.bundle import pretrained
+from common.controller import Controller
+from common.errors import ControllerError
+from common.runs import BUNDLE, CONTROLLER
+
+
+def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]:
+    """The controller, and the bundle that lies beside it if one does."""
+    path, run, shipped = Path(name), runs_dir / name, pretrained() / f"{name}.npz"
+    if path.is_file():
+        return Controller.load(path), path.parent / BUNDLE
+    if (run / CONTROLLER).is_file():
+        return Controller.load(run / CONTROLLER), run / BUNDLE
+    if shipped.is_file():
+        return Controller.load(shipped), None
+    names = ", ".join(sorted(each.stem for each in pretrained().glob("*.npz"))) or "none"
+    raise ControllerError(f"no controller {name!r}: give a file, a run that has ended, or one that ships: {names}")

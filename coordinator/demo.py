@@ -1,0 +1,180 @@
+"""The demonstration: a coordinator and one worker a core on this machine, as anybody would start them by hand.
+
+Spawns console commands and watches over Zenoh; imports neither the run nor the worker.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+
+from common.client import Client
+from common.config import option
+from common.errors import ConnectionFailedError, DreamfleetError, UsageError
+from common.runs import CONTROLLER, open_run
+from common.table import run_panel
+
+REFRESH = 0.5
+START_SECONDS = 30.0
+PLOT, VIDEO = "fitness.png", "drive.mp4"
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """How long and how large; the defaults suit two cores and gymnasium's own picture."""
+
+    minutes: float = option(4.0, "evolve for so long")
+    population: int = option(16, "candidates a generation")
+    episodes: int = option(2, "episodes a candidate")
+    horizon: int = option(150, "steps of an episode at most")
+    sigma0: float = option(0.1, "first step size")
+    seed: int = option(1, "makes the run")
+    tracks: int = option(8, "unseen tracks that the mean is judged on")
+    workers: int = option(0, "worker processes; 0: one a core")
+    port: int = option(7447, "port of the embedded router")
+
+    def __post_init__(self) -> None:
+        if self.minutes <= 0 or self.tracks < 1 or self.workers < 0:
+            raise UsageError("--minutes must be positive, --tracks at least 1, --workers at least 0")
+
+
+class Demo:
+    """One demonstration run in `runs_dir`."""
+
+    def __init__(self, config: DemoConfig, name: str, runs_dir: Path) -> None:
+        self._config = config
+        self._name = name
+        self._runs_dir = runs_dir
+        self._folder = runs_dir / name
+        self._endpoint = f"tcp/127.0.0.1:{config.port}"
+        self._console = Console()
+
+    def play(self) -> None:
+        """Evolve, judge, draw, record, and say what to try next."""
+        self._evolve()
+        self._say("judging the evolved mean on unseen tracks, whole episodes, in gymnasium's own environment")
+        controller = str(self._folder / CONTROLLER)
+        self._call("evaluate", "--controller", controller, "--episodes", str(self._config.tracks))
+        self._plot()
+        self._say("recording a drive")
+        self._call("record", "--controller", controller, "--out", str(self._folder / VIDEO), "--steps", "600")
+        self._farewell()
+
+    def _evolve(self) -> None:
+        config = self._config
+        workers = config.workers or len(os.sched_getaffinity(0))
+        self._say(f"evolving for {config.minutes:g} minutes: a coordinator and {workers} workers on this machine")
+        with ExitStack() as stack:
+            coordinator = self._spawn(
+                stack, "coordinator", "--run", self._name, "--runs-dir", str(self._runs_dir),
+                "--listen", self._endpoint, "--population", str(config.population), "--episodes", str(config.episodes),
+                "--horizon", str(config.horizon), "--sigma0", str(config.sigma0), "--seed", str(config.seed),
+                "--minutes", str(config.minutes), "--evaluate-every", "0",
+            )  # fmt: skip
+            client = self._connect(coordinator)
+            with client:
+                for number in range(workers):
+                    self._spawn(
+                        stack, "worker", "--connect", self._endpoint, "--run", self._name,
+                        "--name", f"core-{number}", "--slots", "1",
+                    )  # fmt: skip
+                self._watch(client, coordinator)
+            if coordinator.wait() != 0:
+                raise DreamfleetError(f"the coordinator failed; its words are in {self._log('coordinator')}")
+
+    def _connect(self, coordinator: subprocess.Popen[bytes]) -> Client:
+        deadline = time.monotonic() + START_SECONDS
+        while True:
+            if coordinator.poll() is not None:
+                raise DreamfleetError(self._last_words("coordinator"))
+            try:
+                return Client((self._endpoint,))
+            except ConnectionFailedError:
+                if time.monotonic() > deadline:
+                    raise
+
+    def _watch(self, client: Client, coordinator: subprocess.Popen[bytes]) -> None:
+        with Live(console=self._console, refresh_per_second=4) as live:
+            while coordinator.poll() is None:
+                try:
+                    status = client.status(self._name)
+                    workers = list(client.pages("workers", self._name))
+                    live.update(run_panel(status, workers, list(client.pages("history", self._name))))
+                except (ConnectionFailedError, IndexError):
+                    pass  # it is starting, or has just ended
+                try:
+                    coordinator.wait(REFRESH)
+                except subprocess.TimeoutExpired:
+                    continue
+
+    def _spawn(self, stack: ExitStack, verb: str, *arguments: str) -> subprocess.Popen[bytes]:
+        """Start a verb whose words go to a log in the run's folder; it ends when the stack does."""
+        name = arguments[arguments.index("--name") + 1] if "--name" in arguments else verb
+        self._folder.mkdir(parents=True, exist_ok=True)
+        log = stack.enter_context(self._log(name).open("wb"))
+        process = subprocess.Popen(  # noqa: S603 - our own interpreter and our own arguments
+            _command(verb, *arguments), stdout=log, stderr=log, start_new_session=True
+        )
+        stack.callback(_end, process)
+        return process
+
+    def _call(self, verb: str, *arguments: str) -> None:
+        result = subprocess.run(_command(verb, *arguments), check=False)  # noqa: S603 - as above
+        if result.returncode != 0:
+            raise DreamfleetError(f"dreamfleet {verb} failed")
+
+    def _plot(self) -> None:
+        from coordinator.plot import plot_fitness
+
+        with open_run(self._runs_dir, self._name) as run:
+            plot_fitness(run, self._folder / PLOT)
+        self._console.print(f"{self._folder / PLOT}: fitness over generations")
+
+    def _farewell(self) -> None:
+        controller = self._folder / CONTROLLER
+        self._console.print(
+            f"\n[bold]In {self._folder}[/]: the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
+        )
+        for command in (
+            f"dreamfleet replay {self._name} --candidate 0/0",
+            f"dreamfleet evaluate --controller {controller} --episodes 100",
+            f"dreamfleet coordinator --run mine --preset frugal --listen {self._endpoint}   "
+            "# and, on any host: dreamfleet worker --connect tcp/HOST:PORT",
+        ):
+            self._console.print(f"  {command}", style="green", highlight=False, soft_wrap=True)
+
+    def _say(self, text: str) -> None:
+        self._console.print(f"[bold]{text}[/]")
+
+    def _log(self, name: str) -> Path:
+        return self._folder / f"{name}.log"
+
+    def _last_words(self, name: str) -> str:
+        lines = self._log(name).read_text(errors="replace").strip().splitlines()
+        return lines[-1].removeprefix("dreamfleet: ") if lines else f"the {name} ended without a word"
+
+
+def _command(verb: str, *arguments: str) -> Sequence[str]:
+    return [sys.executable, "-m", "common.cli", verb, *arguments]
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Ask a child to leave, twice if it must be."""
+    for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGKILL):
+        if process.poll() is not None:
+            return
+        process.send_signal(number)
+        try:
+            process.wait(3)
+        except subprocess.TimeoutExpired:
+            continue

@@ -1,0 +1,38 @@
+"""A run's fitness over its generations, as a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from common.runs import RunFolder
+
+
+def plot_fitness(run: RunFolder, path: Path) -> None:
+    """Write a PNG: each generation's mean, spread and best; evaluations of the mean where there are any."""
+    history, evaluations, settings = run.history(), run.evaluations(), run.settings
+    number = np.array([each.number for each in history])
+    mean = np.array([each.mean for each in history])
+    std = np.array([each.std for each in history])
+    figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
+    axes.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label="± 1 standard deviation")
+    axes.plot(number, mean, color="tab:blue", label="mean of the population")
+    axes.plot(number, [each.best for each in history], color="tab:orange", linewidth=1, label="best candidate")
+    if evaluations:
+        axes.errorbar(
+            [each.generation for each in evaluations], [each.mean for each in evaluations],
+            [each.std / np.sqrt(each.episodes) for each in evaluations], fmt="o", color="tab:green", capsize=3,
+            label=f"evaluated mean, {settings.evaluation_episodes} whole episodes (± standard error)",
+        )  # fmt: skip
+    task, size = settings.task, f"{settings.population} candidates x {settings.episodes} episodes"
+    axes.set(xlabel="generation", ylabel=f"fitness over {task.horizon} steps")
+    axes.set_title(f"{run.name}: {task.task}, {size}, seed {settings.seed}", fontsize=11)
+    axes.grid(alpha=0.3)
+    axes.legend(loc="best", fontsize=9)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

@@ -1,0 +1,82 @@
+"""Measuring a policy step against its floor and against torch, in one process and alternating blocks."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from common.bundle import Bundle
+from worker.worldmodel.inference import PolicyStep
+
+BLOCKS = 15
+BLOCK_SECONDS = 0.15
+MATRIX = 768  # fits the second-level cache thrice, so that it measures arithmetic
+Measured = Callable[[], Any]
+
+
+def bench_policy(bundle: Bundle) -> dict[str, float | str | None]:
+    """`over_floor`: time of a policy step at batch 1 over its FLOPs at this core's matrix rate; `torch_ratio`."""
+    policy, random = PolicyStep(bundle), np.random.default_rng(0)
+    picture = random.integers(0, 256, (1, *bundle.manifest.picture), dtype=np.uint8)
+    parameters = random.normal(0, 0.1, (1, policy.shape.size)).astype(np.float32)
+    hidden, cell = policy.zero_state(1)
+    matrix = random.normal(size=(MATRIX, MATRIX)).astype(np.float32)
+    product = np.empty_like(matrix)
+    cases: dict[str, Measured] = {
+        "step": lambda: policy.step(picture, parameters, hidden, cell),
+        "product": lambda: np.matmul(matrix, matrix, out=product),
+    }
+    note = ""
+    try:
+        from worker.worldmodel.eager import make_torch_step
+
+        cases["torch"] = make_torch_step(bundle, picture, parameters)
+    except ModuleNotFoundError as error:
+        note = f"torch_ratio needs {error.name}: pip install 'dreamfleet[train]'"
+    seconds = alternate(cases)
+    rate = 2 * MATRIX**3 / seconds["product"]
+    return {
+        "over_floor": round(seconds["step"] * rate / flops(bundle), 3),
+        "torch_ratio": round(seconds["torch"] / seconds["step"], 2) if "torch" in seconds else None,
+        "microseconds": round(seconds["step"] * 1e6, 1),
+        "torch_microseconds": round(seconds["torch"] * 1e6, 1) if "torch" in seconds else None,
+        "flops": flops(bundle),
+        "gflops_of_core": round(rate / 1e9, 1),
+        **({"note": note} if note else {}),
+    }
+
+
+def flops(bundle: Bundle) -> int:
+    """Floating-point operations of one policy step, two a multiply-add of its matrix products."""
+    manifest = bundle.manifest
+    sides, channels = (31, 14, 6, 2), (manifest.picture[2], 32, 64, 128, 256)
+    convolutions = sum(side**2 * 16 * channels[i] * channels[i + 1] for i, side in enumerate(sides))
+    features = manifest.latent + manifest.hidden
+    lstm = 4 * manifest.hidden * (features + manifest.actions)
+    return 2 * (convolutions + 4 * channels[-1] * manifest.latent + lstm + manifest.actions * features)
+
+
+def alternate(cases: dict[str, Measured]) -> dict[str, float]:
+    """Seconds a call of each case: the median of blocks that take turns, so that a slower spell hits all alike."""
+    counts = {name: _calls_a_block(call) for name, call in cases.items()}
+    blocks: dict[str, list[float]] = {name: [] for name in cases}
+    for _ in range(BLOCKS):
+        for name, call in cases.items():
+            started = perf_counter()
+            for _ in range(counts[name]):
+                call()
+            blocks[name].append((perf_counter() - started) / counts[name])
+    return {name: statistics.median(values) for name, values in blocks.items()}
+
+
+def _calls_a_block(call: Measured) -> int:
+    call()
+    started, calls = perf_counter(), 0
+    while perf_counter() - started < BLOCK_SECONDS:
+        call()
+        calls += 1
+    return calls

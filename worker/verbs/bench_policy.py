@@ -1,0 +1,32 @@
+"""`dreamfleet bench policy`: how near a policy step is to what the core can do."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+SUMMARY = "measure a policy step against this core's matrix rate and against torch"
+EXTRAS = ("worker",)
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("--bundle", default="tiny", help="the world model (default tiny)")
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure on one thread and print."""
+    from common.threads import pin_thread_pools
+
+    pin_thread_pools()  # before numpy's library loads
+    from common.bundle import find_bundle
+    from worker.bench import bench_policy
+
+    figures = bench_policy(find_bundle(args.bundle))
+    if args.json:
+        print(json.dumps(figures))
+    else:
+        for name, value in figures.items():
+            print(f"{name:>20}  {value}")
+    return 0

@@ -1,0 +1,44 @@
+"""`dreamfleet record`: a drive as a video."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+from common.errors import UsageError
+from common.runs import default_runs_dir
+from common.seeds import TEST
+
+SUMMARY = "record a drive as an mp4: the track, what the model sees, what its decoder makes of it"
+EXTRAS = ("worker", "views")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("--controller", required=True, help="a file, a run that has ended, or one that ships")
+    parser.add_argument("--seed", type=int, default=TEST.start, help=f"the track (default {TEST.start})")
+    parser.add_argument("--steps", type=int, default=1000, help="steps at most (default 1000)")
+    parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help="the video to write (default drive.mp4)")
+    parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
+    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Record and print the score."""
+    if args.steps < 1 or args.seed < 0:
+        raise UsageError("--steps must be at least 1 and --seed at least 0")
+    if args.out.suffix != ".mp4":
+        raise UsageError(f"--out {args.out}: give a name that ends in .mp4")
+    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    from common.progress import progress_bar
+    from common.shelf import find_controller
+    from worker.evaluation import bundle_for
+    from worker.recording import record
+
+    controller, beside = find_controller(args.controller, args.runs_dir)
+    bundle = bundle_for(controller, args.bundle, beside)
+    with progress_bar("record", args.steps, "steps") as bar:
+        score = record(controller, bundle, args.seed, args.steps, args.out, bar.move)
+    print(f"{args.out}: score {score:.1f} on track {args.seed}")
+    return 0
