@@ -115,7 +115,8 @@ def _plain(value: Any) -> Any:
     """Nested dataclasses as dictionaries, without `dataclasses.asdict`'s deep copies of every vector."""
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
-    names = _field_names(type(value))
+    kind: Any = type(value)
+    names = _field_names(kind)
     return {name: _plain(getattr(value, name)) for name in names} if names else value
 
 

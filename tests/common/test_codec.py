@@ -1,0 +1,151 @@
+"""The codec and the golden fixtures: each message as the first version wrote it, decoded for ever.
+
+A new message's fixture is written by `python -m tests.common.test_codec`; one that exists is never written again.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.codec import Inbox, MalformedError, decode, decode_json, encode, encode_json, encoding
+from common.messages import MAX_MESSAGE, WIRE, Beat, HelloRequest, JobBatch, ResultBatch
+from tests.support.samples import JSON, MSGPACK, VECTOR_ID
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+@pytest.mark.parametrize("name", MSGPACK)
+def test_golden_messages_decode_for_ever(name):
+    sample, payload = MSGPACK[name], (GOLDEN / f"{name}.v1.msgpack").read_bytes()
+    assert decode(type(sample), payload) == sample
+    assert encode(sample) == payload
+
+
+@pytest.mark.parametrize("name", JSON)
+def test_golden_documents_decode_for_ever(name):
+    sample, payload = JSON[name], (GOLDEN / f"{name}.v1.json").read_bytes()
+    assert decode_json(type(sample), payload) == sample
+    assert encode_json(sample) == payload
+
+
+def test_every_wire_message_has_a_fixture():
+    assert {type(sample) for sample in MSGPACK.values()} == set(WIRE)
+
+
+def test_the_encoding_names_the_schema():
+    assert encoding(JobBatch) == "application/msgpack;dreamfleet.job.v1"
+
+
+def damaged(name="result", **changes):
+    raw = msgpack.unpackb(encode(MSGPACK[name]))
+    raw.update(changes)
+    return msgpack.packb(raw)
+
+
+def result_with(**changes):
+    raw = msgpack.unpackb(encode(MSGPACK["result"]))
+    raw["results"][0].update(changes)
+    return msgpack.packb(raw)
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"", "not msgpack"),
+        (b"\xc1", "not msgpack"),
+        (b"\xde\xff\xff", "not msgpack"),
+        (b"\xdd\xff\xff\xff\xff", "not msgpack"),
+        (b"\x91" * 5000, "not msgpack"),
+        (msgpack.packb([1]), "not a message"),
+        (msgpack.packb({1: 2}), "not msgpack"),
+        (damaged(v=2), "unknown version"),
+        (damaged(v=None), "unknown version"),
+        (damaged(extra=1), "wrong fields"),
+        (damaged(run_uid="short"), "wrong length"),
+        (damaged(run_uid=b"0" * 32), "wrong type"),
+        (damaged(incarnation=-1), "out of range"),
+        (damaged(incarnation=True), "wrong type"),
+        (damaged(incarnation=2**63), "out of range"),
+        (damaged(results={}), "wrong type"),
+        (damaged(results=[None]), "wrong type"),
+        (result_with(fitness=float("nan")), "not finite"),
+        (result_with(fitness=float("inf")), "not finite"),
+        (result_with(fitness="1"), "wrong type"),
+        (result_with(digest=b"\x01" * 31), "wrong length"),
+        (result_with(error="x" * 3000), "wrong length"),
+        (damaged("beat", queued=[b"abcdefgh"] * 2000), "wrong length"),
+        (damaged("view", height=0), "out of range"),
+        (b"\x00" * (MAX_MESSAGE + 1), "oversize"),
+    ],
+)
+def test_malformed_messages_are_dropped_and_counted(payload, reason):
+    kinds = {"queued": Beat, "height": type(MSGPACK["view"])}
+    kind = next((kind for word, kind in kinds.items() if word.encode() in payload), ResultBatch)
+    inbox = Inbox()
+    assert inbox.decode(kind, payload) is None
+    assert inbox.dropped == {reason: 1}
+
+
+def test_an_unknown_word_is_malformed():
+    raw = msgpack.unpackb(encode(MSGPACK["job"]))
+    raw["jobs"][0]["kind"] = "mine-bitcoin"
+    with pytest.raises(MalformedError, match="unknown word"):
+        decode(JobBatch, msgpack.packb(raw))
+
+
+def test_our_own_messages_are_checked_before_they_leave():
+    batch = dataclasses.replace(MSGPACK["job"], vectors=MSGPACK["job"].vectors * 2000)
+    with pytest.raises(MalformedError, match="oversize"):
+        encode(batch)
+    beat = dataclasses.replace(MSGPACK["beat"], load=float("nan"))
+    with pytest.raises(MalformedError, match="not finite"):
+        encode(beat)
+
+
+def test_hello_ignores_fields_of_later_versions():
+    plain = encode_json(JSON["hello-request"]).replace(b"{", b'{"hat_size": 7, ', 1)
+    assert decode_json(HelloRequest, plain) == JSON["hello-request"]
+
+
+@pytest.mark.parametrize("payload", [b"", b"[]", b"{}", b"{" * 20000, b'{"protocol_min": NaN}', b"\xff"])
+def test_malformed_documents_are_dropped_and_counted(payload):
+    inbox = Inbox()
+    assert inbox.decode_json(HelloRequest, payload) is None
+    assert inbox.dropped.total() == 1
+
+
+@given(st.binary(max_size=200))
+def test_random_bytes_never_raise_past_the_inbox(payload):
+    inbox = Inbox()
+    assert all(inbox.decode(kind, payload) is None for kind in WIRE)
+
+
+@given(st.data())
+def test_mutated_messages_decode_or_are_counted(data):
+    name = data.draw(st.sampled_from(sorted(MSGPACK)))
+    payload = bytearray(encode(MSGPACK[name]))
+    for _ in range(data.draw(st.integers(1, 4))):
+        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    inbox = Inbox()
+    message = inbox.decode(type(MSGPACK[name]), bytes(payload))
+    assert (message is None) == (inbox.dropped.total() == 1)
+
+
+def test_vectors_travel_to_the_bit():
+    vector = np.array([0.0, -0.0, 1e-45, 3.4e38], dtype="<f4")
+    part = dataclasses.replace(MSGPACK["job"].vectors[0], id=VECTOR_ID, shape=(4,), data=vector.tobytes())
+    received = decode(JobBatch, encode(dataclasses.replace(MSGPACK["job"], vectors=(part,))))
+    assert received.vectors[0].data == vector.tobytes()
+
+
+if __name__ == "__main__":
+    for kind, samples, write in (("msgpack", MSGPACK, encode), ("json", JSON, encode_json)):
+        for name, sample in samples.items():
+            path = GOLDEN / f"{name}.v1.{kind}"
+            if not path.exists():
+                path.write_bytes(write(sample))

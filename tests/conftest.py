@@ -1,0 +1,21 @@
+import pytest
+
+from tests.support.bundles import write_random_bundle
+from tests.support.processes import processes_in
+
+
+@pytest.fixture(scope="session")
+def random_bundle(tmp_path_factory):
+    return write_random_bundle(tmp_path_factory.mktemp("bundle") / "random.zip")
+
+
+@pytest.fixture
+def processes(tmp_path):
+    with processes_in(tmp_path) as running:
+        yield running
+
+
+@pytest.fixture(autouse=True)
+def private_folders(tmp_path, monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("DREAMFLEET_RUNS_DIR", str(tmp_path / "runs"))

@@ -1,0 +1,306 @@
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from common.messages import TAG_BYTES, Beat, Result, Running
+from coordinator.fleet import DEPARTURE_GRACE, SILENT_BEATS, Fleet
+from coordinator.jobs import make_work, travelling
+from tests.support.samples import HEAD, SPEC
+
+A, B = "a/00000001", "b/00000002"
+BEAT = 1.0
+
+
+def work(count, kind="score", generation=0):
+    vector = travelling(np.arange(4.0) + generation)
+    return make_work(SPEC, kind, generation, 0, vector, range(1000, 1000 + count))
+
+
+def beat(capacity=1, seen=0, queued=(), running=(), unacked=()):
+    return Beat(
+        **HEAD, nonce="n", seen=seen, capacity=capacity, slots=capacity, load=0.0, steps_per_second=0.0,
+        queued=tuple(digest[:TAG_BYTES] for digest in queued),
+        running=tuple(Running(digest[:TAG_BYTES], 5) for digest in running),
+        unacked=tuple(digest[:TAG_BYTES] for digest in unacked),
+    )  # fmt: skip
+
+
+def result(digest, fitness=1.0, error=None):
+    return Result(digest, None if error else fitness, 10, 0.1, error, None)
+
+
+def fleet_of(*names, capacity=1, jobs=10):
+    fleet = Fleet(BEAT)
+    fleet.offer(work(jobs))
+    for name in names:
+        fleet.welcome(name, capacity, "f", 0.0)
+        fleet.beat(name, beat(capacity), 0.0)
+    return fleet
+
+
+def digests(sends, name):
+    return [each.job.digest for send in sends if send.identity == name for each in send.content.work]
+
+
+def test_no_work_before_the_first_beat():
+    fleet = Fleet(BEAT)
+    fleet.offer(work(3))
+    fleet.welcome(A, 2, "f", 0.0)
+    assert fleet.dispatch(0.0) == []
+
+
+def test_credit_is_twice_the_capacity_and_a_result_returns_it():
+    fleet = fleet_of(A, capacity=2)
+    given = digests(fleet.dispatch(0.0), A)
+    assert len(given) == 4
+    assert fleet.dispatch(0.1) == []
+    fleet.result(A, result(given[0]), 0.2)
+    (send,) = fleet.dispatch(0.2)
+    assert len(send.content.work) == 1
+    assert [(verdict.digest, verdict.verdict) for verdict in send.content.verdicts] == [(given[0], "accepted")]
+
+
+def test_batches_count_without_a_gap():
+    fleet = fleet_of(A)
+    numbers = []
+    for step in range(5):
+        for send in fleet.dispatch(step / 100):
+            numbers.append(send.number)
+            for each in send.content.work:
+                fleet.result(A, result(each.job.digest), step / 100)
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_work_is_spread_over_workers():
+    fleet = fleet_of(A, B, jobs=2)
+    sends = fleet.dispatch(0.0)
+    assert len(digests(sends, A)) == len(digests(sends, B)) == 1
+
+
+def test_the_first_wanted_result_wins_and_the_others_copy_is_cancelled():
+    fleet = fleet_of(A, B, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.depart(A, 0.1)
+    fleet.tick(0.2)
+    assert digests(fleet.dispatch(0.2), B) == [digest]
+    fleet.welcome(A, 1, "f", 0.3)
+    assert fleet.result(A, result(digest), 0.3)[0] == "accepted"
+    assert [send.content.cancels for send in fleet.dispatch(0.3) if send.identity == B] == [[digest]]
+    assert fleet.result(B, result(digest), 0.4)[0] == "duplicate"
+
+
+def test_a_result_nobody_wants_is_obsolete():
+    assert fleet_of(A).result(A, result(b"x" * 32), 0.0)[0] == "obsolete"
+
+
+def test_a_departed_workers_jobs_are_issued_again_after_the_grace():
+    fleet = fleet_of(A, B, jobs=2)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.depart(A, 1.0)
+    fleet.tick(1.0 + DEPARTURE_GRACE / 2)
+    assert fleet.dispatch(1.0) == []
+    fleet.tick(1.0 + DEPARTURE_GRACE)
+    assert digests(fleet.dispatch(1.1), B) == [digest]
+    assert A not in fleet.members
+
+
+def test_a_silent_workers_jobs_are_issued_again_and_its_voice_brings_it_back():
+    fleet = fleet_of(A, B, jobs=2)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    late = SILENT_BEATS * BEAT + 0.1
+    for step in range(1, 6):
+        fleet.beat(B, beat(seen=1, running=digests([], B)), float(step))
+        fleet.tick(float(step))
+    fleet.beat(B, beat(seen=1), late)
+    fleet.tick(late)
+    assert fleet.members[A].silent
+    assert digest in digests(fleet.dispatch(late), B)
+    fleet.beat(A, beat(seen=1, running=[digest]), late + 1)
+    assert not fleet.members[A].silent
+    assert digest in fleet.members[A].leases
+
+
+def test_a_suspended_host_is_not_taken_for_silence():
+    fleet = fleet_of(A)
+    fleet.dispatch(0.0)
+    fleet.tick(0.1)
+    fleet.tick(1000.0)
+    assert not fleet.members[A].silent
+
+
+def test_a_job_that_two_beats_do_not_show_is_issued_again():
+    fleet = fleet_of(A, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.beat(A, beat(seen=1), 1.0)
+    assert fleet.dispatch(1.0) == []
+    fleet.beat(A, beat(seen=1), 2.0)
+    assert digests(fleet.dispatch(2.0), A) == [digest]
+
+
+def test_a_batch_that_was_not_seen_is_sent_again_under_its_number():
+    fleet = fleet_of(A, jobs=1)
+    (first,) = fleet.dispatch(0.0)
+    fleet.beat(A, beat(seen=0), 1.0)
+    fleet.beat(A, beat(seen=0), 2.0)
+    (again,) = fleet.dispatch(2.1)
+    assert (again.number, again.content) == (first.number, first.content)
+    fleet.beat(A, beat(seen=1, running=digests([first], A)), 3.0)
+    assert fleet.dispatch(9.0) == []
+
+
+def test_an_error_is_no_fitness_and_another_worker_tries():
+    fleet = fleet_of(A, B, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    assert fleet.result(A, result(digest, error="boom"), 0.1) == ("refused", None)
+    assert digests(fleet.dispatch(0.1), B) == [digest]
+    assert fleet.poison() is None
+    fleet.result(B, result(digest, error="boom"), 0.2)
+    _, errors = fleet.poison()
+    assert errors == {A: "boom", B: "boom"}
+
+
+def test_the_only_worker_does_not_try_a_failed_job_again_and_goes_on_with_the_others():
+    fleet = fleet_of(A, jobs=2)
+    first, second = digests(fleet.dispatch(0.0), A)
+    fleet.result(A, result(first, error="boom"), 0.1)
+    fleet.result(A, result(second), 0.1)
+    assert digests(fleet.dispatch(0.2), A) == []
+    assert [errors for _, errors in fleet.failures] == [{A: "boom"}]
+
+
+def test_evaluations_wait_for_slack_and_take_a_quarter_of_the_slots():
+    fleet = fleet_of(A, capacity=4, jobs=3)
+    fleet.offer(work(5, "evaluate"))
+    kinds = [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work]
+    assert kinds == ["score"] * 3 + ["evaluate"]
+    fleet.hurry = True
+    assert len(digests(fleet.dispatch(0.1), A)) == 4
+
+
+def test_a_paused_fleet_gives_nothing_and_still_judges():
+    fleet = fleet_of(A)
+    given = digests(fleet.dispatch(0.0), A)
+    fleet.paused = True
+    fleet.result(A, result(given[0]), 0.1)
+    (send,) = fleet.dispatch(0.1)
+    assert not send.content.work
+    assert len(send.content.verdicts) == 1
+
+
+@settings(max_examples=60, stateful_step_count=60, deadline=None)
+class AnyOrder(RuleBasedStateMachine):
+    """Workers that hold, lose and finish work while messages vanish; each job must count exactly once."""
+
+    def __init__(self):
+        super().__init__()
+        self.fleet = Fleet(BEAT)
+        self.now = 0.0
+        self.jobs = work(12)
+        self.fleet.offer(self.jobs)
+        self.accepted = []
+        self.workers = {}  # name -> [seen, held digests, unacked]
+
+    names = st.sampled_from([A, B, "c/00000003"])
+
+    @rule(name=names)
+    def join(self, name):
+        self.fleet.welcome(name, 2, "f", self.now)
+        self.workers[name] = [0, [], []]
+
+    @rule(name=names)
+    def vanish(self, name):
+        if self.workers.pop(name, None) is not None:
+            self.fleet.depart(name, self.now)
+
+    @rule(name=names, heard=st.booleans())
+    def send_beat(self, name, heard):
+        if name in self.workers and heard:
+            seen, held, unacked = self.workers[name]
+            self.fleet.beat(name, beat(2, seen, queued=held, unacked=unacked), self.now)
+
+    @rule(lost=st.sets(st.integers(0, 3)))
+    def dispatch(self, lost):
+        for index, send in enumerate(self.fleet.dispatch(self.now)):
+            worker = self.workers.get(send.identity)
+            if worker is None or index in lost or send.number > worker[0] + 1:
+                continue
+            if send.number == worker[0] + 1:
+                worker[0] += 1
+                worker[1] += [each.job.digest for each in send.content.work if each.job.digest not in worker[1]]
+                judged = {verdict.digest for verdict in send.content.verdicts}
+                worker[1] = [digest for digest in worker[1] if digest not in send.content.cancels]
+                worker[2] = [digest for digest in worker[2] if digest not in judged]
+
+    @rule(name=names, arrives=st.booleans(), twice=st.booleans())
+    def finish(self, name, arrives, twice):
+        if not self.workers.get(name, [0, [], []])[1]:
+            return
+        digest = self.workers[name][1].pop(0)
+        self.workers[name][2].append(digest)
+        for _ in range(arrives + (arrives and twice)):
+            self.deliver(name, digest)
+
+    @rule(name=names)
+    def repeat(self, name):
+        for digest in list(self.workers.get(name, [0, [], []])[2]):
+            self.deliver(name, digest)
+
+    def deliver(self, name, digest):
+        verdict, done = self.fleet.result(name, result(digest), self.now)
+        if verdict == "accepted":
+            self.accepted.append(done.job.digest)
+
+    @rule(seconds=st.floats(0.01, 3.0))
+    def wait(self, seconds):
+        self.now += seconds
+        self.fleet.tick(self.now)
+
+    @invariant()
+    def each_job_counts_at_most_once(self):
+        assert len(self.accepted) == len(set(self.accepted))
+        assert self.fleet.open + len(self.accepted) == len(self.jobs)
+
+    @invariant()
+    def credit_is_accounted(self):
+        for member in self.fleet.members.values():
+            assert len(member.leases) <= 2 * max(member.capacity, 2)
+            assert all(member.identity in self.fleet._wanted[digest].holders for digest in member.leases)
+
+    @precondition(lambda self: self.fleet.open)
+    @rule()
+    def a_faithful_worker_ends_it(self):
+        """From any state, one worker that loses nothing finishes everything."""
+        name = "z/0000000f"
+        self.join(name)
+        for _ in range(80):
+            self.now += BEAT
+            for other in [each for each in self.fleet.members if each != name]:
+                self.vanish(other)
+                self.fleet.depart(other, self.now)
+            self.send_beat(name, True)
+            self.fleet.tick(self.now)
+            self.dispatch(set())
+            while self.workers[name][1]:
+                self.finish(name, True, False)
+            self.dispatch(set())
+        assert self.fleet.open == 0
+
+
+TestAnyOrder = AnyOrder.TestCase
+
+
+@pytest.mark.parametrize("count", [3000])
+def test_memory_of_results_is_bounded(count):
+    fleet = fleet_of(A, capacity=4, jobs=0)
+    for generation in range(count):
+        fleet.forget(before=generation - 1)
+        fleet.offer(work(1, generation=generation))
+        now = generation / 100
+        fleet.beat(A, beat(4, seen=10**9), now)
+        for digest in digests(fleet.dispatch(now), A):
+            fleet.result(A, result(digest), now)
+    assert len(fleet._accepted) <= 2
+    assert fleet.open == 0
+    assert len(fleet._tags) == len(fleet._queue) == 0

@@ -1,0 +1,75 @@
+"""One of each message, for golden fixtures and for damage."""
+
+import hashlib
+
+from common.messages import (
+    Beat,
+    BundlePart,
+    ControlReply,
+    GenerationEvent,
+    HelloReply,
+    HelloRequest,
+    Intervals,
+    Job,
+    JobBatch,
+    Result,
+    ResultBatch,
+    Running,
+    TaskSpec,
+    UploadPart,
+    VectorPart,
+    Verdict,
+    ViewFrame,
+)
+
+UID = "0123456789abcdef" * 2
+SPEC = TaskSpec(task="car-racing", bundle="ab" * 32, horizon=1000, patience=100)
+VECTOR = bytes(range(64))
+VECTOR_ID = hashlib.sha256(VECTOR).digest()
+HEAD = {"run_uid": UID, "incarnation": 3}
+
+
+def job(episode=0, kind="score", candidate=2, spec=SPEC, seed=1048576):
+    return Job(
+        kind=kind, task=spec.task, generation=7, candidate=candidate, episode=episode, seeds=(seed + episode,),
+        vector=VECTOR_ID, digest=spec.digest(kind, VECTOR_ID, (seed + episode,)), stall=30.0,
+    )  # fmt: skip
+
+
+MSGPACK = {
+    "job": JobBatch(
+        **HEAD, nonce="c0ffee00c0ffee00", number=9,
+        vectors=(VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR),),
+        jobs=(job(), job(1), job(0, "evaluate"), job(0, "collect")), cancels=(b"\x05" * 32,),
+        verdicts=tuple(Verdict(bytes([n]) * 32, word) for n, word in enumerate(("accepted", "duplicate", "obsolete", "refused"))),
+    ),
+    "result": ResultBatch(
+        **HEAD, fingerprint="x86_64 avx2 glibc-2.36 numpy-2.4.6",
+        results=(
+            Result(b"\x01" * 32, 812.5, 1000, 7.25, None, None),
+            Result(b"\x02" * 32, None, 17, 0.5, "slot crashed (signal 11)", None),
+            Result(b"\x03" * 32, 0.0, 300, 2.0, None, b"\x04" * 32),
+        ),
+    ),
+    "beat": Beat(
+        **HEAD, nonce="c0ffee00c0ffee00", seen=9, capacity=4, slots=4, queued=(b"abcdefgh",),
+        running=(Running(b"ABCDEFGH", 412),), unacked=(b"12345678",), load=1.5, steps_per_second=987.5,
+    ),
+    "bundle": BundlePart(**HEAD, sha256=b"\xab" * 32, offset=40960, total=14302154, data=b"part of a bundle"),
+    "upload": UploadPart(**HEAD, digest=b"\x01" * 32, sha256=b"\x04" * 32, offset=0, total=16, data=b"part of a drive!"),
+    "view": ViewFrame(**HEAD, slot=1, tag=b"ABCDEFGH", step=99, reward=-0.1, height=2, width=2, picture=bytes(12)),
+}  # fmt: skip
+JSON = {
+    "hello-request": HelloRequest(1, 1, "0.1.0", "host-a/0a1b2c3d", ("car-racing", "dream"), "x86_64 avx2", 8),
+    "hello-reply": HelloReply(
+        True, 1, 1, "0.1.0", "night", UID, 3, "c0ffee00c0ffee00", "", "",
+        {"task": "car-racing", "bundle": "ab" * 32, "horizon": 1000, "patience": 100}, {"beat": 1.0, "repeat": 1.0},
+    ),
+    "generation-event": GenerationEvent(
+        v=1, run="night", run_uid=UID, incarnation=3, generation=7, mean=100.5, std=20.25, best=150.0, worst=-10.0,
+        sigma=0.09, seconds=12.5, environment_steps=64000,
+    ),
+    "control-reply": ControlReply(v=1, run="night", accepted=True, why=""),
+    "intervals": Intervals(beat=1.0, repeat=1.0),
+    "task-spec": SPEC,
+}  # fmt: skip

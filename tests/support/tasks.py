@@ -1,0 +1,98 @@
+"""Small tasks that score in microseconds or on command, for tests of everything around them."""
+
+import os
+import signal
+import time
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+MODULE = "tests.support.tasks"
+TOY, SLOW_TOY, RAISING, CRASHING, NAN = (f"{MODULE}:{name}" for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan"))
+
+
+class ToyEnvironment(gymnasium.Env):
+    """Ten steps; the reward says how near the action is to a target that the seed makes."""
+
+    observation_space = spaces.Box(-1, 1, (1,))
+    action_space = spaces.Box(-1, 1, (8,))
+
+    def __init__(self, seconds=0.0):
+        self._seconds = seconds
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._target = self.np_random.normal(0.5, 0.1, 8)
+        self._left = 10
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        if self._seconds:
+            time.sleep(self._seconds)
+        self._left -= 1
+        reward = -float(((action - self._target) ** 2).sum())
+        return np.zeros(1, np.float32), reward, self._left == 0, False, {}
+
+
+class ToyPolicy:
+    def begin(self, parameters):
+        self._action = parameters[:8].astype(np.float64)
+
+    def act(self, observation):
+        return self._action
+
+
+class Toy:
+    name = TOY
+    width = 1
+    seconds = 0.0
+
+    def make_environment(self):
+        return ToyEnvironment(self.seconds)
+
+    def make_policy(self, bundle):
+        return ToyPolicy()
+
+
+class SlowToy(Toy):
+    """An episode takes about a third of a second."""
+
+    name = SLOW_TOY
+    seconds = 0.03
+
+
+class Raising(Toy):
+    name = RAISING
+
+    def make_policy(self, bundle):
+        return RaisingPolicy()
+
+
+class RaisingPolicy(ToyPolicy):
+    def act(self, observation):
+        raise RuntimeError("the road has ended")
+
+
+class Crashing(Toy):
+    name = CRASHING
+
+    def make_policy(self, bundle):
+        return CrashingPolicy()
+
+
+class CrashingPolicy(ToyPolicy):
+    def act(self, observation):
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+
+class Nan(Toy):
+    name = NAN
+
+    def make_policy(self, bundle):
+        return NanPolicy()
+
+
+class NanPolicy(ToyPolicy):
+    def begin(self, parameters):
+        self._action = np.full(8, np.nan)

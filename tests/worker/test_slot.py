@@ -1,0 +1,100 @@
+import os
+import queue
+import signal
+
+import pytest
+
+from common.errors import DreamfleetError
+from common.messages import TaskSpec
+from tests.support import tasks
+from tests.support.samples import VECTOR, job
+from worker.slot import FAILED_STARTS, Slot
+
+TIMEOUT = 60
+
+
+def spec(task):
+    return TaskSpec(task=task, bundle="ab" * 32, horizon=100, patience=0)
+
+
+class Harness:
+    """A slot and its worker's queue."""
+
+    def __init__(self, task, bundle):
+        self.spec = spec(task)
+        self.events = queue.SimpleQueue()
+        self.slot = Slot(0, self.spec, bundle, self.events)
+
+    def wait_ready(self):
+        while not self.slot.ready:
+            self.slot.handle(self.events.get(timeout=TIMEOUT)[1])
+
+    def result(self):
+        while True:
+            if (result := self.slot.handle(self.events.get(timeout=TIMEOUT)[1])) is not None:
+                return result
+
+    def score(self, episode=0):
+        self.wait_ready()
+        self.slot.submit(job(episode, spec=self.spec), VECTOR)
+        return self.result()
+
+
+@pytest.fixture
+def harness(random_bundle):
+    made = []
+
+    def make(task, bundle=None):
+        made.append(Harness(task, bundle or random_bundle.path))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.slot.stop()
+
+
+def test_it_scores_and_the_same_job_gives_the_same_bits(harness):
+    slot = harness(tasks.TOY)
+    first, second, other = slot.score(), slot.score(), slot.score(1)
+    assert first.fitness is not None
+    assert first.steps == 10
+    assert first.fitness == second.fitness != other.fitness
+
+
+@pytest.mark.parametrize(
+    ("task", "error"), [(tasks.RAISING, "RuntimeError: the road has ended"), (tasks.NAN, "ValueError: the episode's")]
+)
+def test_an_exception_is_the_jobs_error_and_the_child_lives_on(harness, task, error):
+    slot = harness(task)
+    pid = None
+    for _ in range(2):
+        result = slot.score()
+        assert result.fitness is None
+        assert result.error.startswith(error)
+        assert slot.slot.pid == (pid or slot.slot.pid)
+        pid = slot.slot.pid
+
+
+def test_a_crash_costs_one_job_and_another_child_takes_its_place(harness):
+    slot = harness(tasks.CRASHING)
+    for _ in range(2):
+        result = slot.score()
+        assert (result.fitness, result.error) == (None, f"slot crashed (signal {signal.SIGSEGV.value})")
+
+
+def test_a_killed_child_is_replaced_alone(harness):
+    slot = harness(tasks.SLOW_TOY)
+    slot.wait_ready()
+    slot.slot.submit(job(0, spec=slot.spec), VECTOR)
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    assert "signal 9" in slot.result().error
+    assert slot.score().fitness is not None
+
+
+def test_a_child_that_cannot_start_ends_with_its_reason(harness, tmp_path):
+    broken = tmp_path / "broken.zip"
+    broken.write_bytes(b"no bundle")
+    slot = harness(tasks.TOY, broken)
+    with pytest.raises(DreamfleetError, match=r"cannot start: BundleError.*not a whole bundle"):
+        for _ in range(FAILED_STARTS):
+            slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1])
