@@ -5,11 +5,13 @@ The file's SHA-256 is its identity. Equal parts give equal files: entries are so
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -107,14 +109,27 @@ class BundleStore:
         self._path(sha256).unlink(missing_ok=True)
         return None
 
-    def partial(self, sha256: str) -> Path:
-        """Where a download of this bundle grows; what is there already is its beginning."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        return self._folder / f"{sha256}.part"
+    @contextmanager
+    def downloading(self, sha256: str) -> Iterator[Path]:
+        """Hold the right to download: where the bundle grows; what is there already is its beginning.
+
+        Waits while another process of this host downloads it; look with `find` again before you do.
+        """
+        partial = self._folder / f"{sha256}.part"
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            lock = partial.with_suffix(".lock").open("w")
+        except OSError as error:
+            raise BundleError(
+                f"cannot write in {self._folder}: {error.strerror}; point $DREAMFLEET_CACHE elsewhere"
+            ) from error
+        with lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield partial
 
     def complete(self, sha256: str) -> Bundle:
         """Verify a finished download and give it its name; a wrong one is removed."""
-        partial = self.partial(sha256)
+        partial = self._folder / f"{sha256}.part"
         if (found := hash_file(partial)) != sha256:
             partial.unlink()
             raise BundleError(

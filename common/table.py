@@ -31,7 +31,8 @@ def run_panel(
     parts: list[RenderableType] = [_facts(status)]
     if status["why"]:
         parts.append(Text(status["why"], style="bold red" if state == "paused" else ""))
-    parts += [Text(_failure(each), style="red") for each in status["failures"][:3]]
+    elif status["failures"]:
+        parts.append(Text(_failure(status["failures"][0]), style="red"))
     parts.append(_progress(status))
     if history:
         parts.append(Text.assemble(("mean fitness by generation  ", "dim"), _sparkline(history)))

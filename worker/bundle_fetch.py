@@ -29,26 +29,25 @@ def obtain(session: zenoh.Session, run: str, sha256: str, store: BundleStore, in
     bundle = store.find(sha256)
     if bundle is not None:
         return bundle
-    for attempt in range(1, ATTEMPTS + 1):
-        _download(session, keys.bundle(run, sha256), sha256, store.partial(sha256), inbox)
-        try:
-            bundle = store.complete(sha256)
-        except BundleError as error:
-            log.warning("attempt %d of %d: %s", attempt, ATTEMPTS, error)
-            continue
-        log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6)
-        return bundle
+    with store.downloading(sha256) as path:
+        for attempt in range(1, ATTEMPTS + 1):
+            if (bundle := store.find(sha256)) is not None:  # another worker of this host was faster
+                return bundle
+            _download(session, keys.bundle(run, sha256), sha256, path, inbox)
+            try:
+                bundle = store.complete(sha256)
+            except BundleError as error:
+                log.warning("attempt %d of %d: %s", attempt, ATTEMPTS, error)
+                continue
+            log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6)
+            return bundle
     raise BundleError(f"the bundle {sha256[:12]}... arrived damaged {ATTEMPTS} times: check the coordinator's copy")
 
 
 def _download(session: zenoh.Session, key: str, sha256: str, path: Path, inbox: Inbox) -> None:
     """Append to `path` until it is as long as the bundle."""
     total, silences = None, 0
-    try:
-        file = path.open("ab")
-    except OSError as error:
-        raise BundleError(f"cannot write {path}: {error.strerror}; point $DREAMFLEET_CACHE elsewhere") from error
-    with file:
+    with path.open("ab") as file:
         while total is None or file.tell() < total:
             offsets = [file.tell() + index * MAX_PART for index in range(WINDOW if total else 1)]
             parts = _ask(session, key, [each for each in offsets if total is None or each < total], inbox)

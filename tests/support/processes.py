@@ -21,7 +21,13 @@ def free_port():
 
 
 def environment(cache):
-    return {**os.environ, "PYTHONPATH": str(ROOT), "DREAMFLEET_CACHE": str(cache), "PYTHONUNBUFFERED": "1", "COLUMNS": "120"}
+    return {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "DREAMFLEET_CACHE": str(cache),
+        "PYTHONUNBUFFERED": "1",
+        "COLUMNS": "120",
+    }
 
 
 class Process:
@@ -30,7 +36,12 @@ class Process:
     def __init__(self, arguments, cache):
         command = [sys.executable, "-m", "common.cli", *map(str, arguments)]
         self.popen = subprocess.Popen(
-            command, env=environment(cache), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+            command,
+            env=environment(cache),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
         )
         self.lines = []
         self._queue = queue.SimpleQueue()
@@ -83,7 +94,16 @@ class Processes:
 
     def coordinator(self, *arguments, name="test"):
         process = self.start(
-            "coordinator", "--run", name, "--runs-dir", self.runs, "--listen", self.endpoint, "--beat", "0.2", *arguments
+            "coordinator",
+            "--run",
+            name,
+            "--runs-dir",
+            self.runs,
+            "--listen",
+            self.endpoint,
+            "--beat",
+            "0.2",
+            *arguments,
         )
         process.wait_for("incarnation")
         return process
@@ -94,7 +114,9 @@ class Processes:
     def call(self, *arguments, timeout=DEADLINE):
         """Run a verb to its end: exit code, stdout, stderr."""
         command = [sys.executable, "-m", "common.cli", *map(str, arguments)]
-        done = subprocess.run(command, env=environment(self.cache), capture_output=True, text=True, timeout=timeout)
+        done = subprocess.run(
+            command, env=environment(self.cache), capture_output=True, check=False, text=True, timeout=timeout
+        )
         return done.returncode, done.stdout, done.stderr
 
     def status(self):

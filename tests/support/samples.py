@@ -26,6 +26,7 @@ UID = "0123456789abcdef" * 2
 SPEC = TaskSpec(task="car-racing", bundle="ab" * 32, horizon=1000, patience=100)
 VECTOR = bytes(range(64))
 VECTOR_ID = hashlib.sha256(VECTOR).digest()
+VERDICTS = ("accepted", "duplicate", "obsolete", "refused")
 HEAD = {"run_uid": UID, "incarnation": 3}
 
 
@@ -41,7 +42,7 @@ MSGPACK = {
         **HEAD, nonce="c0ffee00c0ffee00", number=9,
         vectors=(VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR),),
         jobs=(job(), job(1), job(0, "evaluate"), job(0, "collect")), cancels=(b"\x05" * 32,),
-        verdicts=tuple(Verdict(bytes([n]) * 32, word) for n, word in enumerate(("accepted", "duplicate", "obsolete", "refused"))),
+        verdicts=tuple(Verdict(bytes([n]) * 32, word) for n, word in enumerate(VERDICTS)),
     ),
     "result": ResultBatch(
         **HEAD, fingerprint="x86_64 avx2 glibc-2.36 numpy-2.4.6",
@@ -56,7 +57,9 @@ MSGPACK = {
         running=(Running(b"ABCDEFGH", 412),), unacked=(b"12345678",), load=1.5, steps_per_second=987.5,
     ),
     "bundle": BundlePart(**HEAD, sha256=b"\xab" * 32, offset=40960, total=14302154, data=b"part of a bundle"),
-    "upload": UploadPart(**HEAD, digest=b"\x01" * 32, sha256=b"\x04" * 32, offset=0, total=16, data=b"part of a drive!"),
+    "upload": UploadPart(
+        **HEAD, digest=b"\x01" * 32, sha256=b"\x04" * 32, offset=0, total=16, data=b"part of a drive!"
+    ),
     "view": ViewFrame(**HEAD, slot=1, tag=b"ABCDEFGH", step=99, reward=-0.1, height=2, width=2, picture=bytes(12)),
 }  # fmt: skip
 JSON = {

@@ -9,7 +9,9 @@ import numpy as np
 from gymnasium import spaces
 
 MODULE = "tests.support.tasks"
-TOY, SLOW_TOY, RAISING, CRASHING, NAN = (f"{MODULE}:{name}" for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan"))
+TOY, SLOW_TOY, RAISING, CRASHING, NAN = (
+    f"{MODULE}:{name}" for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan")
+)
 
 
 class ToyEnvironment(gymnasium.Env):

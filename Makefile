@@ -1,0 +1,58 @@
+# Two commands on a fresh machine: `make demo` and `make test`. Both make .venv and install what they need.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+SOURCES := pyproject.toml constraints.txt
+
+.PHONY: demo test setup check wheel long box2d-py bundle worker-size clean
+
+demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
+	$(BIN)/dreamfleet demo $(ARGS)
+
+test: $(VENV)/.dev  ## every test that ends within minutes
+	$(BIN)/pytest -m "not long" $(ARGS)
+
+setup: $(VENV)/.dev  ## everything that development needs
+
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.demo: $(VENV)/bin/python $(SOURCES)
+	$(PIP) --editable '.[worker,views]'
+	touch $@
+
+$(VENV)/.dev: $(VENV)/bin/python $(SOURCES)
+	$(PIP) --editable '.[dev]'
+	touch $@ $(VENV)/.demo
+
+check: $(VENV)/.dev  ## style, types, import contracts, and a wheel that installs into an empty environment
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python deploy/check_wheel.py
+
+long: $(VENV)/.dev  ## proofs that take half an hour: five run seeds of the demo improve
+	$(BIN)/pytest -m long --timeout 3600 $(ARGS)
+
+box2d-py: $(VENV)/bin/python  ## the same library from its source archive instead of the wheel; needs a C++ compiler
+	$(PYTHON) -m venv .venv-box2d-py
+	.venv-box2d-py/bin/python -m pip install --quiet --constraint constraints.txt setuptools swig
+	.venv-box2d-py/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	.venv-box2d-py/bin/python -m pip uninstall --quiet --yes box2d
+	PATH=$(CURDIR)/.venv-box2d-py/bin:$$PATH .venv-box2d-py/bin/python -m pip install --quiet --no-build-isolation box2d-py==2.3.8
+	.venv-box2d-py/bin/pytest -m "not long" $(ARGS)
+
+bundle: $(VENV)/.dev  ## the shipped world model again, from nothing: about 20 minutes of two cores
+	$(BIN)/dreamfleet collect --preset tiny --data data/tiny
+	$(BIN)/dreamfleet train vae --data data/tiny
+	$(BIN)/dreamfleet encode --data data/tiny
+	$(BIN)/dreamfleet train mdnrnn --data data/tiny
+	$(BIN)/dreamfleet bundle --data data/tiny --out data/tiny/tiny.zip
+
+worker-size: $(VENV)/bin/python  ## what a worker's environment weighs
+	$(BIN)/python deploy/worker_size.py
+
+clean:
+	rm -rf $(VENV) .venv-box2d-py build dist *.egg-info

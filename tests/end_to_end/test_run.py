@@ -1,0 +1,152 @@
+"""A run with a task that scores in no time: what its coordinator, workers, status and journal do."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from common.runs import open_run
+from tests.support import tasks
+from tests.support.processes import environment, free_port
+
+pytestmark = pytest.mark.timeout(120)
+
+
+@pytest.fixture
+def settings(random_bundle):
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0)
+
+
+def history(processes, name="test"):
+    with open_run(processes.runs, name) as run:
+        return [(each.number, each.mean, each.best, each.sigma) for each in run.history()]
+
+
+def test_a_worker_that_started_first_waits_fetches_the_bundle_and_leaves_when_the_run_is_over(processes, settings):
+    worker = processes.worker("--task", tasks.TOY, "--exit-when-done")
+    worker.wait_for("waiting for a coordinator")
+    coordinator = processes.coordinator(*settings, "--task", tasks.TOY, "--generations", 3)
+    worker.wait_for("fetched bundle")
+    code, out = coordinator.finish()
+    assert (code, "ended after 3 generations" in out) == (0, True)
+    assert worker.finish()[0] == 0
+    assert [number for number, *_ in history(processes)] == [0, 1, 2]
+
+
+def test_the_mean_is_evaluated_on_schedule_and_at_the_end_and_the_target_ends_the_run(processes, random_bundle):
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", tasks.TOY, "--population", 8, "--episodes", 1, "--sigma0", 0.2,
+        "--evaluate-every", 5, "--evaluation-episodes", 3, "--generations", 400, "--target", -4,
+    )  # fmt: skip
+    processes.worker("--task", tasks.TOY)
+    code, out = coordinator.finish()
+    assert code == 0
+    with open_run(processes.runs, "test") as run:
+        evaluations = run.evaluations()
+        assert [each.generation % 5 for each in evaluations[:-1]] == [4] * (len(evaluations) - 1)
+        assert max(each.mean for each in evaluations) >= -4
+        assert "reached" in run.ended
+        seeds = [each.seed for each in run.results(4, 0, "evaluate")]
+    assert seeds == [20000, 20001, 20002]
+    assert "reached" in out
+
+
+def test_stopped_with_a_signal_and_continued_equals_never_stopped(processes, settings):
+    whole = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 6, name="whole")
+    processes.worker("--task", tasks.SLOW_TOY, "--run", "whole", "--slots", 2)
+    assert whole.finish()[0] == 0
+
+    parts = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 6, name="parts")
+    processes.worker("--task", tasks.SLOW_TOY, "--run", "parts", "--slots", 2)
+    parts.wait_for("generation 1: mean")
+    parts.popen.send_signal(signal.SIGTERM)
+    code, _ = parts.finish()
+    assert code == 130
+    again = processes.start(
+        "coordinator", "--resume", "parts", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+        "--beat", "0.2", "--generations", 6,
+    )  # fmt: skip
+    assert again.finish()[0] == 0
+    assert history(processes, "parts") == history(processes, "whole")
+    with open_run(processes.runs, "parts") as one, open_run(processes.runs, "whole") as other:
+        assert one.controller_path.exists()
+        for generation in range(6):
+            assert [one.fitness(generation, i) for i in range(4)] == [other.fitness(generation, i) for i in range(4)]
+
+
+def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
+    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
+    processes.worker("--task", tasks.SLOW_TOY)
+    coordinator.wait_for("generation 1: mean")
+    ours = processes.status()
+    assert (ours["schema"], ours["run"], ours["state"], ours["slots"]) == (1, "test", "running", 1)
+    assert ours["worker_list"][0]["state"] == "present"
+    tool = Path(sys.executable).parent / "zenoh"
+    command = [tool, "--mode", "client", "--connect", processes.endpoint, "get", "-s", "dreamfleet/v1/test/status"]
+    done = subprocess.run([*command, "--decoder", "json"], capture_output=True, check=False, text=True, timeout=60)
+    theirs = json.loads(
+        done.stdout.strip().splitlines()[-1].split(":", 1)[-1] if done.stdout[:1] != "{" else done.stdout
+    )
+    assert theirs["run_uid"] == ours["run_uid"]
+    code, out, _ = processes.call("status", "--connect", processes.endpoint)
+    assert code == 0
+    assert "mean fitness by generation" in out
+
+
+def test_a_job_that_fails_on_two_workers_pauses_the_run_and_says_why(processes, settings):
+    coordinator = processes.coordinator(*settings, "--task", tasks.RAISING, "--generations", 2)
+    for name in ("one", "two"):
+        processes.worker("--task", tasks.RAISING, "--name", name)
+    while (status := processes.status())["state"] != "paused":
+        assert status["generation"]["episodes_done"] == 0
+    assert "failed on two workers" in status["why"]
+    assert "the road has ended" in status["why"]
+    assert coordinator.popen.poll() is None
+
+
+def test_a_worker_with_another_fingerprint_is_refused_with_the_remedy(processes, settings, tmp_path):
+    processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
+    processes.worker("--task", tasks.SLOW_TOY).wait_for("joined")
+    stranger = tmp_path / "stranger.py"
+    stranger.write_text(
+        "import sys, common.fingerprint, worker.admission\n"
+        "worker.admission.fingerprint = lambda: 'riscv64 other'\n"
+        "from common.cli import main\nsys.exit(main(sys.argv[1:]))\n"
+    )
+    command = [sys.executable, stranger, "worker", "--connect", processes.endpoint, "--task", tasks.SLOW_TOY]
+    done = subprocess.run(
+        command, env=environment(tmp_path / "c"), capture_output=True, check=False, text=True, timeout=60
+    )
+    assert done.returncode != 0
+    assert "fingerprints differ" in done.stderr
+    assert "--mixed" in done.stderr
+
+
+def test_a_worker_that_does_not_know_the_task_is_refused(processes, settings):
+    processes.coordinator(*settings, "--task", "moon-landing", "--generations", 1)
+    code, _, err = processes.call("worker", "--connect", processes.endpoint)
+    assert code != 0
+    assert "'moon-landing'" in err
+
+
+def test_a_second_coordinator_of_a_live_run_is_refused(processes, settings):
+    processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
+    elsewhere = f"tcp/127.0.0.1:{free_port()}"
+    code, _, err = processes.call(
+        "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", elsewhere
+    )
+    assert code != 0
+    assert "held by a live coordinator" in err
+
+
+def test_a_foreign_coordinator_on_the_same_network_is_refused(processes, settings, tmp_path):
+    processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
+    code, _, err = processes.call(
+        "coordinator", "--run", "test", "--runs-dir", tmp_path / "elsewhere", "--connect", processes.endpoint, *settings,
+        "--generations", 1,
+    )  # fmt: skip
+    assert code != 0
+    assert "has a live coordinator already" in err

@@ -1,0 +1,58 @@
+"""The promise: who scored, and who died meanwhile, changes no bit."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from common.runs import open_run
+
+pytestmark = pytest.mark.timeout(300)
+GENERATIONS, POPULATION, EPISODES = 4, 6, 2
+SETTINGS = (
+    "--bundle", "tiny", "--population", POPULATION, "--episodes", EPISODES, "--horizon", 30,
+    "--generations", GENERATIONS, "--seed", 5,
+)  # fmt: skip
+
+
+def outcome(processes, name):
+    """Every fitness of every candidate, and the reported mean, after the run."""
+    with open_run(processes.runs, name) as run:
+        fitness = [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
+        episodes = [
+            [(each.seed, each.fitness, each.steps) for each in run.results(g, i)]
+            for g in range(GENERATIONS) for i in range(POPULATION)
+        ]  # fmt: skip
+        vectors = [run.candidate(g, i).tobytes() for g in range(GENERATIONS) for i in range(POPULATION)]
+        return fitness, episodes, vectors, np.load(run.controller_path)["parameters"].tobytes()
+
+
+def run_alone(processes):
+    coordinator = processes.coordinator(*SETTINGS, "--evaluate-every", 0, name="alone")
+    worker = processes.worker("--run", "alone")
+    code, _ = coordinator.finish(120)
+    assert code == 0
+    worker.end()
+    return outcome(processes, "alone")
+
+
+def run_with_a_death(processes):
+    """Three workers; one is killed while it scores, in the middle of the second generation."""
+    coordinator = processes.coordinator(*SETTINGS, "--evaluate-every", 0, name="three")
+    workers = [processes.worker("--run", "three", "--name", f"w{number}") for number in range(3)]
+    coordinator.wait_for("generation 0: mean")
+    while (status := processes.status())["generation"]["episodes_done"] == status["generation"]["episodes"]:
+        pass  # between two generations
+    os.kill(workers[1].popen.pid, signal.SIGKILL)
+    code, _ = coordinator.finish(120)
+    assert code == 0
+    return outcome(processes, "three")
+
+
+def test_one_worker_and_three_of_which_one_is_killed_give_the_same_bits(processes):
+    alone, three = run_alone(processes), run_with_a_death(processes)
+    assert alone == three
+    code, out, err = processes.call("replay", "alone", "--runs-dir", processes.runs, "--candidate", "2/3")
+    assert code == 0, err
+    assert out.count("same bits") == EPISODES

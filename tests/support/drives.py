@@ -1,0 +1,27 @@
+"""A data set of made-up drives, written in milliseconds."""
+
+import numpy as np
+
+from worker.tasks.preprocessing import PREPROCESSING
+from worker.training.collect import episode_path
+
+
+def write_drive(folder, number, steps=12):
+    """One episode of noise under a moving bar, with a tile now and then."""
+    random = np.random.default_rng(number)
+    pictures = random.integers(0, 60, (steps, 64, 64, 3), dtype=np.uint8)
+    for step in range(steps):
+        pictures[step, :, (3 * step + number) % 64] = 255
+    path = episode_path(folder, number)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        path, picture=pictures, action=random.uniform(0, 1, (steps, 3)).astype(np.float32),
+        reward=np.where(np.arange(steps) % 3 == 0, 3.4, -0.1).astype(np.float32), ended=np.array(False),
+        driver=np.array("held"), preprocessing=np.array(PREPROCESSING),
+    )  # fmt: skip
+    return path
+
+
+def write_drives(folder, episodes=6, steps=12):
+    """So many episodes of unequal length."""
+    return [write_drive(folder, number, steps - number % 3) for number in range(episodes)]
