@@ -36,7 +36,8 @@ class DemoConfig:
     minutes: float = option(4.0, "evolve for so long")
     population: int = option(16, "candidates a generation")
     episodes: int = option(2, "episodes a candidate")
-    horizon: int = option(150, "steps of an episode at most")
+    horizon: int = option(200, "steps of an episode at most")
+    patience: int = option(60, "cut an episode after so many steps without reward")
     sigma0: float = option(0.1, "first step size")
     seed: int = option(1, "makes the run")
     tracks: int = option(8, "unseen tracks that the mean is judged on")
@@ -75,12 +76,7 @@ class Demo:
         workers = config.workers or len(os.sched_getaffinity(0))
         self._say(f"evolving for {config.minutes:g} minutes: a coordinator and {workers} workers on this machine")
         with ExitStack() as stack:
-            coordinator = self._spawn(
-                stack, "coordinator", "--run", self._name, "--runs-dir", str(self._runs_dir),
-                "--listen", self._endpoint, "--population", str(config.population), "--episodes", str(config.episodes),
-                "--horizon", str(config.horizon), "--sigma0", str(config.sigma0), "--seed", str(config.seed),
-                "--minutes", str(config.minutes), "--evaluate-every", "0",
-            )  # fmt: skip
+            coordinator = self._spawn(stack, "coordinator", *self._run_arguments())
             client = self._connect(coordinator)
             with client:
                 for number in range(workers):
@@ -91,6 +87,15 @@ class Demo:
                 self._watch(client, coordinator)
             if coordinator.wait() != 0:
                 raise DreamfleetError(f"the coordinator failed; its words are in {self._log('coordinator')}")
+
+    def _run_arguments(self) -> list[str]:
+        config = self._config
+        flags = {
+            "run": self._name, "runs-dir": self._runs_dir, "listen": self._endpoint, "population": config.population,
+            "episodes": config.episodes, "horizon": config.horizon, "patience": config.patience,
+            "sigma0": config.sigma0, "seed": config.seed, "minutes": config.minutes, "evaluate-every": 0,
+        }  # fmt: skip
+        return [text for name, value in flags.items() for text in (f"--{name}", str(value))]
 
     def _connect(self, coordinator: subprocess.Popen[bytes]) -> Client:
         deadline = time.monotonic() + START_SECONDS

@@ -145,8 +145,8 @@ def test_a_second_coordinator_of_a_live_run_is_refused(processes, settings):
 def test_a_foreign_coordinator_on_the_same_network_is_refused(processes, settings, tmp_path):
     processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
     code, _, err = processes.call(
-        "coordinator", "--run", "test", "--runs-dir", tmp_path / "elsewhere", "--connect", processes.endpoint, *settings,
-        "--generations", 1,
+        "coordinator", "--run", "test", "--runs-dir", tmp_path / "elsewhere", "--connect", processes.endpoint,
+        *settings, "--generations", 1,
     )  # fmt: skip
     assert code != 0
     assert "has a live coordinator already" in err

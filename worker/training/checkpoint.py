@@ -36,7 +36,7 @@ def load_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
             progress: dict[str, Any] = json.loads(file.metadata()["progress"])
         weights = {name: tensor for name, tensor in tensors.items() if name.startswith("model.")}
         model.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
-    except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
         raise DatasetError(
             f"checkpoint {path} does not fit or is damaged ({error}); delete it to begin anew"
         ) from error
@@ -49,9 +49,12 @@ def load_weights(path: Path) -> dict[str, NDArray[np.float32]]:
     """A checkpoint's weights as arrays; `DatasetError` if it is not there."""
     if not path.exists():
         raise DatasetError(f"no {path}: train it first with `dreamfleet train {path.stem}`")
-    with safe_open(path, "np") as file:
-        names = [name for name in file.keys() if name.startswith("model.")]  # noqa: SIM118 - no mapping
-        return {name.removeprefix("model."): file.get_tensor(name) for name in names}
+    try:
+        with safe_open(path, "np") as file:
+            names = [name for name in file.keys() if name.startswith("model.")]  # noqa: SIM118 - no mapping
+            return {name.removeprefix("model."): file.get_tensor(name) for name in names}
+    except (OSError, SafetensorError) as error:
+        raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
 
 
 def _restore_adam(optimiser: torch.optim.Adam, tensors: dict[str, torch.Tensor]) -> None:

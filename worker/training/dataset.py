@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,9 @@ def split(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 def load(path: Path, *names: str) -> Arrays:
     """The named arrays of one episode; `DatasetError` if the file is damaged or lacks one."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in names}
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error, RuntimeError) as error:
         raise DatasetError(f"{path} is damaged ({error}); delete it and run the verb that wrote it again") from error
 
 

@@ -17,13 +17,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure on one thread and print."""
-    from common.threads import pin_thread_pools
+    from multiprocessing import get_context
 
-    pin_thread_pools()  # before numpy's library loads
     from common.bundle import find_bundle
+    from common.threads import pin_thread_pools
     from worker.bench import bench_policy
 
-    figures = bench_policy(find_bundle(args.bundle))
+    bundle = find_bundle(args.bundle)
+    pin_thread_pools()
+    # A child, for numpy's library reads its thread count once, as it loads, and the command line has loaded it.
+    with get_context("spawn").Pool(1) as pool:
+        figures = pool.apply(bench_policy, (bundle,))
     if args.json:
         print(json.dumps(figures))
     else:

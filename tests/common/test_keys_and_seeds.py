@@ -1,0 +1,44 @@
+import re
+
+import pytest
+
+from common import keys, seeds
+from common.errors import UsageError
+
+
+@pytest.mark.parametrize("name", ["a", "night-run-7", "0", "x" * 63])
+def test_good_run_names(name):
+    assert keys.check_run_name(name) == name
+
+
+@pytest.mark.parametrize("name", ["", "-a", "A", "a b", "a/b", "*", "a" * 64, "ä", "a.b", "../x", "a\n"])
+def test_bad_run_names_are_refused(name):
+    with pytest.raises(UsageError, match="cannot name a run"):
+        keys.check_run_name(name)
+
+
+@pytest.mark.parametrize("name", [None, "Big Host!", "***", "", "ok", "x" * 200, "häuschen"])
+def test_a_worker_has_a_name_and_a_life(name):
+    identity = keys.new_worker(name)
+    assert keys.is_worker(identity)
+    assert re.fullmatch(r"[a-z0-9][a-z0-9.-]{0,62}/[0-9a-f]{8}", identity)
+
+
+def test_two_lives_differ():
+    assert keys.new_worker("a") != keys.new_worker("a")
+
+
+def test_keys_of_workers_give_the_worker_back():
+    assert keys.worker_of(keys.result("run", "host/0a0b0c0d")) == "host/0a0b0c0d"
+
+
+def test_training_seeds_belong_to_training_and_to_one_episode():
+    made = [seeds.training_seed(run, g, e) for run in range(4) for g in range(10) for e in range(10)]
+    assert len(set(made)) == len(made)
+    assert all(seeds.TRAINING_FIRST <= seed <= seeds.TRAINING_LAST for seed in made)
+    assert made[0] == seeds.training_seed(0, 0, 0)
+
+
+def test_validation_and_test_tracks_never_meet():
+    assert not set(seeds.validation_seeds(100)) & set(seeds.TEST)
+    assert seeds.validation_seeds(3) == (20000, 20001, 20002)

@@ -1,0 +1,144 @@
+"""What people get wrong: one clear line that says what to do, an exit code that is not 0, nothing lost."""
+
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.controller import Controller, ControllerShape
+from tests.support import tasks
+
+pytestmark = pytest.mark.timeout(120)
+
+
+def complains(processes, *arguments, says):
+    code, out, err = processes.call(*arguments)
+    assert code not in (0, None)
+    line = err.strip().splitlines()[-1]
+    assert says in line, err
+    assert "Traceback" not in err + out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--run", "No Good"), "cannot name a run"),
+        (("--preset", "huge"), "unknown preset 'huge': choose one of article, frugal, paper"),
+        (("--bundle", "absent"), "no bundle 'absent'"),
+        (("--population", "1"), "--population must be at least 2"),
+        (("--sigma0", "nan"), "--sigma0 must be a positive number"),
+        (("--horizon", "0"), "--horizon must be at least 1"),
+        (("--population", "many"), "invalid int value: 'many'"),
+        (("--listen", "localhost"), "write it as tcp/HOST:PORT"),
+        (("--config", "absent.toml"), "no configuration file at absent.toml"),
+        (("--resume", "never"), "no run 'never'"),
+        (("--target", "900", "--evaluate-every", "0"), "--target is reached by an evaluated mean"),
+        (("--minutes", "-1"), "--minutes must not be negative"),
+    ],
+)
+def test_the_coordinator_complains(processes, arguments, says):
+    complains(processes, "coordinator", "--runs-dir", processes.runs, *arguments, says=says)
+    assert not processes.runs.exists() or not any(processes.runs.iterdir())
+
+
+def test_an_unknown_configuration_key_names_the_nearest(processes, tmp_path):
+    path = tmp_path / "run.toml"
+    path.write_text("[run]\npopluation = 8\n")
+    complains(processes, "coordinator", "--config", path, says="did you mean 'population'")
+
+
+def test_a_port_in_use_costs_nothing(processes, random_bundle):
+    with socket.create_server(("127.0.0.1", processes.port)):
+        complains(
+            processes, "coordinator", "--run", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+            "--bundle", random_bundle.path, says="is in use",
+        )  # fmt: skip
+    again = processes.start(
+        "coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint
+    )
+    again.wait_for("incarnation")
+
+
+def test_a_damaged_bundle_starts_nothing(processes, tmp_path):
+    broken = tmp_path / "broken.zip"
+    broken.write_bytes(b"PK\x03\x04 half")
+    complains(processes, "coordinator", "--bundle", broken, says="not a whole bundle")
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+def test_an_unwritable_folder(processes, random_bundle):
+    complains(
+        processes, "coordinator", "--runs-dir", "/proc/dreamfleet", "--bundle", random_bundle.path,
+        "--listen", processes.endpoint, says="choose another --runs-dir",
+    )  # fmt: skip
+    complains(processes, "collect", "--data", "/proc/dreamfleet", "--episodes", "1", says="choose another --data")
+
+
+def test_an_existing_run_is_not_begun_again(processes, random_bundle):
+    settings = ("--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--generations", 1)
+    processes.coordinator(*settings).end()
+    complains(
+        processes, "coordinator", "--run", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+        "--bundle", random_bundle.path, says="exists: choose another --run, or continue it with --resume",
+    )  # fmt: skip
+    complains(
+        processes, "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--population", "8",
+        says="frozen with run test",
+    )  # fmt: skip
+
+
+def test_a_controller_of_another_shape(processes, tmp_path):
+    path = tmp_path / "small.npz"
+    Controller(ControllerShape(4), np.zeros(15, np.float32), "car-racing", "ab" * 32).save(path)
+    complains(
+        processes, "evaluate", "--controller", path, "--bundle", "tiny", "--episodes", "1",
+        says="a controller of 15 parameters does not fit tiny.zip, which needs 867",
+    )  # fmt: skip
+    complains(processes, "evaluate", "--controller", path, "--episodes", "1", says="name it with --bundle")
+    complains(processes, "evaluate", "--controller", "absent", says="no controller 'absent'")
+    complains(processes, "record", "--controller", path, "--out", "drive.avi", says="ends in .mp4")
+
+
+def test_a_worker_or_viewer_without_a_coordinator(processes):
+    complains(processes, "status", "--connect", processes.endpoint, says="nobody answers at")
+    complains(processes, "worker", "--connect", "nowhere", says="write it as tcp/HOST:PORT")
+    complains(processes, "worker", "--connect", processes.endpoint, "--run", "No", says="cannot name a run")
+    complains(processes, "worker", "--connect", processes.endpoint, "--slots", "-1", says="--slots must be from 0")
+
+
+def test_runs_that_do_not_exist(processes):
+    for verb in (("runs", "show"), ("runs", "delete"), ("runs", "archive"), ("replay", "--candidate", "0/0")):
+        complains(processes, *verb, "night", "--runs-dir", processes.runs, says="no run 'night'")
+    complains(processes, "replay", "night", "--candidate", "first", says="write generation/index")
+
+
+def test_a_run_is_listed_shown_archived_and_deleted(processes, random_bundle):
+    coordinator = processes.coordinator(
+        "--bundle",
+        random_bundle.path,
+        "--task",
+        tasks.TOY,
+        "--generations",
+        2,
+        "--population",
+        4,
+        "--evaluate-every",
+        0,
+    )
+    processes.worker("--task", tasks.TOY)
+    assert coordinator.finish()[0] == 0
+    where = ("--runs-dir", processes.runs)
+    assert "2 generations" in processes.call("runs", "list", *where)[1]
+    assert "sigma0" in processes.call("runs", "show", "test", *where)[1]
+    complains(processes, "runs", "delete", "test", *where, says="give --yes")
+    assert processes.call("runs", "archive", "test", *where)[0] == 0
+    assert "no runs" in processes.call("runs", "list", *where)[1]
+    assert "test" in processes.call("runs", "list", "--archived", *where)[1]
+    assert processes.call("runs", "delete", "test", "--yes", "--runs-dir", processes.runs / "archive")[0] == 0
+
+
+def test_the_doctor_finds_this_installation_well(processes):
+    code, out, _ = processes.call("doctor")
+    assert code == 0, out
+    assert "fingerprint" in out

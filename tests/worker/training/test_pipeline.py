@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+
+from common.bundle import WEIGHTS
+from common.errors import DatasetError, UsageError
+from tests.support.drives import write_drive, write_drives
+from worker.training import train_mdnrnn, train_vae
+from worker.training.assemble import assemble
+from worker.training.checkpoint import load_weights
+from worker.training.dataset import load
+from worker.training.encode import encode
+from worker.training.presets import TrainConfig, find_preset
+from worker.training.train_mdnrnn import area_under_curve
+from worker.worldmodel.inference import Encoder, PolicyStep
+
+SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
+
+
+def ignore(_done, _note):
+    pass
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A data folder that has been through every stage, each two updates long; read only."""
+    folder = tmp_path_factory.mktemp("data")
+    write_drives(folder, episodes=4, steps=6)
+    train_vae.train_vae(folder, SHORT, ignore)
+    assert sum(encode(folder)) == 6 + 5 + 4 + 6
+    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore)
+    return folder
+
+
+def test_equal_folders_make_equal_bundles(trained, tmp_path):
+    first, second = (assemble(trained, tmp_path / f"{index}.zip", "b", with_weights=False) for index in range(2))
+    assert first.sha256 == second.sha256
+    assert first.controller_shape.size == 867
+    assert WEIGHTS not in first.manifest.parts
+
+
+def test_a_bundle_encodes_as_its_training_did(trained, tmp_path):
+    bundle = assemble(trained, tmp_path / "b.zip", "b", with_weights=True)
+    pictures = load(trained / "episodes" / "000001.npz", "picture")["picture"]
+    encoded = load(trained / "encoded" / "000001.npz", "mu", "mirrored_mu")
+    assert np.allclose(Encoder(bundle).encode(pictures)[0], encoded["mu"], atol=1e-5)
+    mirrored = np.ascontiguousarray(pictures[:, :, ::-1])
+    assert np.allclose(Encoder(bundle).encode(mirrored)[0], encoded["mirrored_mu"], atol=1e-5)
+    assert PolicyStep(bundle).shape == bundle.controller_shape
+    assert WEIGHTS in bundle.manifest.parts
+
+
+def test_training_goes_on_where_it_stopped(tmp_path):
+    write_drives(tmp_path, episodes=4, steps=6)
+    seen = []
+    train_vae.train_vae(tmp_path, SHORT, lambda done, _: seen.append(done))
+    before = load_weights(tmp_path / train_vae.CHECKPOINT)
+    train_vae.train_vae(tmp_path, SHORT, lambda done, _: seen.append(done))
+    unchanged = load_weights(tmp_path / train_vae.CHECKPOINT)
+    train_vae.train_vae(tmp_path, TrainConfig(3, 8, 1e-3), lambda done, _: seen.append(done))
+    after = load_weights(tmp_path / train_vae.CHECKPOINT)
+    assert seen == [0, 1, 2, 2, 2, 3]
+    assert all(np.array_equal(before[name], unchanged[name]) for name in before)
+    assert not all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_the_mdnrnn_goes_on_to_the_same_weights_as_without_a_stop(trained, tmp_path):
+    (tmp_path / "encoded").symlink_to(trained / "encoded")
+    for updates in (1, 2):
+        train_mdnrnn.train_mdnrnn(tmp_path, TrainConfig(updates, 8, 1e-3), ignore)
+    whole, stopped = (load_weights(each / train_mdnrnn.CHECKPOINT) for each in (trained, tmp_path))
+    assert all(np.array_equal(whole[name], stopped[name]) for name in whole)
+
+
+def test_encoding_again_encodes_only_what_is_new(tmp_path):
+    write_drives(tmp_path, episodes=2, steps=4)
+    train_vae.train_vae(tmp_path, TrainConfig(1, 4, 1e-3), ignore)
+    assert len(list(encode(tmp_path))) == 2
+    write_drive(tmp_path, 2, steps=4)
+    assert list(encode(tmp_path)) == [4]
+
+
+STAGES = {
+    "encode": lambda folder: list(encode(folder)),
+    "mdnrnn": lambda folder: train_mdnrnn.train_mdnrnn(folder, SHORT, ignore),
+    "bundle": lambda folder: assemble(folder, folder / "b.zip", "b", with_weights=False),
+}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_before_its_time_names_the_verb_to_run(tmp_path, stage):
+    write_drives(tmp_path, episodes=2, steps=4)
+    with pytest.raises(DatasetError, match=r"dreamfleet (train vae|encode)"):
+        STAGES[stage](tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", bytes(64)])
+def test_a_damaged_checkpoint_is_refused_with_the_remedy(tmp_path, content):
+    write_drives(tmp_path, episodes=2, steps=4)
+    (tmp_path / train_vae.CHECKPOINT).write_bytes(content)
+    for attempt in (
+        lambda: train_vae.train_vae(tmp_path, SHORT, ignore),
+        lambda: load_weights(tmp_path / train_vae.CHECKPOINT),
+    ):
+        with pytest.raises(DatasetError, match="delete it"):
+            attempt()
+
+
+def test_an_unknown_preset_lists_those_that_exist():
+    with pytest.raises(UsageError, match=r"'huge'.*tiny"):
+        find_preset("huge")
+
+
+@pytest.mark.parametrize(
+    ("scores", "positive", "area"),
+    [([1, 2, 3, 4], [0, 0, 1, 1], 1.0), ([4, 3, 2, 1], [0, 0, 1, 1], 0.0), ([1, 2, 3, 4], [1, 0, 0, 1], 0.5)],
+)
+def test_the_area_under_the_curve(scores, positive, area):
+    assert area_under_curve(np.array(scores, np.float32), np.array(positive, bool)) == area
