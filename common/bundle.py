@@ -183,5 +183,5 @@ def _read_manifest(archive: zipfile.ZipFile, path: Path) -> Manifest:
         if plain["format"] != FORMAT:
             raise BundleError(f"{path} has bundle format {plain['format']}; this version reads {FORMAT}")
         return from_plain(Manifest, plain)
-    except (ValueError, TypeError, MalformedError) as error:
+    except (ValueError, TypeError, MalformedError, RecursionError) as error:
         raise BundleError(f"{path}: the manifest cannot be read ({error})") from error

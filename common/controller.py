@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import zlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,7 @@ class Controller:
     def load(cls, path: Path) -> Controller:
         """Read a controller file; `ControllerError` says what is wrong with it."""
         try:
-            with np.load(path, allow_pickle=False) as archive:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 about = json.loads(str(archive["about"]))
                 parameters = archive["parameters"]
             if about["format"] != FORMAT:
@@ -100,5 +101,5 @@ class Controller:
             return cls(shape, parameters, str(about["task"]), str(about["bundle"]), dict(about["provenance"]))
         except FileNotFoundError:
             raise ControllerError(f"no controller at {path}") from None
-        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+        except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error) as error:
             raise ControllerError(f"{path} is not a controller file: {error}") from error

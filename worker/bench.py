@@ -14,7 +14,7 @@ from worker.worldmodel.inference import PolicyStep
 
 BLOCKS = 15
 BLOCK_SECONDS = 0.15
-MATRIX = 768  # fits the second-level cache thrice, so that it measures arithmetic
+MATRIX = 768  # large enough to be all arithmetic, small enough for many blocks
 Measured = Callable[[], Any]
 
 

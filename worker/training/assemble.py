@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from common.bundle import DECODER, ENCODER, INITIAL, POLICY, WEIGHTS, Bundle, Manifest, write_bundle
+from common.errors import DatasetError
 from common.fingerprint import package_version
 from worker.tasks.preprocessing import PREPROCESSING, SIZE
 from worker.training import train_mdnrnn, train_vae
 from worker.training.checkpoint import load_weights
 from worker.training.dataset import episodes, load
-from worker.training.encode import ENCODED
+from worker.training.encode import ENCODED, encoder_of
 from worker.worldmodel.export import Weights, export_decoder, export_encoder, export_policy
 from worker.worldmodel.mdnrnn import MDNRNNConfig
 from worker.worldmodel.vae import VAEConfig
@@ -38,6 +39,8 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundl
     """Build the bundle of a data folder whose models are trained."""
     vae = load_weights(folder / train_vae.CHECKPOINT)
     rnn = load_weights(folder / train_mdnrnn.CHECKPOINT)
+    if train_mdnrnn.vae_of(folder) != encoder_of(folder):
+        raise DatasetError(f"the MDN-RNN in {folder} was trained on another VAE: train it again before you bundle")
     quality = folder / QUALITY
     provenance = {
         "episodes": len(episodes(folder)),

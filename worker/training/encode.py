@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from common.bundle import hash_file
 from common.errors import DatasetError
 from common.files import write_aside
 from worker.training.checkpoint import load_checkpoint
@@ -20,15 +21,15 @@ ENCODED = "encoded"
 
 
 def encode(folder: Path) -> Iterator[int]:
-    """Encode the episodes that are not encoded yet, and all again when the VAE is newer; yields the frames of each."""
+    """Encode the episodes that are not encoded yet, and all when the VAE is another; yields the frames of each."""
     model = VAE(VAEConfig())
     if load_checkpoint(folder / CHECKPOINT, model, None) is None:
         raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
     model.eval()
-    trained = (folder / CHECKPOINT).stat().st_mtime
+    vae = hash_file(folder / CHECKPOINT)
     for path in episodes(folder):
         target = folder / ENCODED / path.name
-        if target.exists() and target.stat().st_mtime > trained:
+        if target.exists() and str(load(target, "vae")["vae"]) == vae:
             continue
         pictures = load_pictures(path)
         drive = load(path, "action", "reward")
@@ -37,9 +38,18 @@ def encode(folder: Path) -> Iterator[int]:
         with write_aside(target) as file:
             np.savez(
                 file, mu=mu, logvar=logvar, mirrored_mu=mirrored_mu, mirrored_logvar=mirrored_logvar,
-                action=drive["action"], reward=drive["reward"],
+                action=drive["action"], reward=drive["reward"], vae=np.array(vae),
             )  # fmt: skip
         yield len(pictures)
+
+
+def encoder_of(folder: Path) -> str:
+    """Hash of the VAE checkpoint that a folder's latents come from; `DatasetError` if it is not the folder's own."""
+    vae = hash_file(folder / CHECKPOINT)
+    for path in episodes(folder, ENCODED):
+        if str(load(path, "vae")["vae"]) != vae:
+            raise DatasetError(f"{path} is of another VAE: run `dreamfleet encode --data {folder}` again")
+    return vae
 
 
 def _latents(model: VAE, pictures: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -11,10 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from common.errors import DatasetError
 from common.progress import append_curve
 from worker.training.checkpoint import load_checkpoint, save_checkpoint
 from worker.training.dataset import episodes, load, pad, split
-from worker.training.encode import ENCODED
+from worker.training.encode import ENCODED, encoder_of
 from worker.training.presets import TrainConfig
 from worker.training.train_vae import Report
 from worker.worldmodel.mdnrnn import MDNRNN, MDNRNNConfig, latent_loss, reward_loss
@@ -38,10 +39,13 @@ class Drives:
 def train_mdnrnn(folder: Path, config: TrainConfig, report: Report) -> dict[str, float]:
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes."""
     train, held_out = split(episodes(folder, ENCODED))
+    vae = encoder_of(folder)
     torch.manual_seed(config.seed)
     model = MDNRNN(MDNRNNConfig())
     optimiser = torch.optim.Adam(model.parameters(), lr=config.rate)
-    progress = load_checkpoint(folder / CHECKPOINT, model, optimiser) or {"update": 0}
+    progress = load_checkpoint(folder / CHECKPOINT, model, optimiser) or {"update": 0, "vae": vae}
+    if progress.get("vae") != vae:
+        raise DatasetError(f"{folder / CHECKPOINT} was trained on latents of another VAE; delete it to begin anew")
     start: int = progress["update"]
     report(start, "")
     for update in range(start + 1, config.updates + 1):
@@ -58,8 +62,14 @@ def train_mdnrnn(folder: Path, config: TrainConfig, report: Report) -> dict[str,
         if update % 10 == 0:
             append_curve(folder / "mdnrnn.jsonl", update=update, latent=latent.item(), reward=reward.item())
         if update % SAVE_EVERY == 0 or update == config.updates:
-            save_checkpoint(folder / CHECKPOINT, model, optimiser, {"update": update})
+            save_checkpoint(folder / CHECKPOINT, model, optimiser, {"update": update, "vae": vae})
     return quality(model, held_out)
+
+
+def vae_of(folder: Path) -> str:
+    """Hash of the VAE checkpoint whose latents the folder's MDN-RNN was trained on."""
+    progress = load_checkpoint(folder / CHECKPOINT, MDNRNN(MDNRNNConfig()), None) or {}
+    return str(progress.get("vae"))
 
 
 def losses(model: MDNRNN, drives: Drives, noise: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -40,7 +40,9 @@ class GraphBuilder:
 
     def give(self, value: str, name: str, kind: int, *shape: int) -> None:
         """An output of `kind` and shape `(N, *shape)`."""
-        self._nodes.append(helper.make_node("Identity", [value], [name]))
+        for node in self._nodes:  # renamed where it is made and used: an Identity node would cost a copy
+            for names in (node.input, node.output):
+                names[:] = [name if each == value else each for each in names]
         self._outputs.append(helper.make_tensor_value_info(name, kind, ["N", *shape]))
 
     def constant(self, array: NDArray[Any]) -> str:
@@ -125,7 +127,7 @@ def export_policy(vae: Weights, rnn: Weights, vae_config: VAEConfig, rnn_config:
 
 def _encode(graph: GraphBuilder, picture: str, vae: Weights, config: VAEConfig) -> str:
     """Convolutions over the picture; its scale of 1/255 is folded into the first."""
-    value = graph.node("Transpose", graph.node("Cast", picture, to=TensorProto.FLOAT), perm=[0, 3, 1, 2])
+    value = graph.node("Cast", graph.node("Transpose", picture, perm=[0, 3, 1, 2]), to=TensorProto.FLOAT)
     for layer in (0, 2, 4, 6):
         kernel = vae[f"encoder.{layer}.weight"]
         kernel = (kernel.astype(np.float64) / 255).astype(np.float32) if layer == 0 else kernel
@@ -154,13 +156,15 @@ def _act(graph: GraphBuilder, parameters: str, features: str, config: MDNRNNConf
 
 
 def _advance(graph: GraphBuilder, inputs: Sequence[str], cell: str, rnn: Weights, hidden_size: int) -> tuple[str, str]:
-    """One LSTM step as one matrix product; torch orders the gates input, forget, cell, output."""
-    kernel = np.concatenate([rnn["lstm.weight_ih_l0"], rnn["lstm.weight_hh_l0"]], axis=1).T
-    bias = rnn["lstm.bias_ih_l0"] + rnn["lstm.bias_hh_l0"]
+    """One LSTM step as one matrix product; torch's gates i, f, g, o become i, f, o, g for one Sigmoid of three."""
+    order = np.concatenate([np.arange(hidden_size) + gate * hidden_size for gate in (0, 1, 3, 2)])
+    kernel = np.concatenate([rnn["lstm.weight_ih_l0"], rnn["lstm.weight_hh_l0"]], axis=1)[order].T
+    bias = (rnn["lstm.bias_ih_l0"] + rnn["lstm.bias_hh_l0"])[order]
     gates = graph.node("Gemm", graph.node("Concat", *inputs, axis=1), graph.constant(kernel), graph.constant(bias))
-    enter, forget, candidate, leave = graph.node("Split", gates, graph.shape(*[hidden_size] * 4), outputs=4, axis=1)
-    kept = graph.node("Mul", graph.node("Sigmoid", forget), cell)
-    added = graph.node("Mul", graph.node("Sigmoid", enter), graph.node("Tanh", candidate))
-    next_cell = graph.node("Add", kept, added)
-    next_hidden = graph.node("Mul", graph.node("Sigmoid", leave), graph.node("Tanh", next_cell))
+    squashed, candidate = graph.node("Split", gates, graph.shape(3 * hidden_size, hidden_size), outputs=2, axis=1)
+    opened = graph.node("Sigmoid", squashed)
+    enter, forget, leave = graph.node("Split", opened, graph.shape(*[hidden_size] * 3), outputs=3, axis=1)
+    kept = graph.node("Mul", forget, cell)
+    next_cell = graph.node("Add", kept, graph.node("Mul", enter, graph.node("Tanh", candidate)))
+    next_hidden = graph.node("Mul", leave, graph.node("Tanh", next_cell))
     return next_hidden, next_cell

@@ -1,3 +1,5 @@
+import shutil
+
 import numpy as np
 import pytest
 
@@ -64,11 +66,28 @@ def test_training_goes_on_where_it_stopped(tmp_path):
 
 
 def test_the_mdnrnn_goes_on_to_the_same_weights_as_without_a_stop(trained, tmp_path):
-    (tmp_path / "encoded").symlink_to(trained / "encoded")
+    for name in ("encoded", train_vae.CHECKPOINT):
+        (tmp_path / name).symlink_to(trained / name)
     for updates in (1, 2):
         train_mdnrnn.train_mdnrnn(tmp_path, TrainConfig(updates, 8, 1e-3), ignore)
     whole, stopped = (load_weights(each / train_mdnrnn.CHECKPOINT) for each in (trained, tmp_path))
     assert all(np.array_equal(whole[name], stopped[name]) for name in whole)
+
+
+def test_latents_of_an_older_vae_never_reach_a_bundle(trained, tmp_path):
+    folder = tmp_path / "data"
+    shutil.copytree(trained, folder)
+    train_vae.train_vae(folder, TrainConfig(3, 8, 1e-3), ignore)
+    for stage in ("mdnrnn", "bundle"):
+        with pytest.raises(DatasetError, match="dreamfleet encode"):
+            STAGES[stage](folder)
+    list(encode(folder))
+    for stage in ("mdnrnn", "bundle"):
+        with pytest.raises(DatasetError, match="another VAE"):
+            STAGES[stage](folder)
+    (folder / train_mdnrnn.CHECKPOINT).unlink()
+    STAGES["mdnrnn"](folder)
+    STAGES["bundle"](folder)
 
 
 def test_encoding_again_encodes_only_what_is_new(tmp_path):
