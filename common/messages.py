@@ -164,6 +164,7 @@ class Beat(Message):
     unacked: Annotated[tuple[Tag, ...], Length(0, MAX_LEASES)]  # oldest first
     load: Annotated[float, Between(0.0, 1e6)]  # the host's, over one minute
     steps_per_second: Annotated[float, Between(0.0, 1e9)]
+    drawn_by: Word  # whose picture the slots see: native, gymnasium, or - where a task does not say
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -106,11 +106,12 @@ def _worker_table(workers: Sequence[dict[str, Any]]) -> RenderableType:
     if not workers:
         return Text("no workers yet: start one with  dreamfleet worker --connect tcp/HOST:PORT", style="yellow")
     table = Table(box=None, padding=(0, 2), header_style="dim")
-    for column in ("worker", "state", "slots", "leases", "finished", "steps/s", "load"):
-        table.add_column(column, justify="left" if column in ("worker", "state") else "right")
+    for column in ("worker", "state", "slots", "leases", "finished", "steps/s", "load", "picture"):
+        table.add_column(column, justify="left" if column in ("worker", "state", "picture") else "right")
     for each in workers[:20]:
         style = "" if each["state"] == "present" else "red"
-        values = (each["slots"], each["leases"], each["finished"], f"{each['steps_per_second']:.0f}", each["load"])
+        values = (each["slots"], each["leases"], each["finished"], f"{each['steps_per_second']:.0f}", each["load"],
+                  each["drawn_by"])  # fmt: skip
         table.add_row(each["worker"], each["state"], *map(str, values), style=style)
     if len(workers) > 20:
         table.add_row(f"and {len(workers) - 20} more")

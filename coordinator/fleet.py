@@ -52,6 +52,7 @@ class Member:
     seen: int = 0
     load: float = 0.0
     steps_per_second: float = 0.0
+    drawn_by: str = "-"
     finished: int = 0
     leases: dict[bytes, Lease] = field(default_factory=dict)
     unseen: dict[int, Sent] = field(default_factory=dict)
@@ -144,7 +145,7 @@ class Fleet:
             return
         self._hear(member, now)
         member.capacity, member.slots, member.seen = beat.capacity, beat.slots, beat.seen
-        member.load, member.steps_per_second = beat.load, beat.steps_per_second
+        member.load, member.steps_per_second, member.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
         member.unseen = {number: sent for number, sent in member.unseen.items() if number > beat.seen}
         shown = {self._tags.get(tag) for tag in (*beat.queued, *(run.tag for run in beat.running), *beat.unacked)}
         for digest, lease in list(member.leases.items()):

@@ -129,6 +129,7 @@ def _member(member: Member, now: float) -> dict[str, Any]:
         "finished": member.finished,
         "steps_per_second": round(member.steps_per_second, 1),
         "load": round(member.load, 2),
+        "drawn_by": member.drawn_by,
         "heard": round(now - member.heard, 1),
         "fingerprint": member.fingerprint,
     }

@@ -71,7 +71,7 @@ def evaluate(controller: Controller, bundle: Bundle, seeds: tuple[int, ...], job
 
 def _start_process(spec: TaskSpec, bundle: Path) -> None:
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    _scorer[:] = [Scorer(spec, Bundle.open(bundle))]
+    _scorer[:] = [Scorer(spec, Bundle.open(bundle), judge=True)]
 
 
 def _drive(task: tuple[Controller, int]) -> tuple[int, float]:

@@ -16,12 +16,12 @@ FULL_EPISODE = 10**6  # steps: the environment's own limit ends it
 
 
 class Scorer:
-    """Scores one job at a time."""
+    """Scores one job at a time; a `judge` does so in the environment that reported scores come from."""
 
-    def __init__(self, spec: TaskSpec, bundle: Bundle) -> None:
+    def __init__(self, spec: TaskSpec, bundle: Bundle, *, judge: bool = False) -> None:
         task = find_task(spec.task)
         self._spec = spec
-        self._environment = task.make_environment()
+        self._environment = task.make_judge() if judge else task.make_environment()
         self._policy = task.make_policy(bundle)
 
     def score(
@@ -29,6 +29,11 @@ class Scorer:
     ) -> Score:
         """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode."""
         return rollout(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
+
+    @property
+    def drawn_by(self) -> str:
+        """Who draws the environment's picture; `-` where a task does not say."""
+        return str(getattr(self._environment.unwrapped, "drawn_by", "-"))
 
     def course(self, kind: Kind, seed: int) -> Course:
         """The episode that a job of this kind and seed is."""

@@ -234,6 +234,7 @@ class Worker:
             unacked=_tags(self._outbox.digests),
             load=os.getloadavg()[0],
             steps_per_second=self._rate,
+            drawn_by=next((slot.drawn_by for slot in self._slots if slot.ready), "-"),
         )
         session.put(keys.beat(self._admission.run, self.identity), encode(beat), encoding=encoding(Beat))
 

@@ -25,9 +25,15 @@ from common.messages import Job, Result, TaskSpec
 from common.threads import pin_thread_pools
 
 log = logging.getLogger(__name__)
-READY = "ready"
 FAILED_STARTS = 3
 _PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A child's first word: it can score, and who draws its picture."""
+
+    drawn_by: str
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,7 @@ class SlotEvent:
 
     slot: int
     life: int
-    ready: bool = False
+    ready: Ready | None = None
     result: Result | None = None
     gone: str | None = None
 
@@ -48,6 +54,7 @@ class Slot:
         self.number = number
         self.job: Job | None = None
         self.ready = False
+        self.drawn_by = "-"
         self._spec = spec
         self._bundle = bundle
         self._events = events
@@ -78,8 +85,8 @@ class Slot:
         """Take one of this slot's events; the result of its job, if that has ended."""
         if event.life != self._life:
             return None
-        if event.ready:
-            self.ready = True
+        if event.ready is not None:
+            self.ready, self.drawn_by = True, event.ready.drawn_by
             self._failed_starts = 0
         elif event.result is not None:
             self.job = None
@@ -131,11 +138,12 @@ class Slot:
                 said = pipe.recv()
             except (EOFError, OSError):
                 break
-            if isinstance(said, str) and said != READY:
+            if isinstance(said, str):
                 why = said
-                continue
-            event = SlotEvent(self.number, life, ready=said == READY, result=None if said == READY else said)
-            self._events.put(("slot", event))
+            elif isinstance(said, Ready):
+                self._events.put(("slot", SlotEvent(self.number, life, ready=said)))
+            else:
+                self._events.put(("slot", SlotEvent(self.number, life, result=said)))
         self._events.put(("slot", SlotEvent(self.number, life, gone=why)))
 
 
@@ -153,7 +161,7 @@ def serve_jobs(pipe: Connection[Any, Any], steps: Any, spec: TaskSpec, bundle: P
     except Exception as error:
         pipe.send(_one_line(error))
         raise SystemExit(1) from error
-    pipe.send(READY)
+    pipe.send(Ready(scorer.drawn_by))
 
     def count(done: int) -> None:
         steps.value = done

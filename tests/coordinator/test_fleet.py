@@ -20,7 +20,7 @@ def work(count, kind="score", generation=0):
 
 def beat(capacity=1, seen=0, queued=(), running=(), unacked=()):
     return Beat(
-        **HEAD, nonce="n", seen=seen, capacity=capacity, slots=capacity, load=0.0, steps_per_second=0.0,
+        **HEAD, nonce="n", seen=seen, capacity=capacity, slots=capacity, load=0.0, steps_per_second=0.0, drawn_by="-",
         queued=tuple(digest[:TAG_BYTES] for digest in queued),
         running=tuple(Running(digest[:TAG_BYTES], 5) for digest in running),
         unacked=tuple(digest[:TAG_BYTES] for digest in unacked),

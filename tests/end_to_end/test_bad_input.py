@@ -129,7 +129,7 @@ def test_a_run_is_listed_shown_archived_and_deleted(processes, random_bundle):
     processes.worker("--task", tasks.TOY)
     assert coordinator.finish()[0] == 0
     where = ("--runs-dir", processes.runs)
-    assert "2 generations" in processes.call("runs", "list", *where)[1]
+    assert "ended" in processes.call("runs", "list", *where)[1]
     assert "sigma0" in processes.call("runs", "show", "test", *where)[1]
     complains(processes, "runs", "delete", "test", *where, says="give --yes")
     assert processes.call("runs", "archive", "test", *where)[0] == 0

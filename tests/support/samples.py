@@ -55,6 +55,7 @@ MSGPACK = {
     "beat": Beat(
         **HEAD, nonce="c0ffee00c0ffee00", seen=9, capacity=4, slots=4, queued=(b"abcdefgh",),
         running=(Running(b"ABCDEFGH", 412),), unacked=(b"12345678",), load=1.5, steps_per_second=987.5,
+        drawn_by="native",
     ),
     "bundle": BundlePart(**HEAD, sha256=b"\xab" * 32, offset=40960, total=14302154, data=b"part of a bundle"),
     "upload": UploadPart(

@@ -39,6 +39,9 @@ class Task(Protocol):
     def make_environment(self) -> gymnasium.Env[Any, Any]:
         """A new environment; its observations are what the policy takes."""
 
+    def make_judge(self) -> gymnasium.Env[Any, Any]:
+        """The environment that reported scores come from; the same as the other where there is no second one."""
+
     def make_policy(self, bundle: Bundle) -> Policy:
         """The policy of a bundle; `BundleError` if the bundle is of another task."""
 

@@ -1,4 +1,4 @@
-"""gymnasium's CarRacing-v3, seen through the world model's encoder."""
+"""CarRacing-v3, seen through the world model's encoder."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from common.bundle import Bundle
 from common.errors import BundleError
+from worker.render.check import make_car_racing
 from worker.tasks.preprocessing import PREPROCESSING, SIZE, picture
 from worker.worldmodel.inference import PolicyStep
 
@@ -24,7 +25,11 @@ class CarRacing:
     width = 1
 
     def make_environment(self) -> gymnasium.Env[Any, Any]:
-        """Gymnasium's own environment; the observation is the 64x64 picture."""
+        """The environment with the native picture, where that is exact; it observes the 64x64 picture."""
+        return make_car_racing(picture_only=True)
+
+    def make_judge(self) -> gymnasium.Env[Any, Any]:
+        """The unmodified environment of gymnasium, preprocessed here."""
         return PictureObservation(gymnasium.make(ENVIRONMENT))
 
     def make_policy(self, bundle: Bundle) -> CarRacingPolicy:

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from common.errors import DatasetError, UsageError
 from common.files import write_aside
 from common.threads import pin_thread_pools
-from worker.tasks.preprocessing import PREPROCESSING, picture
+from worker.render.check import make_car_racing
+from worker.tasks.preprocessing import PREPROCESSING
 from worker.training.drivers import DRIVERS
-
-ENVIRONMENT = "CarRacing-v3"
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ def drive(config: CollectConfig, number: int) -> dict[str, NDArray[Any]]:
     random = np.random.default_rng([config.seed, number])
     name = list(DRIVERS)[number % len(DRIVERS)]
     driver = DRIVERS[name](random)
-    environment = gymnasium.make(ENVIRONMENT)
+    environment = make_car_racing(picture_only=True)
     observation, _ = environment.reset(seed=int(random.integers(2**20, 2**31)))
     if random.random() < config.anywhere:
         observation = _put_anywhere(environment, random)
@@ -86,7 +85,7 @@ def drive(config: CollectConfig, number: int) -> dict[str, NDArray[Any]]:
     idle, ended = 0, False
     while len(actions) < config.steps and idle < config.patience and not ended:
         action = driver.act()
-        pictures.append(picture(observation))
+        pictures.append(observation)
         observation, reward, terminated, truncated, _ = environment.step(action)
         actions.append(action)
         rewards.append(float(reward))

@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
 
     from common.bundle import find_bundle
     from common.threads import pin_thread_pools
-    from worker.bench import bench_policy
+    from worker.bench.policy import bench_policy
 
     bundle = find_bundle(args.bundle)
     pin_thread_pools()

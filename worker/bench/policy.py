@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Callable
-from time import perf_counter
-from typing import Any
-
 import numpy as np
 
 from common.bundle import Bundle
+from worker.bench.blocks import Measured, alternate
 from worker.worldmodel.inference import PolicyStep
 
-BLOCKS = 15
-BLOCK_SECONDS = 0.15
 MATRIX = 768  # large enough to be all arithmetic, small enough for many blocks
-Measured = Callable[[], Any]
 
 
 def bench_policy(bundle: Bundle) -> dict[str, float | str | None]:
@@ -58,25 +51,3 @@ def flops(bundle: Bundle) -> int:
     features = manifest.latent + manifest.hidden
     lstm = 4 * manifest.hidden * (features + manifest.actions)
     return 2 * (convolutions + 4 * channels[-1] * manifest.latent + lstm + manifest.actions * features)
-
-
-def alternate(cases: dict[str, Measured]) -> dict[str, float]:
-    """Seconds a call of each case: the median of blocks that take turns, so that a slower spell hits all alike."""
-    counts = {name: _calls_a_block(call) for name, call in cases.items()}
-    blocks: dict[str, list[float]] = {name: [] for name in cases}
-    for _ in range(BLOCKS):
-        for name, call in cases.items():
-            started = perf_counter()
-            for _ in range(counts[name]):
-                call()
-            blocks[name].append((perf_counter() - started) / counts[name])
-    return {name: statistics.median(values) for name, values in blocks.items()}
-
-
-def _calls_a_block(call: Measured) -> int:
-    call()
-    started, calls = perf_counter(), 0
-    while perf_counter() - started < BLOCK_SECONDS:
-        call()
-        calls += 1
-    return calls

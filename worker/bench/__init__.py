@@ -1,0 +1,1 @@
+"""Measurements that are ratios from one run: cases take turns in blocks, medians count."""

@@ -1,0 +1,165 @@
+"""gymnasium's CarRacing-v3 with its own track, physics and rewards; only the observation is drawn by our native module.
+
+`rgb_array` and `human` rendering stay gymnasium's. Where the native module was not built, `worker.render.check` says
+so and gymnasium draws.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pygame
+from gymnasium.envs.box2d import car_dynamics, car_racing
+from gymnasium.error import InvalidAction
+from numpy.typing import NDArray
+
+from worker.tasks import preprocessing
+
+try:
+    from worker.render import _native
+except ImportError:  # no compiler when this was installed
+    _native = None  # type: ignore[assignment]
+
+BAR_TOP = 700  # source row
+TEXT_BOX = (125, 100)  # pixels at the bar's left end that hold the score
+PICTURE_SHAPE = (64, 64, 3)
+_Base: Any = car_racing.CarRacing  # untyped upstream
+
+
+class CarRacing(_Base):  # type: ignore[misc]
+    """CarRacing-v3 with its observation drawn natively.
+
+    `picture_only` observes the 64x64 picture instead; `native` False lets gymnasium draw, as it does anyway where the
+    module was not built. Not thread-safe, as gymnasium's is not: environments of one process share one canvas.
+    """
+
+    def __init__(self, *arguments: Any, picture_only: bool = False, native: bool = True, **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self._native = native and available()
+        self._picture_only = picture_only
+        self._bodies = np.zeros((5, 4))
+        self._sight = np.array([0.0, 0.0, 0.0, 0.0, car_racing.PLAYFIELD])
+        self._fixtures = np.zeros(0)
+        if picture_only:
+            self.observation_space = gymnasium.spaces.Box(0, 255, PICTURE_SHAPE, np.uint8)
+
+    @property
+    def drawn_by(self) -> str:
+        """`native` or `gymnasium`."""
+        return "native" if self._native else "gymnasium"
+
+    def step(self, action: Any) -> Any:
+        """Gymnasium's step; an action of another shape, or NaN, is refused before anything moves."""
+        if action is not None and self.continuous:
+            action = np.asarray(action)
+            if action.shape != (3,) or not np.isfinite(action).all():
+                raise InvalidAction(f"an action is three finite numbers (steering, gas, brake), not {action!r}")
+        return super().step(action)
+
+    def _create_track(self) -> bool:
+        """Gymnasium's track; the tiles' colours then live in one array, which contacts change in place."""
+        if not super()._create_track():
+            return False
+        self._road = np.array([corners for corners, _ in self.road_poly], dtype=np.float64)
+        self._road_colours = np.array([colour for _, colour in self.road_poly], dtype=np.float64)
+        rows = {id(colour): row for row, (_, colour) in enumerate(self.road_poly)}
+        for tile in self.road:
+            row = rows[id(tile.color)]
+            tile.color = self._road_colours[row]
+            self.road_poly[row] = (self.road_poly[row][0], tile.color)
+        self._fixtures = np.zeros(0)
+        return True
+
+    def _render(self, mode: str) -> Any:
+        if mode != "state_pixels":
+            return super()._render(mode)
+        if self._native:
+            return self._draw()
+        observation = super()._render(mode)
+        return preprocessing.picture(observation) if self._picture_only else observation
+
+    def _draw(self) -> NDArray[np.uint8]:
+        """The observation `(96, 96, 3)`, or the picture `(64, 64, 3)`."""
+        car, t = self.car, self.t
+        hull = car.hull
+        if not self._fixtures.size:
+            self._fixtures = fixtures_of(car)
+        for row, body in zip(self._bodies, car.wheels, strict=False):
+            row[0], row[1] = body.position
+            row[2], row[3] = body.angle, body.phase
+        x, y = hull.position
+        angle = hull.angle
+        self._bodies[4] = x, y, angle, 0.0
+        zoom = 0.1 * car_racing.SCALE * max(1 - t, 0) + car_racing.ZOOM * car_racing.SCALE * min(t, 1)
+        self._sight[:4] = zoom, -angle, x, y
+        palette = np.array([self.bg_color, self.grass_color], dtype=np.float64)
+        out = np.empty((96, 96, 3), np.uint8)
+        _native.scene(
+            out, self._road, self._road_colours, GRASS, palette, self._sight, self._bodies, self._fixtures, WHEEL
+        )
+        if self._picture_only:
+            picture = np.empty(PICTURE_SHAPE, np.uint8)
+            _native.picture(picture, out)
+            return picture
+        self._draw_bar(out[84:])
+        return out
+
+    def _draw_bar(self, rows: NDArray[np.uint8]) -> None:
+        car, hull = self.car, self.car.hull
+        vx, vy = hull.linearVelocity
+        wheels = car.wheels
+        _native.bar(
+            rows, math.sqrt(vx * vx + vy * vy), *(wheel.omega for wheel in wheels),
+            wheels[0].joint.angle, hull.angularVelocity,
+        )  # fmt: skip
+        text = score_text(f"{self.reward:04.0f}")
+        rows[:, : text.shape[1]] = text
+
+
+def available() -> bool:
+    """Whether the native module was built."""
+    return _native is not None
+
+
+def fixtures_of(car: car_dynamics.Car) -> NDArray[np.float64]:
+    """The car's polygons in drawing order: body, colour, count, vertices."""
+    rows: list[float] = []
+    for obj in car.drawlist:
+        body = 4 if obj is car.hull else car.wheels.index(obj)
+        for fixture in obj.fixtures:
+            vertices = fixture.shape.vertices
+            rows += [body, *(int(c * 255) for c in obj.color), len(vertices)]
+            rows += [value for vertex in vertices for value in vertex]
+    return np.array(rows, dtype=np.float64)
+
+
+@lru_cache(maxsize=4096)
+def score_text(text: str) -> NDArray[np.uint8]:
+    """The score's text as observation rows 84-95, columns 0-11."""
+    pygame.font.init()
+    font = pygame.font.Font(pygame.font.get_default_font(), 42)
+    image = font.render(text, True, (255, 255, 255), (0, 0, 0))
+    place = image.get_rect()
+    place.center = (60, int(car_racing.WINDOW_H - car_racing.WINDOW_H * 2.5 / 40.0))
+    surface = pygame.Surface(TEXT_BOX)
+    surface.blit(image, place.move(0, -BAR_TOP))
+    rows = np.zeros((12, 96, 3), np.uint8)
+    _native.shrink_text(rows, np.ascontiguousarray(pygame.surfarray.array3d(surface).transpose(1, 0, 2)))
+    return rows[:, :12].copy()
+
+
+def _grass() -> NDArray[np.float64]:
+    size = car_racing.GRASS_DIM
+    return np.array([
+        [(size * x + size, size * y + 0), (size * x + 0, size * y + 0),
+         (size * x + 0, size * y + size), (size * x + size, size * y + size)]
+        for x in range(-20, 20, 2) for y in range(-20, 20, 2)
+    ], dtype=np.float64)  # fmt: skip
+
+
+GRASS = _grass()
+WHEEL = np.array([car_dynamics.WHEEL_W, car_dynamics.WHEEL_R, car_dynamics.SIZE, *car_dynamics.WHEEL_WHITE], float)
