@@ -31,16 +31,16 @@ PLOT, VIDEO = "fitness.png", "drive.mp4"
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """How long and how large; the defaults suit two cores and gymnasium's own picture."""
+    """How long and how large; the defaults suit two cores."""
 
     minutes: float = option(4.0, "evolve for so long")
-    population: int = option(16, "candidates a generation")
+    population: int = option(32, "candidates a generation")
     episodes: int = option(2, "episodes a candidate")
-    horizon: int = option(200, "steps of an episode at most")
-    patience: int = option(60, "cut an episode after so many steps without reward")
+    horizon: int = option(1000, "steps of an episode at most")
+    patience: int = option(100, "cut an episode after so many steps without reward")
     sigma0: float = option(0.1, "first step size")
     seed: int = option(1, "makes the run")
-    tracks: int = option(8, "unseen tracks that the mean is judged on")
+    tracks: int = option(16, "unseen tracks that the mean is judged on")
     workers: int = option(0, "worker processes; 0: one a core")
     port: int = option(7447, "port of the embedded router")
 
@@ -68,7 +68,7 @@ class Demo:
         self._call("evaluate", "--controller", controller, "--episodes", str(self._config.tracks))
         self._plot()
         self._say("recording a drive")
-        self._call("record", "--controller", controller, "--out", str(self._folder / VIDEO), "--steps", "600")
+        self._call("record", "--controller", controller, "--out", str(self._folder / VIDEO), "--steps", "1000")
         self._farewell()
 
     def _evolve(self) -> None:
