@@ -20,7 +20,7 @@ class Backlog:
         self._spec = spec
         self.begin()
         self._jobs: OrderedDict[bytes, Job] = OrderedDict()
-        self._vectors: OrderedDict[bytes, bytearray] = OrderedDict()
+        self._vectors: OrderedDict[bytes, dict[int, bytes]] = OrderedDict()  # identity -> offset -> bytes
 
     def begin(self) -> None:
         """A new coordinator's life: its batches count from 1 again."""
@@ -60,17 +60,16 @@ class Backlog:
     def next(self) -> tuple[Job, bytes] | None:
         """The first job whose vector is whole, with the vector."""
         for digest, job in self._jobs.items():
-            vector = self._vectors.get(job.vector)
-            if vector is not None and hashlib.sha256(vector).digest() == job.vector:
+            parts = sorted(self._vectors.get(job.vector, {}).items())
+            vector = b"".join(data for _, data in parts)
+            if hashlib.sha256(vector).digest() == job.vector:
                 del self._jobs[digest]
-                return job, bytes(vector)
+                return job, vector
         return None
 
     def _add_part(self, part: VectorPart) -> None:
-        vector = self._vectors.setdefault(part.id, bytearray())
+        self._vectors.setdefault(part.id, {})[part.offset] = part.data
         self._vectors.move_to_end(part.id)
-        if part.offset == len(vector):  # parts come in order; one that was missed comes again with its batch
-            vector.extend(part.data)
 
     def _trim(self) -> None:
         needed = {job.vector for job in self._jobs.values()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import queue
+from collections.abc import Callable
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -19,13 +20,16 @@ from common.messages import MAX_PART, BundlePart
 log = logging.getLogger(__name__)
 WINDOW = 8  # queries in flight: enough to fill a link with a long way
 ATTEMPTS = 3  # damaged downloads before giving up
-SILENCES = 20  # rounds without any part before giving up
+SILENCES = 20  # rounds without progress before giving up
 QUERY_TIMEOUT = 3.0
-PAUSE = 0.5  # seconds after a round without any part
+PAUSE = 0.5  # seconds after a round without progress
 
 
-def obtain(session: zenoh.Session, run: str, sha256: str, store: BundleStore, inbox: Inbox) -> Bundle:
-    """The bundle from the cache, or fetched from the coordinator."""
+def obtain(
+    session: zenoh.Session, run: str, sha256: str, store: BundleStore, inbox: Inbox,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Bundle | None:  # fmt: skip
+    """The bundle from the cache, or fetched from the coordinator; `None` if `stopped`, what has come stays."""
     bundle = store.find(sha256)
     if bundle is not None:
         return bundle
@@ -33,7 +37,9 @@ def obtain(session: zenoh.Session, run: str, sha256: str, store: BundleStore, in
         for attempt in range(1, ATTEMPTS + 1):
             if (bundle := store.find(sha256)) is not None:  # another worker of this host was faster
                 return bundle
-            _download(session, keys.bundle(run, sha256), sha256, path, inbox)
+            _download(session, keys.bundle(run, sha256), sha256, path, inbox, stopped)
+            if stopped():
+                return None
             try:
                 bundle = store.complete(sha256)
             except BundleError as error:
@@ -44,21 +50,28 @@ def obtain(session: zenoh.Session, run: str, sha256: str, store: BundleStore, in
     raise BundleError(f"the bundle {sha256[:12]}... arrived damaged {ATTEMPTS} times: check the coordinator's copy")
 
 
-def _download(session: zenoh.Session, key: str, sha256: str, path: Path, inbox: Inbox) -> None:
-    """Append to `path` until it is as long as the bundle."""
+def _download(
+    session: zenoh.Session, key: str, sha256: str, path: Path, inbox: Inbox, stopped: Callable[[], bool]
+) -> None:
+    """Append to `path` until it is as long as the bundle, or `stopped`."""
     total, silences = None, 0
     with path.open("ab") as file:
-        while total is None or file.tell() < total:
-            offsets = [file.tell() + index * MAX_PART for index in range(WINDOW if total else 1)]
+        while (total is None or file.tell() < total) and not stopped():
+            before = file.tell()
+            offsets = [before + index * MAX_PART for index in range(WINDOW if total else 1)]
             parts = _ask(session, key, [each for each in offsets if total is None or each < total], inbox)
             for part in sorted(parts, key=lambda part: part.offset):
-                total = part.total
-                if part.sha256.hex() == sha256 and part.offset == file.tell() and part.data:
-                    file.write(part.data)
+                if part.sha256.hex() == sha256:
+                    total = part.total
+                    if part.offset == file.tell():
+                        file.write(part.data)
             if total is not None and file.tell() > total:
-                file.truncate(0)  # the beginning of something else
-            silences = 0 if parts else silences + 1
-            if not parts:
+                file.seek(0)
+                file.truncate()  # the beginning of something else
+            elif file.tell() > before or file.tell() == total:
+                silences = 0
+            else:
+                silences += 1
                 sleep(PAUSE)
             if silences >= SILENCES:
                 raise BundleError("the coordinator no longer answers for its bundle; start the worker again later")

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from common.bundle import Bundle, BundleStore, default_cache, find_bundle
 from common.controller import Controller
-from common.errors import BundleError, ControllerError
+from common.errors import BundleError, ControllerError, DreamfleetError
 from common.messages import TaskSpec
 from common.threads import pin_thread_pools
 from worker.scoring import Scorer
-
-_scorer: list[Scorer] = []  # one a process, made by the pool's initializer
 
 
 @dataclass(frozen=True)
@@ -63,17 +66,27 @@ def evaluate(controller: Controller, bundle: Bundle, seeds: tuple[int, ...], job
     """Drive one whole episode a seed in `jobs` processes; yields (seed, score) as each ends."""
     pin_thread_pools()
     spec = TaskSpec(controller.task, bundle.sha256, horizon=1000, patience=0)
-    with get_context("spawn").Pool(
-        min(jobs, len(seeds)), initializer=_start_process, initargs=(spec, bundle.path)
-    ) as pool:
-        yield from pool.imap_unordered(_drive, [(controller, seed) for seed in seeds])
+    pool = ProcessPoolExecutor(min(jobs, len(seeds)), get_context("spawn"), _start_process)
+    try:
+        drives = [pool.submit(_drive, spec, bundle.path, controller.parameters, seed) for seed in seeds]
+        for drive in as_completed(drives):
+            yield drive.result()
+    except BrokenProcessPool as error:
+        raise DreamfleetError("a process that drove has crashed; `dreamfleet doctor` looks for the cause") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
-def _start_process(spec: TaskSpec, bundle: Path) -> None:
+def _start_process() -> None:
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    _scorer[:] = [Scorer(spec, Bundle.open(bundle), judge=True)]
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches the whole group: end without a traceback
 
 
-def _drive(task: tuple[Controller, int]) -> tuple[int, float]:
-    controller, seed = task
-    return seed, _scorer[0].score("evaluate", controller.parameters, seed).fitness
+def _drive(spec: TaskSpec, bundle: Path, parameters: NDArray[np.float32], seed: int) -> tuple[int, float]:
+    return seed, _scorer(spec, bundle).score("evaluate", parameters, seed).fitness
+
+
+@cache
+def _scorer(spec: TaskSpec, bundle: Path) -> Scorer:
+    """One a process, made by its first drive, so that whatever is wrong is that drive's error."""
+    return Scorer(spec, Bundle.open(bundle), judge=True)

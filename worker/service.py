@@ -10,14 +10,14 @@ import logging
 import os
 import queue
 import random
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from time import monotonic
 from typing import Any
 
 import zenoh
 
 from common import keys
-from common.bundle import BundleStore, default_cache
+from common.bundle import Bundle, BundleStore, default_cache
 from common.codec import Inbox, encode, encoding
 from common.errors import ConnectionFailedError, RefusedError
 from common.fingerprint import fingerprint
@@ -34,6 +34,7 @@ from worker.tasks.api import find_task, known_tasks
 log = logging.getLogger(__name__)
 RETRY = 1.0  # seconds between attempts to connect or join
 GONE = 5.0  # seconds without a coordinator after which a run counts as over
+SILENT_BEATS = 5  # in which a coordinator that knows this worker would have answered
 SMOOTHING = 0.3  # weight of the newest interval in the throughput
 
 
@@ -51,6 +52,8 @@ class Worker:
         self._stops = 0
         self._slots: list[Slot] = []
         self._coordinators: set[str] = set()
+        self._parted = False  # the joined coordinator was out of sight, and may have given this worker up
+        self._quiet_since = self._ask_at = 0.0
         self._finished = self._steps_finished = 0
 
     def stop(self) -> None:
@@ -69,7 +72,9 @@ class Worker:
             if admission is None:
                 return
             self._admission = admission
-            bundle = obtain(session, admission.run, admission.spec.bundle, BundleStore(default_cache()), self.inbox)
+            bundle = self._obtain_bundle(session)
+            if bundle is None:
+                return
             stack.callback(self._stop_slots)
             self._slots = [
                 Slot(number, admission.spec, bundle.path, self._events) for number in range(self._slot_count)
@@ -109,9 +114,13 @@ class Worker:
             self._pause()
         return None
 
+    def _obtain_bundle(self, session: zenoh.Session) -> Bundle | None:
+        run, store = self._admission, BundleStore(default_cache())
+        return obtain(session, run.run, run.spec.bundle, store, self.inbox, stopped=lambda: self._stops > 0)
+
     def _pause(self) -> None:
         """Wait a moment, with jitter, or until told to stop."""
-        deadline = monotonic() + RETRY * random.uniform(0.5, 1.5)  # noqa: S311 - jitter, no secret
+        deadline = monotonic() + _jittered(RETRY)
         while not self._stops and (left := deadline - monotonic()) > 0:
             try:
                 self._events.get(timeout=left)
@@ -130,8 +139,8 @@ class Worker:
         ]
 
     def _loop(self, session: zenoh.Session) -> None:
-        now = monotonic()
-        self._alone_since: float | None = None
+        self._quiet_since = now = monotonic()
+        self._alone_since: float | None = now  # until a coordinator's token says otherwise
         self._beat_at, self._rate, self._counted = now, 0.0, (now, 0)
         drain_until = None
         while not self._left(drain_until):
@@ -148,7 +157,8 @@ class Worker:
             if now >= self._beat_at:
                 self._beat_at = now + self._admission.intervals.beat
                 self._send_beat(session, now, capacity=0 if drain_until else self._capacity())
-            self._rejoin(session)
+            if self._must_rejoin(now):
+                self._rejoin(session, now)
 
     def _left(self, drain_until: float | None) -> bool:
         if self._stops > 1:
@@ -175,10 +185,16 @@ class Worker:
         elif kind == "slot":
             self._take_slot_event(event)
         elif kind == "coordinator":
-            nonce = str(event.key_expr).rsplit("/", 1)[-1]
-            change = self._coordinators.discard if event.kind == zenoh.SampleKind.DELETE else self._coordinators.add
-            change(nonce)
-            self._alone_since = None if self._coordinators else monotonic()
+            self._take_token(event)
+
+    def _take_token(self, event: zenoh.Sample) -> None:
+        nonce = str(event.key_expr).rsplit("/", 1)[-1]
+        if event.kind == zenoh.SampleKind.DELETE:
+            self._coordinators.discard(nonce)
+            self._parted |= nonce == self._admission.nonce
+        else:
+            self._coordinators.add(nonce)
+        self._alone_since = None if self._coordinators else monotonic()
 
     def _take_batch(self, payload: bytes) -> None:
         batch = self.inbox.decode(JobBatch, payload)
@@ -187,11 +203,13 @@ class Worker:
         if (batch.run_uid, batch.nonce) != (self._admission.run_uid, self._admission.nonce):
             self.inbox.dropped["foreign coordinator"] += 1
             return
+        self._quiet_since = monotonic()
         for job, why in self._backlog.take_in(batch):
             self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
         self._outbox.settle(verdict.digest for verdict in batch.verdicts)
 
     def _take_slot_event(self, event: SlotEvent) -> None:
+        self._quiet_since = monotonic()
         result = self._slots[event.slot].handle(event)
         if result is not None:
             self._finished += 1
@@ -238,10 +256,23 @@ class Worker:
         )
         session.put(keys.beat(self._admission.run, self.identity), encode(beat), encoding=encoding(Beat))
 
-    def _rejoin(self, session: zenoh.Session) -> None:
-        """Follow the run into its coordinator's next life; what runs goes on, what is unacknowledged is kept."""
-        if not self._coordinators or self._admission.nonce in self._coordinators:
-            return
+    def _must_rejoin(self, now: float) -> bool:
+        """Whether the coordinator is in its next life, or may have forgotten this worker.
+
+        A coordinator forgets whose token vanishes, and a cut of the connection makes each vanish for the other. The
+        silence covers a loss that only the coordinator saw.
+        """
+        if not self._coordinators or now < self._ask_at:
+            return False
+        if self._parted or self._admission.nonce not in self._coordinators:
+            return True
+        idle = any(slot.ready for slot in self._slots) and all(slot.job is None for slot in self._slots)
+        silent = now - self._quiet_since > SILENT_BEATS * self._admission.intervals.beat
+        return silent and (idle or len(self._outbox) > 0)
+
+    def _rejoin(self, session: zenoh.Session, now: float) -> None:
+        """Say hello again; what runs goes on, what is unacknowledged is kept, what is queued is given again."""
+        self._ask_at = now + _jittered(RETRY)
         request = make_request(self.identity, self._tasks, self._slot_count)
         admission = ask(session, self._admission.run, request, self.inbox)
         if admission is None:
@@ -249,15 +280,30 @@ class Worker:
         if (admission.run_uid, admission.spec) != (self._admission.run_uid, self._admission.spec):
             raise RefusedError(f"run {admission.run} is another run now; start this worker again to join it")
         self._admission = admission
+        self._drop_batches()
         self._backlog.begin()
         self._backlog.clear()
         self._outbox.resend_all()
-        self._beat_at = 0.0
-        log.info("run %s goes on, incarnation %d", admission.run, admission.incarnation)
+        self._parted, self._beat_at, self._quiet_since = False, 0.0, monotonic()
+        log.info("joined run %s again, incarnation %d", admission.run, admission.incarnation)
+
+    def _drop_batches(self) -> None:
+        """Batches that wait in the queue are of the numbering that has ended, and would pass for later ones."""
+        kept = []
+        with suppress(queue.Empty):
+            while True:
+                kept.append(self._events.get_nowait())
+        for kind, event in kept:
+            if kind != "job":
+                self._events.put((kind, event))
 
     def _stop_slots(self) -> None:
         for slot in self._slots:
             slot.stop()
+
+
+def _jittered(seconds: float) -> float:
+    return seconds * random.uniform(0.5, 1.5)  # noqa: S311 - no secret
 
 
 def _tags(digests: list[bytes]) -> tuple[bytes, ...]:

@@ -11,8 +11,10 @@ import os
 import queue
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter
@@ -126,7 +128,8 @@ class Slot:
         self._process = context.Process(
             target=serve_jobs, args=(theirs, self._steps, self._spec, self._bundle, os.getpid()), daemon=True
         )
-        self._process.start()
+        with _signals_held():
+            self._process.start()
         theirs.close()
         threading.Thread(target=self._read, args=(self._pipe, self._life), daemon=True).start()
 
@@ -172,6 +175,17 @@ def serve_jobs(pipe: Connection[Any, Any], steps: Any, spec: TaskSpec, bundle: P
         except EOFError:
             return
         pipe.send(_score(scorer, job, vector, count))
+
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """A child started here inherits the mask: Ctrl-C, which reaches the whole group, cannot end it while it imports."""
+    resource_tracker.ensure_running()  # as it starts it would lift the mask
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _score(scorer: Any, job: Job, vector: bytes, count: Any) -> Result:

@@ -2,7 +2,7 @@
 
 Rows 0-83 (below them is the indicator bar), then an exact integer box filter 84x96 -> 64x64: an output pixel averages
 21/16 rows and 3/2 columns. With weights in sixteenths and halves their sum is 63 and the pixel `(sum + 31) // 63`.
-No library's resize, so that a native renderer can equal it to the bit.
+No library's resize, so that the native renderer equals it to the bit.
 """
 
 from __future__ import annotations
