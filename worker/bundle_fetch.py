@@ -22,6 +22,7 @@ WINDOW = 8  # queries in flight: enough to fill a link with a long way
 ATTEMPTS = 3  # damaged downloads before giving up
 SILENCES = 20  # rounds without progress before giving up
 QUERY_TIMEOUT = 3.0
+LOOK = 0.2  # seconds between looks at whether to stop
 PAUSE = 0.5  # seconds after a round without progress
 
 
@@ -59,7 +60,7 @@ def _download(
         while (total is None or file.tell() < total) and not stopped():
             before = file.tell()
             offsets = [before + index * MAX_PART for index in range(WINDOW if total else 1)]
-            parts = _ask(session, key, [each for each in offsets if total is None or each < total], inbox)
+            parts = _ask(session, key, [each for each in offsets if total is None or each < total], inbox, stopped)
             for part in sorted(parts, key=lambda part: part.offset):
                 if part.sha256.hex() == sha256:
                     total = part.total
@@ -77,15 +78,20 @@ def _download(
                 raise BundleError("the coordinator no longer answers for its bundle; start the worker again later")
 
 
-def _ask(session: zenoh.Session, key: str, offsets: list[int], inbox: Inbox) -> list[BundlePart]:
+def _ask(
+    session: zenoh.Session, key: str, offsets: list[int], inbox: Inbox, stopped: Callable[[], bool]
+) -> list[BundlePart]:
     replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
     done = object()
     for offset in offsets:
         handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
         session.get(f"{key}?offset={offset};length={MAX_PART}", handler, timeout=QUERY_TIMEOUT)
     parts, left = [], len(offsets)
-    while left:
-        reply = replies.get()
+    while left and not stopped():
+        try:
+            reply = replies.get(timeout=LOOK)
+        except queue.Empty:
+            continue
         if reply is done:
             left -= 1
         elif reply.ok is not None and (part := inbox.decode(BundlePart, reply.ok.payload.to_bytes())) is not None:

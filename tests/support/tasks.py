@@ -53,6 +53,9 @@ class Toy:
     def make_environment(self):
         return ToyEnvironment(self.seconds)
 
+    def make_judge(self):
+        return self.make_environment()
+
     def make_policy(self, bundle):
         return ToyPolicy()
 

@@ -76,6 +76,8 @@ void canvas_begin(Canvas *canvas, uint32_t background)
 {
     canvas->count = 0;
     canvas->overflow = false;
+    memset(canvas->head, 0xff, sizeof canvas->head);
+    memset(canvas->tail, 0xff, sizeof canvas->tail);
     memset(canvas->dirty, 0, sizeof canvas->dirty);
     for (int i = 0; i < CELLS; i++)
         for (int j = 0; j < CELLS; j++)
@@ -89,25 +91,24 @@ typedef struct {
     int count;
 } Runs;
 
-/* Source columns of the dirty cells of one row of cells, or of two that share a source row. */
-static void find_runs(const Canvas *canvas, const uint8_t *one, const uint8_t *other, Runs *out)
+/* Source columns of the dirty ones among a row of cells. */
+static void find_runs(const Canvas *canvas, const uint8_t *dirty, Runs *out)
 {
     const Axis *across = &canvas->across;
     out->count = 0;
     for (int j = 0; j < CELLS; j++) {
         if (j % 8 == 0) { /* mostly nothing: look at eight at once */
-            uint64_t some, more;
-            memcpy(&some, one + j, sizeof some);
-            memcpy(&more, other + j, sizeof more);
-            if (!(some | more)) {
+            uint64_t some;
+            memcpy(&some, dirty + j, sizeof some);
+            if (!some) {
                 j += 7;
                 continue;
             }
         }
-        if (!(one[j] | other[j]))
+        if (!dirty[j])
             continue;
         int start = j;
-        while (j + 1 < CELLS && (one[j + 1] | other[j + 1]))
+        while (j + 1 < CELLS && dirty[j + 1])
             j++;
         Run run = {(int16_t)across->first[start], (int16_t)across->last[j]};
         if (out->count && run.left <= out->runs[out->count - 1].right)
@@ -132,33 +133,26 @@ static uint32_t blend(uint32_t under, uint32_t over, uint32_t alpha)
     return (outer >> 8 & 0xff00ff) | (inner & 0xff00);
 }
 
-static void draw(Canvas *canvas, uint32_t background, int from, int to)
+/* The dirty cells of one row of cells, into the band. */
+static void draw(Canvas *canvas, uint32_t background, int i)
 {
-    static Runs shared[CELLS], own[CELLS]; /* of source rows that two rows of cells share, or one has alone */
     const Axis *down = &canvas->down;
-    for (int i = from; i < to; i++) {
-        find_runs(canvas, canvas->dirty[i], canvas->dirty[i], &own[i]);
-        if (i + 1 < to)
-            find_runs(canvas, canvas->dirty[i], canvas->dirty[i + 1], &shared[i]);
-    }
-    const Runs *rows[HEIGHT];
-    for (int row = down->first[from]; row <= down->last[to - 1]; row++) {
-        int low = MAX(down->low[row], from), high = MIN(down->high[row], to - 1);
-        rows[row] = low == high ? &own[low] : &shared[low];
-        for (int k = 0; k < rows[row]->count; k++)
-            paint(canvas->pixels[row], rows[row]->runs[k].left, rows[row]->runs[k].right, background);
-    }
-    for (const Op *op = canvas->ops, *end = op + canvas->count; op < end; op++) {
-        uint32_t *pixels = canvas->pixels[op->row];
-        if (op->fill) {
-            const Runs *runs = rows[op->row];
-            for (int k = 0; k < runs->count && runs->runs[k].left <= op->right; k++)
-                paint(pixels, MAX(op->left, runs->runs[k].left), MIN(op->right, runs->runs[k].right), op->colour);
+    Runs dirty;
+    find_runs(canvas, canvas->dirty[i], &dirty);
+    for (int row = down->first[i]; row <= down->last[i]; row++) {
+        uint32_t *pixels = canvas->band[row - down->first[i]];
+        for (int k = 0; k < dirty.count; k++)
+            paint(pixels, dirty.runs[k].left, dirty.runs[k].right, background);
+        for (int32_t index = canvas->head[row]; index >= 0; index = canvas->ops[index].next) {
+            Op op = canvas->ops[index];
+            if (op.alpha == FILL)
+                for (int k = 0; k < dirty.count && dirty.runs[k].left <= op.right; k++)
+                    paint(pixels, MAX(op.left, dirty.runs[k].left), MIN(op.right, dirty.runs[k].right), op.colour);
+            else if (op.alpha == 255)
+                paint(pixels, op.left, op.right, op.colour);
+            else
+                pixels[op.left] = blend(pixels[op.left], op.colour, op.alpha);
         }
-        else if (op->alpha == 255)
-            paint(pixels, op->left, op->right, op->colour);
-        else
-            pixels[op->left] = blend(pixels[op->left], op->colour, op->alpha);
     }
 }
 
@@ -200,15 +194,15 @@ static __m128i average_row(const Axis *across, const uint32_t *row, int j)
 static Small average(const Canvas *canvas, int i, int j)
 {
     const Axis *down = &canvas->down;
-    int row = down->first[i], last = down->last[i];
+    int row = 0, last = down->last[i] - down->first[i];
     __m128i sum = _mm_setzero_si128();
     if (i == SCENE_ROWS)
         row++; /* the sliver of the scene, see canvas_init */
     else if (i > 0)
-        sum = weigh(average_row(&canvas->across, canvas->pixels[row++], j), down->first_weight[i]);
+        sum = weigh(average_row(&canvas->across, canvas->band[row++], j), down->first_weight[i]);
     for (; row < last; row++)
-        sum = _mm_add_epi16(sum, average_row(&canvas->across, canvas->pixels[row], j));
-    sum = _mm_add_epi16(sum, weigh(average_row(&canvas->across, canvas->pixels[last], j), down->last_weight[i]));
+        sum = _mm_add_epi16(sum, average_row(&canvas->across, canvas->band[row], j));
+    sum = _mm_add_epi16(sum, weigh(average_row(&canvas->across, canvas->band[last], j), down->last_weight[i]));
     sum = _mm_mulhi_epu16(sum, _mm_set1_epi16((short)down->reciprocal));
     int packed = _mm_cvtsi128_si32(_mm_packus_epi16(sum, sum));
     Small small;
@@ -233,15 +227,15 @@ static Small average(const Canvas *canvas, int i, int j)
     const Axis *down = &canvas->down;
     Small small = {{0, 0, 0, 0}};
     for (int c = 0; c < 3; c++) {
-        int row = down->first[i], last = down->last[i];
+        int row = 0, last = down->last[i] - down->first[i];
         uint32_t sum = 0;
         if (i == SCENE_ROWS)
             row++;
         else if (i > 0)
-            sum = part(average_row(&canvas->across, canvas->pixels[row++], j, 8 * c), down->first_weight[i]);
+            sum = part(average_row(&canvas->across, canvas->band[row++], j, 8 * c), down->first_weight[i]);
         for (; row < last; row++)
-            sum += average_row(&canvas->across, canvas->pixels[row], j, 8 * c);
-        sum += part(average_row(&canvas->across, canvas->pixels[last], j, 8 * c), down->last_weight[i]);
+            sum += average_row(&canvas->across, canvas->band[row], j, 8 * c);
+        sum += part(average_row(&canvas->across, canvas->band[last], j, 8 * c), down->last_weight[i]);
         small.channel[c] = (uint8_t)MIN(255u, (sum & 0xffff) * down->reciprocal >> 16);
     }
     return small;
@@ -250,8 +244,8 @@ static Small average(const Canvas *canvas, int i, int j)
 
 void canvas_finish(Canvas *canvas, uint32_t background, int from, int to, uint8_t *out)
 {
-    draw(canvas, background, from, to);
     for (int i = from; i < to; i++) {
+        draw(canvas, background, i);
         const uint8_t *down = canvas->down.plain[i];
         for (int j = 0; j < CELLS; j++, out += 3) {
             if (canvas->dirty[i][j]) {

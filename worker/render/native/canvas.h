@@ -1,4 +1,5 @@
-/* The surface that gymnasium draws on, of which only what an output pixel can notice is ever filled in.
+/* The surface that gymnasium draws on, of which only what an output pixel can notice is ever filled in, one row of
+   output cells at a time: what is drawn on stays within the processor's nearest caches.
 
    An output cell is the source rectangle that one pixel of the 96x96 observation averages. A cell that no edge passes
    has one colour and is never drawn; only the others ("dirty" cells) get real pixels. Rows count from the top of the
@@ -15,6 +16,7 @@ enum {
     CELLS = 96,      /* across and down */
     SCENE_ROWS = 84, /* rows of cells above the indicator bar */
     SCENE = 700,     /* source rows above it */
+    BAND = 12,       /* source rows of a row of cells, at most */
     MAX_OPS = 1 << 19,
     MAX_RUNS = CELLS / 2 + 1,
 };
@@ -25,11 +27,13 @@ typedef struct {
 
 /* A horizontal run of one shape; alpha 255 replaces, less blends. */
 typedef struct {
-    int16_t row, left, right;
-    uint8_t alpha;
-    bool fill; /* part of an interior: drawn only where cells are dirty */
-    uint32_t colour;
+    int32_t next; /* of the same source row, or -1 */
+    int16_t left, right;
+    uint32_t colour : 24, alpha : 8;
 } Op;
+
+/* Runs of an interior are drawn only where cells are dirty; their alpha says so. Single pixels and outlines are not. */
+enum { FILL = 0 };
 
 typedef struct {
     int16_t left, right;
@@ -45,12 +49,12 @@ typedef struct {
 } Axis;
 
 typedef struct {
-    uint32_t pixels[HEIGHT][WIDTH];
+    uint32_t band[BAND][WIDTH];
     uint8_t dirty[CELLS][CELLS];
     uint32_t colour[CELLS][CELLS]; /* of clean cells */
     int16_t middle[HEIGHT];        /* the cell row whose middle this source row is, or -1 */
     Op ops[MAX_OPS];
-    int count;
+    int32_t count, head[HEIGHT], tail[HEIGHT]; /* the first and last run of each source row, or -1 */
     bool overflow; /* more was drawn than there is room for; the caller must not trust the picture */
     Axis across, down;
 } Canvas;

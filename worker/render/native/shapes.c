@@ -27,14 +27,20 @@ static void mark(Canvas *canvas, int row, int left, int right)
         memset(&canvas->dirty[canvas->down.high[row]][first], 1, (size_t)count);
 }
 
-static void push(Canvas *canvas, int row, int left, int right, int alpha, bool fill, uint32_t colour)
+static void push(Canvas *canvas, int row, int left, int right, int alpha, uint32_t colour)
 {
-    if (canvas->count == MAX_OPS) {
+    int32_t index = canvas->count;
+    if (index == MAX_OPS) {
         canvas->overflow = true;
         return;
     }
-    canvas->ops[canvas->count++] =
-        (Op){(int16_t)row, (int16_t)left, (int16_t)right, (uint8_t)alpha, fill, colour};
+    canvas->count++;
+    canvas->ops[index] = (Op){-1, (int16_t)left, (int16_t)right, colour & 0xffffff, (uint8_t)alpha};
+    if (canvas->tail[row] < 0)
+        canvas->head[row] = index;
+    else
+        canvas->ops[canvas->tail[row]].next = index;
+    canvas->tail[row] = index;
 }
 
 /* One pixel of an outline; `y` counts upwards as gymnasium draws. */
@@ -47,7 +53,7 @@ static void dot(Canvas *canvas, int x, int y, int alpha, uint32_t colour)
     int left = canvas->across.low[x], right = canvas->across.high[x];
     canvas->dirty[up][left] = canvas->dirty[up][right] = 1;
     canvas->dirty[under][left] = canvas->dirty[under][right] = 1;
-    push(canvas, row, x, x, alpha, false, colour);
+    push(canvas, row, x, x, alpha, colour);
 }
 
 /* A run of an outline, or of a solid shape: its cells are dirty. */
@@ -63,7 +69,7 @@ static void run(Canvas *canvas, int left, int right, int row, uint32_t colour)
     if ((unsigned)row >= HEIGHT || left > right)
         return;
     mark(canvas, row, left, right);
-    push(canvas, row, left, right, 255, false, colour);
+    push(canvas, row, left, right, 255, colour);
 }
 
 /* ---- the anti-aliased outline ---- */
@@ -262,7 +268,7 @@ void canvas_fill(Canvas *canvas, const Point *points, int count, uint32_t colour
             left = MAX(left, 0);
             right = MIN(right, WIDTH - 1);
             if (row < SCENE && left <= right) {
-                push(canvas, row, left, right, 255, true, colour);
+                push(canvas, row, left, right, FILL, colour);
                 colour_cells(canvas, row, left, right, colour);
             }
         }

@@ -1,0 +1,153 @@
+"""A coordinator driven by hand: a real router, the real codec, and no rule but the test's."""
+
+import queue
+from dataclasses import asdict
+
+import zenoh
+
+from common import keys
+from common.codec import decode, decode_json, encode, encode_json
+from common.messages import (
+    MAX_PART,
+    TAG_BYTES,
+    Beat,
+    BundlePart,
+    HelloReply,
+    HelloRequest,
+    Intervals,
+    JobBatch,
+    ResultBatch,
+    TaskSpec,
+    VectorPart,
+    Verdict,
+)
+from common.session import Network, open_session
+from tests.support import samples
+
+DEADLINE = 30
+FIRST, SECOND = "aaaaaaaaaaaaaaaa", "bbbbbbbbbbbbbbbb"
+WHOLE = VectorPart(id=samples.VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=samples.VECTOR)
+
+
+class Hand:
+    """Answers hello and bundle queries; everything that a worker says is in one queue, in order."""
+
+    def __init__(self, port, bundle, task, run="test"):
+        self.run = run
+        self.spec = TaskSpec(task=task, bundle=bundle.sha256, horizon=100, patience=0)
+        self.nonce, self.incarnation, self.run_uid = FIRST, 1, samples.UID
+        self.intervals = Intervals(beat=0.1, repeat=0.1)
+        self.refusal = None
+        self.worker = None
+        self.offsets = queue.SimpleQueue()  # of the bundle's parts that were asked for
+        self.damage = lambda offset, data: data  # what becomes of a bundle's part; `None`: no answer
+        self._held = []
+        self._bundle = bundle.path.read_bytes()
+        self._said = queue.SimpleQueue()
+        self.session = open_session(Network(listen=(f"tcp/127.0.0.1:{port}",)))
+        declare, answer = self.session.declare_subscriber, self.session.declare_queryable
+        self._declared = [
+            answer(keys.hello(run), _direct(self._hello)),
+            answer(keys.bundle(run, bundle.sha256), _direct(self._part)),
+            declare(keys.any_worker("result", run), self._hear(ResultBatch)),
+            declare(keys.any_worker("beat", run), self._hear(Beat)),
+        ]
+        self._token = None
+        self.appear()
+
+    def appear(self):
+        self._token = self.session.liveliness().declare_token(keys.live_coordinator(self.run, self.nonce))
+
+    def vanish(self):
+        self._token.undeclare()
+
+    def close(self):
+        for query in self._held:
+            query.drop()
+        self.session.close()
+
+    def next(self, kind, accept=lambda _: True):
+        """The next message of this kind that is as wanted; what came before it is gone."""
+        while True:
+            message = self._said.get(timeout=DEADLINE)
+            if isinstance(message, kind) and accept(message):
+                return message
+
+    def hello(self):
+        return self.next(HelloRequest)
+
+    def beat(self, accept=lambda _: True):
+        return self.next(Beat, accept)
+
+    def ready(self):
+        """Wait until the worker can score."""
+        self.hello()
+        return self.beat(lambda beat: beat.capacity > 0)
+
+    def result(self, of):
+        """Wait for this job's result."""
+        batch = self.next(ResultBatch, lambda batch: of.digest in _digests(batch))
+        return next(each for each in batch.results if each.digest == of.digest)
+
+    def results(self, *of):
+        """Wait until each of these jobs has come; digests of all results that came meanwhile."""
+        missing, came = {job.digest for job in of}, set()
+        while missing - came:
+            came |= _digests(self.next(ResultBatch))
+        return came
+
+    def job(self, episode=0):
+        return samples.job(episode, spec=self.spec)
+
+    def batch(self, number, *jobs, vectors=(WHOLE,), cancels=(), accepted=(), **head):
+        verdicts = tuple(Verdict(job.digest, "accepted") for job in accepted)
+        whole = {"run_uid": self.run_uid, "incarnation": self.incarnation, "nonce": self.nonce, **head}
+        return JobBatch(**whole, number=number, vectors=vectors, jobs=jobs, cancels=cancels, verdicts=verdicts)
+
+    def send(self, number, *jobs, **content):
+        self.put(encode(self.batch(number, *jobs, **content)))
+
+    def put(self, payload):
+        self.session.put(keys.job(self.run, self.worker), payload)
+
+    def _hear(self, kind):
+        return _direct(lambda sample: self._said.put(decode(kind, sample.payload.to_bytes())))
+
+    def _hello(self, query):
+        with query:
+            request = decode_json(HelloRequest, query.payload.to_bytes())
+            self.worker = request.worker
+            why, remedy = self.refusal or ("", "")
+            reply = HelloReply(
+                accepted=not why, protocol_min=1, protocol_max=1, package="0", run=self.run, run_uid=self.run_uid,
+                incarnation=self.incarnation, nonce=self.nonce, why=why, remedy=remedy,
+                spec={} if why else asdict(self.spec), intervals={} if why else asdict(self.intervals),
+            )  # fmt: skip
+            query.reply(keys.hello(self.run), encode_json(reply), encoding="application/json")
+        self._said.put(request)
+
+    def _part(self, query):
+        offset = int(query.parameters.get("offset"))
+        self.offsets.put(offset)
+        data = self.damage(offset, self._bundle[offset : offset + MAX_PART])
+        if data is None:
+            self._held.append(query)
+            return
+        with query:
+            part = BundlePart(
+                run_uid=self.run_uid, incarnation=self.incarnation, sha256=bytes.fromhex(self.spec.bundle),
+                offset=offset, total=len(self._bundle), data=data,
+            )  # fmt: skip
+            query.reply(query.key_expr, encode(part))
+
+
+def _digests(batch):
+    return {each.digest for each in batch.results}
+
+
+def tag(job):
+    return job.digest[:TAG_BYTES]
+
+
+def _direct(callback):
+    return zenoh.handlers.Callback(callback, indirect=False)

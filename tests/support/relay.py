@@ -1,0 +1,61 @@
+"""A TCP relay whose connections a test can cut."""
+
+import socket
+import struct
+import threading
+from contextlib import suppress
+
+from tests.support.processes import free_port
+
+RESET_ON_CLOSE = struct.pack("ii", 1, 0)
+
+
+class Relay:
+    """Passes connections on to a port of this host."""
+
+    def __init__(self, target):
+        self._target = target
+        self._pairs = []
+        self.port = free_port()
+        self.endpoint = f"tcp/127.0.0.1:{self.port}"
+        self._server = socket.create_server(("127.0.0.1", self.port))
+        self._threads = []
+        self._run(self._accept)
+
+    def cut(self):
+        """End every connection; new ones are let through."""
+        pairs, self._pairs = self._pairs, []
+        for each in (one for pair in pairs for one in pair):
+            with suppress(OSError):  # its pump has ended meanwhile
+                each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_ON_CLOSE)
+                each.shutdown(socket.SHUT_RDWR)
+
+    def close(self):
+        self._server.shutdown(socket.SHUT_RDWR)
+        self.cut()
+        for thread in self._threads:
+            thread.join()
+        self._server.close()
+
+    def _accept(self):
+        while True:
+            try:
+                near, _ = self._server.accept()
+            except OSError:
+                return
+            far = socket.create_connection(("127.0.0.1", self._target))
+            self._pairs.append((near, far))
+            for source, sink in ((near, far), (far, near)):
+                self._run(_pump, source, sink)
+
+    def _run(self, target, *arguments):
+        self._threads.append(threading.Thread(target=target, args=arguments, daemon=True))
+        self._threads[-1].start()
+
+
+def _pump(source, sink):
+    with source, suppress(OSError):
+        while data := source.recv(65536):
+            sink.sendall(data)
+    with suppress(OSError):
+        sink.shutdown(socket.SHUT_RDWR)
