@@ -1,12 +1,16 @@
 import os
 import queue
+import select
 import signal
+import subprocess
+import sys
 
 import pytest
 
 from common.errors import DreamfleetError
 from common.messages import TaskSpec
 from tests.support import tasks
+from tests.support.processes import environment
 from tests.support.samples import VECTOR, job
 from worker.slot import FAILED_STARTS, Slot
 
@@ -100,3 +104,36 @@ def test_a_child_that_cannot_start_ends_with_its_reason(harness, tmp_path):
     last = slot.events.get(timeout=TIMEOUT)[1]
     with pytest.raises(DreamfleetError, match=r"cannot start: BundleError.*not a whole bundle"):
         slot.slot.handle(last)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_asks_the_worker_to_leave_does_not_end_a_child_that_starts(harness, number):
+    slot = harness(tasks.TOY)
+    pid = slot.slot.pid
+    os.kill(pid, number)
+    assert slot.score().fitness is not None
+    assert slot.slot.pid == pid
+
+
+@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
+def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import queue, sys, pathlib\n"
+        "from tests.support import tasks\nfrom tests.worker.test_slot import spec\nfrom worker.slot import Slot\n"
+        "if __name__ == '__main__':\n"
+        "    events = queue.SimpleQueue()\n"
+        "    slot = Slot(0, spec(tasks.TOY), pathlib.Path(sys.argv[1]), events)\n"
+        "    slot.handle(events.get()[1])\n"
+        "    print(slot.pid, slot.ready, flush=True)\n"
+        "    events.get()\n"
+    )
+    command = [sys.executable, script, random_bundle.path]
+    with subprocess.Popen(command, env=environment(tmp_path), stdout=subprocess.PIPE, text=True) as parent:
+        pid, ready = parent.stdout.readline().split()
+        assert ready == "True"
+        child = os.pidfd_open(int(pid))
+        assert not select.select([child], [], [], 0)[0]
+        parent.kill()
+        assert select.select([child], [], [], TIMEOUT)[0]
+        os.close(child)
