@@ -6,6 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from common.errors import DreamfleetError
 from common.fingerprint import package_version
 from common.runs import default_runs_dir
 
+GROUP = "dreamfleet.checks"
 # distribution -> (module, extra); the empty extra is what every role needs
 PACKAGES = {
     "eclipse-zenoh": ("zenoh", ""),
@@ -46,9 +48,10 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Every check."""
-    return [*_packages(), _one_box2d(), *_bundles(), _writable("cache", default_cache()),
-            _writable("runs", default_runs_dir())]  # fmt: skip
+    """Every check, ours and those that the sides register under `dreamfleet.checks`."""
+    registered = [finding for point in entry_points(group=GROUP) for finding in point.load()()]
+    folders = [_writable("cache", default_cache()), _writable("runs", default_runs_dir())]
+    return [*_packages(), _one_box2d(), *_bundles(), *registered, *folders]
 
 
 def _packages() -> Iterator[Finding]:

@@ -142,3 +142,4 @@ def test_the_doctor_finds_this_installation_well(processes):
     code, out, _ = processes.call("doctor")
     assert code == 0, out
     assert "fingerprint" in out
+    assert "native picture" in out

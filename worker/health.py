@@ -1,0 +1,25 @@
+"""The worker's own checks for `dreamfleet doctor`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from common.health import Finding
+
+
+def examine() -> Iterator[Finding]:
+    """Whether the native picture was built and equals the installed gymnasium's."""
+    remedy = "install a C compiler, then pip install --force-reinstall --no-deps dreamfleet; gymnasium draws until then"
+    try:
+        from worker.render.check import native_is_exact
+        from worker.render.environment import available
+    except ModuleNotFoundError as error:
+        yield Finding("native picture", False, False, f"no {error.name}", "worker", "pip install 'dreamfleet[worker]'")
+        return
+    if not available():
+        yield Finding("native picture", False, False, "not built", "worker", remedy)
+    elif not native_is_exact():
+        remedy = "install the tested versions of gymnasium and pygame-ce; gymnasium draws until then"
+        yield Finding("native picture", False, False, "differs from gymnasium's", "worker", remedy)
+    else:
+        yield Finding("native picture", True, False, "equal to gymnasium's", "worker", "")
