@@ -103,10 +103,14 @@ class BundleStore:
 
     def find(self, sha256: str) -> Bundle | None:
         """The verified bundle of this hash; a damaged cached copy is removed, so that it is fetched again."""
-        for path in (self._path(sha256), *shipped_bundles().values()):
-            if path.exists() and hash_file(path) == sha256:
+        cached = self._path(sha256)
+        for path in (cached, *shipped_bundles().values()):
+            if not path.exists():
+                continue
+            if hash_file(path) == sha256:
                 return Bundle.open(path)
-        self._path(sha256).unlink(missing_ok=True)
+            if path == cached:  # looked at, and wrong; one that another process completes meanwhile must stay
+                path.unlink(missing_ok=True)
         return None
 
     @contextmanager
