@@ -210,6 +210,8 @@ class Worker:
 
     def _take_slot_event(self, event: SlotEvent) -> None:
         self._quiet_since = monotonic()
+        if event.ready is not None:
+            self._beat_at = 0.0  # new capacity is told at once
         result = self._slots[event.slot].handle(event)
         if result is not None:
             self._finished += 1

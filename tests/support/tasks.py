@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium import spaces
 
 MODULE = "tests.support.tasks"
-TOY, SLOW_TOY, RAISING, CRASHING, NAN = (
-    f"{MODULE}:{name}" for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan")
+TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, JUDGED = (
+    f"{MODULE}:{name}" for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Judged")
 )
 
 
@@ -101,3 +101,24 @@ class Nan(Toy):
 class NanPolicy(ToyPolicy):
     def begin(self, parameters):
         self._action = np.full(8, np.nan)
+
+
+class Hanging(Toy):
+    name = HANGING
+
+    def make_policy(self, bundle):
+        return HangingPolicy()
+
+
+class HangingPolicy(ToyPolicy):
+    def act(self, observation):
+        time.sleep(3600)
+
+
+class Judged(Toy):
+    """Its judge is not its environment."""
+
+    name = JUDGED
+
+    def make_judge(self):
+        return gymnasium.wrappers.TransformReward(self.make_environment(), lambda reward: reward + 100)

@@ -24,13 +24,13 @@ def controller(random_bundle):
 
 
 def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
-    task = find_task(tasks.TOY)
+    task = find_task(tasks.JUDGED)
     alone = {
         seed: rollout(task.make_judge(), task.make_policy(None), controller().parameters, Course(seed, 10**6)).fitness
         for seed in SEEDS
     }
     for jobs in (1, 2):
-        assert dict(evaluate(controller(), random_bundle, SEEDS, jobs)) == alone
+        assert dict(evaluate(controller(tasks.JUDGED), random_bundle, SEEDS, jobs)) == alone
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import worker.service
 from common.bundle import BundleStore, Manifest, default_cache, write_bundle
 from common.codec import encode
 from common.errors import BundleError, RefusedError, UsageError
-from common.messages import MAX_MESSAGE, MAX_PART, ResultBatch
+from common.messages import MAX_MESSAGE, MAX_PART, Intervals, ResultBatch
 from common.session import Network
 from tests.support import tasks
 from tests.support.hand import DEADLINE, SECOND, Hand, tag
@@ -22,6 +22,7 @@ from worker.service import Worker
 
 pytestmark = pytest.mark.timeout(60)
 PARTS = 6  # of the small bundle
+SLOW_BEATS = Intervals(beat=2 * DEADLINE, repeat=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +103,14 @@ def test_it_waits_for_a_coordinator_that_starts_later(stage, said, cached):
     stage.worker()
     wait_for(said, "waiting for a coordinator")
     assert stage.hand().ready().slots == 1
+
+
+def test_a_slot_that_can_score_is_told_at_once(stage, cached):
+    hand = stage.hand()
+    hand.intervals = SLOW_BEATS
+    stage.worker()
+    hand.hello()
+    assert [hand.beat().capacity, hand.beat().capacity] == [0, 1]
 
 
 def test_it_waits_until_its_run_is_there(stage, said, cached):
@@ -253,6 +262,7 @@ def relay(stage):
 
 def test_a_cut_connection_makes_it_say_hello_again(stage, relay, cached):
     hand = stage.hand()
+    hand.intervals = SLOW_BEATS  # so that no silence is long enough to be what it notices
     stage.worker(relay.endpoint)
     hand.ready()
     first, second = hand.job(0), hand.job(1)

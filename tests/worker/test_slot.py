@@ -120,11 +120,15 @@ def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(
         "import queue, sys, pathlib\n"
-        "from tests.support import tasks\nfrom tests.worker.test_slot import spec\nfrom worker.slot import Slot\n"
+        "from tests.support import tasks\n"
+        "from tests.support.samples import VECTOR, job\n"
+        "from tests.worker.test_slot import spec\n"
+        "from worker.slot import Slot\n"
         "if __name__ == '__main__':\n"
         "    events = queue.SimpleQueue()\n"
-        "    slot = Slot(0, spec(tasks.TOY), pathlib.Path(sys.argv[1]), events)\n"
+        "    slot = Slot(0, spec(tasks.HANGING), pathlib.Path(sys.argv[1]), events)\n"
         "    slot.handle(events.get()[1])\n"
+        "    slot.submit(job(spec=spec(tasks.HANGING)), VECTOR)\n"
         "    print(slot.pid, slot.ready, flush=True)\n"
         "    events.get()\n"
     )
@@ -135,5 +139,8 @@ def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
         child = os.pidfd_open(int(pid))
         assert not select.select([child], [], [], 0)[0]
         parent.kill()
-        assert select.select([child], [], [], TIMEOUT)[0]
+        died = bool(select.select([child], [], [], 10)[0])
+        if not died:
+            os.kill(int(pid), signal.SIGKILL)
         os.close(child)
+        assert died, "it hangs in its job, where no closed pipe ends it"
