@@ -24,8 +24,7 @@ try:
 except ImportError:  # no compiler when this was installed
     _native = None  # type: ignore[assignment]
 
-BAR_TOP = 700  # source row
-TEXT_BOX = (125, 100)  # pixels at the bar's left end that hold the score
+TEXT_WIDTH = 125  # pixels at the window's left end that hold the score
 PICTURE_SHAPE = (64, 64, 3)
 _Base: Any = car_racing.CarRacing  # untyped upstream
 
@@ -139,17 +138,19 @@ def fixtures_of(car: car_dynamics.Car) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=4096)
 def score_text(text: str) -> NDArray[np.uint8]:
-    """The score's text as observation rows 84-95, columns 0-11."""
+    """The score's text as observation rows 84-95, columns 0-11.
+
+    The text lies within the window's first 125 columns, which are exactly twelve of the observation's.
+    """
     pygame.font.init()
     font = pygame.font.Font(pygame.font.get_default_font(), 42)
     image = font.render(text, True, (255, 255, 255), (0, 0, 0))
     place = image.get_rect()
     place.center = (60, int(car_racing.WINDOW_H - car_racing.WINDOW_H * 2.5 / 40.0))
-    surface = pygame.Surface(TEXT_BOX)
-    surface.blit(image, place.move(0, -BAR_TOP))
-    rows = np.zeros((12, 96, 3), np.uint8)
-    _native.shrink_text(rows, np.ascontiguousarray(pygame.surfarray.array3d(surface).transpose(1, 0, 2)))
-    return rows[:, :12].copy()
+    surface = pygame.Surface((TEXT_WIDTH, car_racing.WINDOW_H))
+    surface.blit(image, place)
+    small = pygame.surfarray.array3d(pygame.transform.smoothscale(surface, (12, 96)))
+    return np.ascontiguousarray(small.transpose(1, 0, 2)[84:])
 
 
 def _grass() -> NDArray[np.float64]:

@@ -14,11 +14,6 @@ enum { ONE = 1 << 14 }; /* a whole source pixel's weight */
 
 /* ---- which source pixels a cell averages ---- */
 
-static uint16_t part(uint32_t value, uint32_t weight)
-{
-    return (uint16_t)((uint16_t)(value << 2) * weight >> 16);
-}
-
 static void axis_init(Axis *axis, int length)
 {
     int space = ONE * length / CELLS, left = space, cell = 0, first = 0;
@@ -45,86 +40,311 @@ static void axis_init(Axis *axis, int length)
                 axis->low[pixel] = (uint8_t)j;
             axis->high[pixel] = (uint8_t)j;
         }
-        for (uint32_t value = 0; value < 256; value++) {
-            int whole = axis->last[j] - axis->first[j] - (j > 0);
-            uint32_t sum = (j > 0 ? part(value, axis->first_weight[j]) : 0u) + (uint32_t)whole * value +
-                           part(value, axis->last_weight[j]);
-            axis->plain[j][value] = (uint8_t)MIN(255u, sum * axis->reciprocal >> 16);
-        }
     }
     for (int pixel = axis->last[CELLS - 1] + 1; pixel < length; pixel++)
         axis->low[pixel] = axis->high[pixel] = CELLS - 1; /* no cell takes it; harmless to draw */
+    for (int pixel = 0, after = 0, before = -1; pixel < length; pixel++) {
+        while (after < CELLS && axis->first[after] < pixel)
+            after++;
+        while (before + 1 < CELLS && axis->last[before + 1] <= pixel)
+            before++;
+        axis->after[pixel] = (uint8_t)after;
+        axis->before[pixel] = (int8_t)before;
+    }
 }
 
 void canvas_init(Canvas *canvas)
 {
     axis_init(&canvas->across, WIDTH);
     axis_init(&canvas->down, HEIGHT);
-    memset(canvas->middle, 0xff, sizeof canvas->middle);
-    for (int i = 0; i < CELLS; i++)
-        canvas->middle[(canvas->down.first[i] + canvas->down.last[i]) / 2] = (int16_t)i;
-    /* The bar's first row takes a sliver of the scene's last source row, which rounds to nothing. */
-    for (int pixel = SCENE; pixel < HEIGHT; pixel++)
-        if (canvas->down.low[pixel] < SCENE_ROWS)
-            canvas->down.low[pixel] = SCENE_ROWS;
-    for (int pixel = 0; pixel < SCENE; pixel++)
-        if (canvas->down.high[pixel] >= SCENE_ROWS)
-            canvas->down.high[pixel] = SCENE_ROWS - 1;
 }
 
-void canvas_begin(Canvas *canvas, uint32_t background)
+void canvas_begin(Canvas *canvas, int top, int bottom)
 {
+    canvas->top = top;
+    canvas->bottom = bottom;
     canvas->count = 0;
+    canvas->spans_used = 0;
     canvas->overflow = false;
-    memset(canvas->head, 0xff, sizeof canvas->head);
-    memset(canvas->tail, 0xff, sizeof canvas->tail);
-    memset(canvas->dirty, 0, sizeof canvas->dirty);
-    for (int i = 0; i < CELLS; i++)
-        for (int j = 0; j < CELLS; j++)
-            canvas->colour[i][j] = background;
 }
 
-/* ---- drawing where it is noticed ---- */
+/* ---- one row of cells ---- */
+
+static int lowest_bit(uint64_t word)
+{
+#if defined(__GNUC__)
+    return __builtin_ctzll(word);
+#else
+    int bit = 0;
+    for (; !(word & 1); word >>= 1)
+        bit++;
+    return bit;
+#endif
+}
+
+#define CHANNEL(colour, shift) ((colour) >> (shift) & 255)
+
+/* What a cell of one colour averages to: truncation takes one from each channel that is not 0, along either axis. */
+static uint8_t finished(uint32_t colour, int shift)
+{
+    uint32_t value = CHANNEL(colour, shift);
+    return (uint8_t)(value < 2 ? 0 : value - 2);
+}
+
+/* What of a shape lies in the band: the part of each edge, and the cells that it touches. */
+typedef struct {
+    const Edge *edge;
+    uint32_t colour;
+    int from, to;       /* steps of the edge */
+    int low, high;      /* the first and last cell */
+} Line;
 
 typedef struct {
-    Run runs[MAX_RUNS];
-    int count;
-} Runs;
+    const Shape *shape;
+    int top, bottom; /* rows */
+    int low, high;   /* cells */
+    int lines_end;   /* of the list of lines: this outline is drawn before this interior */
+} Patch;
 
-/* Source columns of the dirty ones among a row of cells. */
-static void find_runs(const Canvas *canvas, const uint8_t *dirty, Runs *out)
+typedef struct {
+    uint64_t left, right; /* cells 0 to 63 and those from 64 on, a bit each */
+} Cells;
+
+typedef struct {
+    int left, right; /* source columns */
+    int first;       /* the first shape that can be seen in it */
+} DirtyRun;
+
+/* Valid for the row of cells that is being drawn. */
+typedef struct {
+    int first, top, bottom; /* source rows: of the cells, and those of them that are drawn on */
+    uint8_t *out; /* the finished row */
+    Patch patches[MAX_SHAPES];
+    Line lines[MAX_SHAPES * MAX_EDGES];
+    int patch_count, line_count;
+    Cells dirty;
+    int16_t base[CELLS]; /* the last shape that covers the whole cell, or -1 */
+    DirtyRun runs[CELLS];
+    int run_count;
+} Band;
+
+/* The cells from `low` to `high`, which may be one less than low. */
+static Cells cells_between(int low, int high)
+{
+    uint64_t all = ~(uint64_t)0;
+    Cells cells = {0, 0};
+    if (low < 64)
+        cells.left = all << low & (high < 63 ? ~(all << (high + 1)) : all);
+    if (high >= 64)
+        cells.right = (low > 64 ? all << (low - 64) : all) & ~(all << (high - 63));
+    return cells;
+}
+
+static void soil(Band *band, int low, int high)
+{
+    Cells cells = cells_between(low, high);
+    band->dirty.left |= cells.left;
+    band->dirty.right |= cells.right;
+}
+
+/* Gives cells that one shape covers its colour. */
+static void cover(Band *band, int low, int high, uint32_t colour, int index)
+{
+    uint8_t red = finished(colour, 16), green = finished(colour, 8), blue = finished(colour, 0);
+    Cells cells = cells_between(low, high);
+    band->dirty.left &= ~cells.left;
+    band->dirty.right &= ~cells.right;
+    uint8_t *out = band->out + 3 * low;
+    for (int j = low; j <= high; j++, out += 3) {
+        out[0] = red;
+        out[1] = green;
+        out[2] = blue;
+        band->base[j] = (int16_t)index;
+    }
+}
+
+/* Which steps of the edge fall into the band, and the columns of their pixels; false if none do. */
+static bool clip_edge(const Band *band, const Edge *edge, Line *line, int *left, int *right)
+{
+    int bottom = HEIGHT - 1 - band->bottom, top = HEIGHT - 1 - band->top; /* y, upwards */
+    if (edge->high.y < bottom || edge->low.y > top)
+        return false;
+    int a = edge->low.x, b = edge->high.x;
+    line->edge = edge;
+    line->from = 1;
+    line->to = edge->longer - 1;
+    if (edge->kind == STEEP) {
+        line->from = MAX(1, bottom - edge->low.y);
+        line->to = MIN(edge->longer - 1, top - edge->low.y);
+        a = edge->low.x + edge->step * (int)(edge->slope * (uint32_t)line->from >> 16);
+        b = edge->low.x + edge->step * (int)(edge->slope * (uint32_t)(line->to + 1) >> 16);
+    }
+    else if (edge->kind == SHALLOW) { /* its pixels lie at y and at y + 1 */
+        int below = bottom - 1 - edge->low.y, above = top - edge->low.y;
+        if (below > 0)
+            line->from = (int)((((uint32_t)below << 16) + edge->slope - 1) / edge->slope);
+        line->to = MIN(edge->longer - 1, (int)((((uint32_t)(above + 1) << 16) - 1) / edge->slope));
+        a = edge->low.x + edge->step * (line->from - 1);
+        b = edge->low.x + edge->step * line->to;
+    }
+    if (edge->kind == UPRIGHT || edge->kind == LEVEL) {
+        *left = MIN(a, b);
+        *right = MAX(a, b);
+    }
+    else {
+        *left = MIN(a, b) - 1;
+        *right = MAX(a, b) + 1;
+    }
+    int y = edge->first.y;
+    if (y >= bottom && y <= top) {
+        *left = MIN(*left, edge->first.x);
+        *right = MAX(*right, edge->first.x);
+    }
+    *left = MAX(*left, 0);
+    *right = MIN(*right, WIDTH - 1);
+    return true;
+}
+
+/* The columns that all of the spans share, and those that any of them touches. */
+static void bound(const Span *spans, int count, Span *all, Span *any)
+{
+    *all = *any = spans[0];
+    for (int i = 1; i < count; i++) {
+        all->left = MAX(all->left, spans[i].left);
+        all->right = MIN(all->right, spans[i].right);
+        any->left = MIN(any->left, spans[i].left);
+        any->right = MAX(any->right, spans[i].right);
+    }
+}
+
+/* Finds which cells the shape dirties and which it covers. */
+static void survey(Canvas *canvas, Band *band, int index)
+{
+    const Shape *shape = &canvas->shapes[index];
+    const Axis *across = &canvas->across;
+    for (int e = 0; e < shape->edges; e++) {
+        Line *line = &band->lines[band->line_count];
+        int left, right;
+        if (!clip_edge(band, &shape->edge[e], line, &left, &right))
+            continue;
+        line->colour = shape->colour;
+        line->low = across->low[left];
+        line->high = across->high[right];
+        soil(band, line->low, line->high);
+        band->line_count++;
+    }
+    Patch *patch = &band->patches[band->patch_count++];
+    patch->shape = shape;
+    patch->lines_end = band->line_count;
+    patch->top = MAX(shape->top, band->top);
+    patch->bottom = MIN(shape->bottom, band->bottom);
+    if (patch->top > patch->bottom)
+        return;
+    Span all, any;
+    bound(shape->spans + patch->top - shape->top, patch->bottom - patch->top + 1, &all, &any);
+    if (any.left > any.right) {
+        patch->bottom = patch->top - 1;
+        return;
+    }
+    patch->low = across->low[any.left];
+    patch->high = across->high[any.right];
+    soil(band, patch->low, patch->high);
+    if (patch->top > band->top || patch->bottom < band->bottom || all.left > all.right)
+        return;
+    int low = across->after[all.left], high = across->before[all.right];
+    if (low <= high)
+        cover(band, low, high, shape->colour, index);
+}
+
+static int first_cell(Cells cells)
+{
+    return cells.left ? lowest_bit(cells.left) : cells.right ? 64 + lowest_bit(cells.right) : CELLS;
+}
+
+static Cells without(Cells cells, Cells others)
+{
+    return (Cells){cells.left & ~others.left, cells.right & ~others.right};
+}
+
+/* Source columns of the dirty ones among the cells. */
+static void find_runs(const Canvas *canvas, Band *band)
 {
     const Axis *across = &canvas->across;
-    out->count = 0;
-    for (int j = 0; j < CELLS; j++) {
-        if (j % 8 == 0) { /* mostly nothing: look at eight at once */
-            uint64_t some;
-            memcpy(&some, dirty + j, sizeof some);
-            if (!some) {
-                j += 7;
-                continue;
-            }
-        }
-        if (!dirty[j])
-            continue;
-        int start = j;
-        while (j + 1 < CELLS && dirty[j + 1])
-            j++;
-        Run run = {(int16_t)across->first[start], (int16_t)across->last[j]};
-        if (out->count && run.left <= out->runs[out->count - 1].right)
-            out->runs[out->count - 1].right = run.right;
-        else
-            out->runs[out->count++] = run;
+    Cells rest = band->dirty, clean = {~rest.left, ~rest.right};
+    band->run_count = 0;
+    for (int low = first_cell(rest); low < CELLS; low = first_cell(rest)) {
+        int high = first_cell(without(clean, cells_between(0, low - 1))) - 1;
+        DirtyRun run = {across->first[low], across->last[high], band->base[low]};
+        for (int j = low + 1; j <= high; j++)
+            run.first = MIN(run.first, band->base[j]);
+        band->runs[band->run_count++] = run;
+        rest = without(rest, cells_between(low, high));
     }
 }
 
 static void paint(uint32_t *row, int left, int right, uint32_t colour)
 {
-    for (int x = left; x <= right; x++)
-        row[x] = colour;
+    int count = right - left + 1;
+    uint32_t *to = row + left;
+#ifdef __SSE2__
+    /* Mostly short: stores that overlap are cheaper than a branch that nobody can foresee. */
+    if (count > 3) {
+        __m128i four = _mm_set1_epi32((int)colour);
+        int last = count - 4;
+        for (; last > 12; last -= 16, to += 16) {
+            _mm_storeu_si128((__m128i *)to, four);
+            _mm_storeu_si128((__m128i *)(to + 4), four);
+            _mm_storeu_si128((__m128i *)(to + 8), four);
+            _mm_storeu_si128((__m128i *)(to + 12), four);
+        }
+        _mm_storeu_si128((__m128i *)(to + MIN(last, 0)), four);
+        _mm_storeu_si128((__m128i *)(to + MIN(last, 4)), four);
+        _mm_storeu_si128((__m128i *)(to + MIN(last, 8)), four);
+        _mm_storeu_si128((__m128i *)(to + last), four);
+        return;
+    }
+#endif
+    for (int i = 0; i < count; i++)
+        to[i] = colour;
 }
 
-/* d + ((c - d) * a >> 8) in each channel, which is (d * (256 - a) + c * a) >> 8; two channels at once. */
+/* Two neighbouring pixels of an outline, which share its colour: d + ((c - d) * a >> 8) in each channel, which is
+   (d * (256 - a) + c * a) >> 8. The alphas of the pair follow from one weight. */
+typedef struct {
+#ifdef __SSE2__
+    __m128i colour;
+#else
+    uint32_t colour;
+#endif
+} Ink;
+
+#ifdef __SSE2__
+static Ink ink_of(uint32_t colour)
+{
+    __m128i one = _mm_unpacklo_epi8(_mm_cvtsi32_si128((int)colour), _mm_setzero_si128());
+    return (Ink){_mm_unpacklo_epi64(one, one)};
+}
+
+static void dots(uint32_t *near, uint32_t *far, Ink ink, uint32_t weight)
+{
+    int pair = (int)(255 * (255 - weight) >> 8 | (255 * weight >> 8) << 16);
+    __m128i alpha = _mm_cvtsi32_si128(pair);
+    alpha = _mm_shuffle_epi32(_mm_unpacklo_epi16(alpha, alpha), _MM_SHUFFLE(1, 1, 0, 0));
+    __m128i under = _mm_unpacklo_epi32(_mm_cvtsi32_si128((int)*near), _mm_cvtsi32_si128((int)*far));
+    under = _mm_unpacklo_epi8(under, _mm_setzero_si128());
+    __m128i sum = _mm_add_epi16(_mm_mullo_epi16(under, _mm_sub_epi16(_mm_set1_epi16(256), alpha)),
+                                _mm_mullo_epi16(ink.colour, alpha));
+    sum = _mm_srli_epi16(sum, 8);
+    sum = _mm_packus_epi16(sum, sum);
+    *near = (uint32_t)_mm_cvtsi128_si32(sum);
+    *far = (uint32_t)_mm_cvtsi128_si32(_mm_srli_si128(sum, 4));
+}
+#else
+static Ink ink_of(uint32_t colour)
+{
+    return (Ink){colour};
+}
+
 static uint32_t blend(uint32_t under, uint32_t over, uint32_t alpha)
 {
     uint32_t rest = 256 - alpha;
@@ -133,133 +353,227 @@ static uint32_t blend(uint32_t under, uint32_t over, uint32_t alpha)
     return (outer >> 8 & 0xff00ff) | (inner & 0xff00);
 }
 
-/* The dirty cells of one row of cells, into the band. */
-static void draw(Canvas *canvas, uint32_t background, int i)
+static void dots(uint32_t *near, uint32_t *far, Ink ink, uint32_t weight)
 {
-    const Axis *down = &canvas->down;
-    Runs dirty;
-    find_runs(canvas, canvas->dirty[i], &dirty);
-    for (int row = down->first[i]; row <= down->last[i]; row++) {
-        uint32_t *pixels = canvas->band[row - down->first[i]];
-        for (int k = 0; k < dirty.count; k++)
-            paint(pixels, dirty.runs[k].left, dirty.runs[k].right, background);
-        for (int32_t index = canvas->head[row]; index >= 0; index = canvas->ops[index].next) {
-            Op op = canvas->ops[index];
-            if (op.alpha == FILL)
-                for (int k = 0; k < dirty.count && dirty.runs[k].left <= op.right; k++)
-                    paint(pixels, MAX(op.left, dirty.runs[k].left), MIN(op.right, dirty.runs[k].right), op.colour);
-            else if (op.alpha == 255)
-                paint(pixels, op.left, op.right, op.colour);
-            else
-                pixels[op.left] = blend(pixels[op.left], op.colour, op.alpha);
+    *near = blend(*near, ink.colour, 255 * (255 - weight) >> 8);
+    *far = blend(*far, ink.colour, 255 * weight >> 8);
+}
+#endif
+
+enum { STRIDE = MARGIN + WIDTH + MARGIN };
+
+static void draw_line(Canvas *canvas, const Band *band, const Line *line)
+{
+    const Edge *edge = line->edge;
+    Point low = edge->low, first = edge->first;
+    uint32_t colour = line->colour;
+    /* of column 0 and y 0; a step of y upwards is a row less */
+    uint32_t *origin = &canvas->band[0][MARGIN] + (HEIGHT - band->first) * STRIDE;
+    if (edge->kind == LEVEL) {
+        paint(origin - low.y * STRIDE, MIN(low.x, edge->high.x), MAX(low.x, edge->high.x), colour);
+        return;
+    }
+    int bottom = HEIGHT - 1 - band->bottom, top = HEIGHT - 1 - band->top;
+    if (edge->kind == UPRIGHT) {
+        for (int y = MAX(low.y, bottom); y <= MIN(edge->high.y, top); y++)
+            origin[low.x - y * STRIDE] = colour;
+        return;
+    }
+    if (first.y >= bottom && first.y <= top)
+        origin[first.x - first.y * STRIDE] = colour;
+    uint32_t at = edge->slope * (uint32_t)line->from;
+    Ink ink = ink_of(colour);
+    if (edge->kind == STEEP) {
+        uint32_t *row = origin + low.x - (low.y + line->from) * STRIDE;
+        for (int n = line->from; n <= line->to; n++, at += edge->slope, row -= STRIDE) {
+            uint32_t *pixel = row + edge->step * (int)(at >> 16);
+            uint32_t weight = at >> 8 & 255;
+            dots(pixel, pixel + edge->step, ink, weight);
         }
+    }
+    else {
+        uint32_t *column = origin + low.x + edge->step * line->from - low.y * STRIDE;
+        for (int n = line->from; n <= line->to; n++, at += edge->slope, column += edge->step) {
+            uint32_t *pixel = column - (int)(at >> 16) * STRIDE;
+            uint32_t weight = at >> 8 & 255;
+            dots(pixel, pixel - STRIDE, ink, weight);
+        }
+    }
+}
+
+static void draw_patch(Canvas *canvas, const Band *band, const Patch *patch)
+{
+    const Shape *shape = patch->shape;
+    int index = (int)(shape - canvas->shapes);
+    int left = canvas->across.first[patch->low], right = canvas->across.last[patch->high];
+    for (int k = 0; k < band->run_count; k++) {
+        DirtyRun run = band->runs[k];
+        if (run.first > index || run.right < left)
+            continue;
+        if (run.left > right)
+            break;
+        for (int row = patch->top; row <= patch->bottom; row++) {
+            Span span = shape->spans[row - shape->top];
+            paint(canvas->band[row - band->first + 1] + MARGIN, MAX(span.left, run.left), MIN(span.right, run.right),
+                  shape->colour);
+        }
+    }
+}
+
+static bool any_dirty(const Band *band, int low, int high)
+{
+    Cells cells = cells_between(low, high);
+    return (band->dirty.left & cells.left) || (band->dirty.right & cells.right);
+}
+
+/* The dirty cells of one row of cells, into the band. */
+static void draw(Canvas *canvas, Band *band, uint32_t background)
+{
+    find_runs(canvas, band);
+    for (int k = 0; k < band->run_count; k++)
+        if (band->runs[k].first < 0)
+            for (int row = band->top; row <= band->bottom; row++)
+                paint(canvas->band[row - band->first + 1] + MARGIN, band->runs[k].left, band->runs[k].right, background);
+    const Line *line = band->lines;
+    for (const Patch *patch = band->patches; patch < band->patches + band->patch_count; patch++) {
+        for (; line < band->lines + patch->lines_end; line++)
+            if (any_dirty(band, line->low, line->high))
+                draw_line(canvas, band, line);
+        if (patch->top <= patch->bottom)
+            draw_patch(canvas, band, patch);
     }
 }
 
 /* ---- averaging ---- */
 
-typedef struct {
-    uint8_t channel[4]; /* blue, green, red, nothing: as the pixel lies in memory */
-} Small;
-
 #ifdef __SSE2__
-static __m128i widen(const uint32_t *pixel)
+/* Two source rows side by side, four 16-bit channels each. */
+static __m128i widen(__m128i pixels)
 {
-    return _mm_unpacklo_epi8(_mm_cvtsi32_si128((int)*pixel), _mm_setzero_si128());
+    return _mm_unpacklo_epi8(pixels, _mm_setzero_si128());
 }
 
-static __m128i weigh(__m128i value, int weight)
+static __m128i pair(const uint32_t *a, const uint32_t *b)
 {
-    return _mm_mulhi_epu16(_mm_slli_epi16(value, 2), _mm_set1_epi16((short)weight));
+    return widen(_mm_unpacklo_epi32(_mm_cvtsi32_si128((int)*a), _mm_cvtsi32_si128((int)*b)));
 }
 
-/* The average of one row of a cell. */
-static __m128i average_row(const Axis *across, const uint32_t *row, int j)
+/* Four pixels of a row, added up two by two. */
+static __m128i fold(const uint32_t *pixels)
 {
-    const uint32_t *pixel = row + across->first[j], *last = row + across->last[j];
-    __m128i sum = _mm_setzero_si128(), zero = sum;
-    if (j > 0)
-        sum = weigh(widen(pixel++), across->first_weight[j]);
-    for (; pixel + 4 <= last; pixel += 4) {
-        __m128i four = _mm_loadu_si128((const __m128i *)pixel);
-        __m128i pairs = _mm_add_epi16(_mm_unpacklo_epi8(four, zero), _mm_unpackhi_epi8(four, zero));
-        sum = _mm_add_epi16(sum, _mm_add_epi16(pairs, _mm_srli_si128(pairs, 8)));
+    __m128i four = _mm_loadu_si128((const __m128i *)pixels);
+    return _mm_add_epi16(widen(four), _mm_unpackhi_epi8(four, _mm_setzero_si128()));
+}
+
+static __m128i weigh(__m128i value, __m128i weight)
+{
+    return _mm_mulhi_epu16(_mm_slli_epi16(value, 2), weight);
+}
+
+/* The averages along cell j of two source rows. */
+static __m128i average_rows(const Axis *across, const uint32_t *a, const uint32_t *b, int j)
+{
+    int x = MARGIN + across->first[j], last = MARGIN + across->last[j];
+    __m128i sum = _mm_setzero_si128();
+    if (j > 0) {
+        sum = weigh(pair(a + x, b + x), _mm_set1_epi16((short)across->first_weight[j]));
+        x++;
     }
-    for (; pixel < last; pixel++)
-        sum = _mm_add_epi16(sum, widen(pixel));
-    sum = _mm_add_epi16(sum, weigh(widen(last), across->last_weight[j]));
+    for (; x + 4 <= last; x += 4) {
+        __m128i left = fold(a + x), right = fold(b + x);
+        sum = _mm_add_epi16(sum, _mm_add_epi16(_mm_unpacklo_epi64(left, right), _mm_unpackhi_epi64(left, right)));
+    }
+    for (; x < last; x++)
+        sum = _mm_add_epi16(sum, pair(a + x, b + x));
+    sum = _mm_add_epi16(sum, weigh(pair(a + last, b + last), _mm_set1_epi16((short)across->last_weight[j])));
     return _mm_mulhi_epu16(sum, _mm_set1_epi16((short)across->reciprocal));
 }
 
-static Small average(const Canvas *canvas, int i, int j)
+static uint32_t average(const Canvas *canvas, int i, int j)
 {
-    const Axis *down = &canvas->down;
-    int row = 0, last = down->last[i] - down->first[i];
-    __m128i sum = _mm_setzero_si128();
-    if (i == SCENE_ROWS)
-        row++; /* the sliver of the scene, see canvas_init */
-    else if (i > 0)
-        sum = weigh(average_row(&canvas->across, canvas->band[row++], j), down->first_weight[i]);
-    for (; row < last; row++)
-        sum = _mm_add_epi16(sum, average_row(&canvas->across, canvas->band[row], j));
-    sum = _mm_add_epi16(sum, weigh(average_row(&canvas->across, canvas->band[last], j), down->last_weight[i]));
+    static const uint32_t nothing[MARGIN + WIDTH + MARGIN];
+    const Axis *across = &canvas->across, *down = &canvas->down;
+    int row = 1, last = 1 + down->last[i] - down->first[i];
+    const uint32_t *first = nothing;
+    int first_weight = 0;
+    if (i > 0) {
+        first = canvas->band[row++];
+        first_weight = down->first_weight[i];
+    }
+    __m128i weights = _mm_unpacklo_epi64(_mm_set1_epi16((short)first_weight),
+                                         _mm_set1_epi16((short)down->last_weight[i]));
+    __m128i sum = weigh(average_rows(across, first, canvas->band[last], j), weights);
+    for (; row + 1 < last; row += 2)
+        sum = _mm_add_epi16(sum, average_rows(across, canvas->band[row], canvas->band[row + 1], j));
+    if (row < last)
+        sum = _mm_add_epi16(sum, average_rows(across, canvas->band[row], nothing, j));
+    sum = _mm_add_epi16(sum, _mm_unpackhi_epi64(sum, sum));
     sum = _mm_mulhi_epu16(sum, _mm_set1_epi16((short)down->reciprocal));
-    int packed = _mm_cvtsi128_si32(_mm_packus_epi16(sum, sum));
-    Small small;
-    memcpy(&small, &packed, sizeof small);
-    return small;
+    return (uint32_t)_mm_cvtsi128_si32(_mm_packus_epi16(sum, sum));
 }
 #else
+static uint16_t part(uint32_t value, uint32_t weight)
+{
+    return (uint16_t)((uint16_t)(value << 2) * weight >> 16);
+}
+
 static uint32_t average_row(const Axis *across, const uint32_t *row, int j, int shift)
 {
     int first = across->first[j], last = across->last[j];
     uint32_t sum = 0;
+    row += MARGIN;
     if (j > 0)
-        sum = part(row[first++] >> shift & 255, across->first_weight[j]);
+        sum = part(CHANNEL(row[first++], shift), across->first_weight[j]);
     for (; first < last; first++)
-        sum += row[first] >> shift & 255;
-    sum += part(row[last] >> shift & 255, across->last_weight[j]);
-    return MIN(255u, (sum & 0xffff) * across->reciprocal >> 16);
+        sum += CHANNEL(row[first], shift);
+    sum += part(CHANNEL(row[last], shift), across->last_weight[j]);
+    return (sum & 0xffff) * across->reciprocal >> 16;
 }
 
-static Small average(const Canvas *canvas, int i, int j)
+static uint32_t average(const Canvas *canvas, int i, int j)
 {
-    const Axis *down = &canvas->down;
-    Small small = {{0, 0, 0, 0}};
-    for (int c = 0; c < 3; c++) {
-        int row = 0, last = down->last[i] - down->first[i];
+    const Axis *across = &canvas->across, *down = &canvas->down;
+    uint32_t cell = 0;
+    for (int shift = 0; shift < 24; shift += 8) {
+        int row = 1, last = 1 + down->last[i] - down->first[i];
         uint32_t sum = 0;
-        if (i == SCENE_ROWS)
-            row++;
-        else if (i > 0)
-            sum = part(average_row(&canvas->across, canvas->band[row++], j, 8 * c), down->first_weight[i]);
+        if (i > 0)
+            sum = part(average_row(across, canvas->band[row++], j, shift), down->first_weight[i]);
         for (; row < last; row++)
-            sum += average_row(&canvas->across, canvas->band[row], j, 8 * c);
-        sum += part(average_row(&canvas->across, canvas->band[last], j, 8 * c), down->last_weight[i]);
-        small.channel[c] = (uint8_t)MIN(255u, (sum & 0xffff) * down->reciprocal >> 16);
+            sum += average_row(across, canvas->band[row], j, shift);
+        sum += part(average_row(across, canvas->band[last], j, shift), down->last_weight[i]);
+        cell |= MIN(255u, (sum & 0xffff) * down->reciprocal >> 16) << shift;
     }
-    return small;
+    return cell;
 }
 #endif
 
+/* Begins with the row's source rows that lie in the window, all background. */
+static void begin_band(const Canvas *canvas, Band *band, int i, uint32_t background, uint8_t *out)
+{
+    band->first = canvas->down.first[i];
+    band->top = MAX(band->first, canvas->top);
+    band->bottom = MIN(canvas->down.last[i], canvas->bottom);
+    band->patch_count = band->line_count = 0;
+    band->out = out;
+    cover(band, 0, CELLS - 1, background, -1);
+}
+
 void canvas_finish(Canvas *canvas, uint32_t background, int from, int to, uint8_t *out)
 {
-    for (int i = from; i < to; i++) {
-        draw(canvas, background, i);
-        const uint8_t *down = canvas->down.plain[i];
-        for (int j = 0; j < CELLS; j++, out += 3) {
-            if (canvas->dirty[i][j]) {
-                Small small = average(canvas, i, j);
-                out[0] = small.channel[2];
-                out[1] = small.channel[1];
-                out[2] = small.channel[0];
-                continue;
-            }
-            const uint8_t *across = canvas->across.plain[j];
-            uint32_t colour = canvas->colour[i][j];
-            out[0] = down[across[colour >> 16 & 255]];
-            out[1] = down[across[colour >> 8 & 255]];
-            out[2] = down[across[colour & 255]];
+    static Band band; /* as the canvas, one a process */
+    for (int i = from; i < to; i++, out += 3 * CELLS) {
+        begin_band(canvas, &band, i, background, out);
+        for (int word = 0; word * 64 < canvas->count; word++)
+            for (uint64_t rest = canvas->active[word][i]; rest; rest &= rest - 1)
+                survey(canvas, &band, word * 64 + lowest_bit(rest));
+        draw(canvas, &band, background);
+        Cells dirty = band.dirty;
+        for (int j = first_cell(dirty); j < CELLS; j = first_cell(dirty)) {
+            uint32_t cell = average(canvas, i, j);
+            for (int c = 0; c < 3; c++)
+                out[3 * j + c] = (uint8_t)CHANNEL(cell, 16 - 8 * c);
+            dirty = without(dirty, cells_between(j, j));
         }
     }
 }

@@ -1,9 +1,9 @@
 /* The surface that gymnasium draws on, of which only what an output pixel can notice is ever filled in, one row of
-   output cells at a time: what is drawn on stays within the processor's nearest caches.
+   output cells at a time: what is drawn on stays within the processor's nearest cache.
 
-   An output cell is the source rectangle that one pixel of the 96x96 observation averages. A cell that no edge passes
-   has one colour and is never drawn; only the others ("dirty" cells) get real pixels. Rows count from the top of the
-   final picture, after gymnasium's vertical flip: row = 799 - y. */
+   An output cell is the source rectangle that one pixel of the 96x96 observation averages. A cell that one shape
+   covers wholly has one colour and is never drawn; only the others ("dirty" cells) get real pixels. Rows count from the
+   top of the final picture, after gymnasium's vertical flip: row = 799 - y. */
 #ifndef DREAMFLEET_CANVAS_H
 #define DREAMFLEET_CANVAS_H
 
@@ -17,27 +17,38 @@ enum {
     SCENE_ROWS = 84, /* rows of cells above the indicator bar */
     SCENE = 700,     /* source rows above it */
     BAND = 12,       /* source rows of a row of cells, at most */
-    MAX_OPS = 1 << 19,
-    MAX_RUNS = CELLS / 2 + 1,
+    MARGIN = 8,      /* pixels beside a band, where an outline may step out by one */
+    MAX_SHAPES = 2048,
+    MAX_SPANS = 1 << 18,
+    MAX_EDGES = 4,
+    WORDS = MAX_SHAPES / 64,
 };
 
 typedef struct {
-    int16_t x, y;
+    int16_t x, y; /* y upwards, as gymnasium draws */
 } Point;
 
-/* A horizontal run of one shape; alpha 255 replaces, less blends. */
 typedef struct {
-    int32_t next; /* of the same source row, or -1 */
-    int16_t left, right;
-    uint32_t colour : 24, alpha : 8;
-} Op;
+    int16_t left, right; /* both included; WIDTH and -1 if there is none */
+} Span;
 
-/* Runs of an interior are drawn only where cells are dirty; their alpha says so. Single pixels and outlines are not. */
-enum { FILL = 0 };
-
+/* One side of an anti-aliased outline. */
 typedef struct {
-    int16_t left, right;
-} Run;
+    enum { LEVEL, UPRIGHT, STEEP, SHALLOW } kind;
+    Point low, high, first; /* `first` is opaque and is drawn first */
+    int step;               /* of x along the way from low to high: 1 or -1 */
+    int longer;             /* steps along the longer axis, both ends included */
+    uint32_t slope;         /* of the shorter axis, in units of 2^-16 pixels a step */
+} Edge;
+
+/* An outline and the interior that is drawn over it: at most one span a row. */
+typedef struct {
+    uint32_t colour;
+    int edges;
+    Edge edge[MAX_EDGES];
+    int top, bottom;   /* rows of the interior */
+    const Span *spans; /* of row `top` and on */
+} Shape;
 
 /* Which source pixels a cell averages along one axis: the first and last in part, those between in full. */
 typedef struct {
@@ -45,26 +56,29 @@ typedef struct {
     uint16_t first_weight[CELLS], last_weight[CELLS];
     uint16_t reciprocal;
     uint8_t low[WIDTH], high[WIDTH]; /* the one or two cells that a source pixel belongs to */
-    uint8_t plain[CELLS][256];       /* what a cell of one value averages to */
+    uint8_t after[WIDTH];            /* the first cell that begins at or after this pixel, or CELLS */
+    int8_t before[WIDTH];            /* the last cell that ends at or before it, or -1 */
 } Axis;
 
 typedef struct {
-    uint32_t band[BAND][WIDTH];
-    uint8_t dirty[CELLS][CELLS];
-    uint32_t colour[CELLS][CELLS]; /* of clean cells */
-    int16_t middle[HEIGHT];        /* the cell row whose middle this source row is, or -1 */
-    Op ops[MAX_OPS];
-    int32_t count, head[HEIGHT], tail[HEIGHT]; /* the first and last run of each source row, or -1 */
+    int top, bottom; /* source rows that are drawn on */
+    int count;
+    Shape shapes[MAX_SHAPES];
+    uint64_t active[WORDS][CELLS]; /* which shapes a row of cells meets, a bit each */
+    int spans_used;
+    Span spans[MAX_SPANS];
     bool overflow; /* more was drawn than there is room for; the caller must not trust the picture */
+    uint32_t band[BAND + 2][MARGIN + WIDTH + MARGIN]; /* one row more above and below, which an outline may touch */
     Axis across, down;
 } Canvas;
 
 void canvas_init(Canvas *canvas);
-void canvas_begin(Canvas *canvas, uint32_t background);
+
+/* Draw on these source rows only. */
+void canvas_begin(Canvas *canvas, int top, int bottom);
 
 /* Shapes, in the order in which they lie on each other. */
-void canvas_outline(Canvas *canvas, const Point *points, int count, uint32_t colour);
-void canvas_fill(Canvas *canvas, const Point *points, int count, uint32_t colour);
+void canvas_polygon(Canvas *canvas, const Point *points, int count, uint32_t colour);
 void canvas_solid(Canvas *canvas, const int *x, const int *y, int count, uint32_t colour, bool flipped);
 
 /* Cell rows `from` to `to` of the finished picture: out is (to - from) x 96 x 3 bytes. */

@@ -1,4 +1,4 @@
-/* CarRacing's picture for Python: `scene`, `bar`, `shrink_text`, `picture`. Arrays come as buffers of doubles.
+/* CarRacing's picture for Python: `scene`, `bar`, `picture`. Arrays come as buffers of doubles.
 
    One canvas a process, whatever the number of environments: it is rebuilt for every picture, and the interpreter
    lock is held throughout. */
@@ -90,8 +90,7 @@ static void quadrilateral(const View *view, const double *corners, double reach,
     }
     if (left == 4 || right == 4 || low == 4 || high == 4)
         return;
-    canvas_outline(&canvas, points, 4, colour);
-    canvas_fill(&canvas, points, 4, colour);
+    canvas_polygon(&canvas, points, 4, colour);
 }
 
 static uint32_t colour_of(const double *rgb)
@@ -228,7 +227,7 @@ static bool draw_scene(Doubles *in, uint8_t *out)
     double bounds = sight[4], reach = bounds / 20 * sqrt(2) * sight[0] + 2;
     bool covered = field_covers(&view, bounds);
     uint32_t background = covered ? ground : 0;
-    canvas_begin(&canvas, background);
+    canvas_begin(&canvas, 0, SCENE - 1);
     if (!covered) {
         double corners[8] = {bounds, bounds, bounds, -bounds, -bounds, -bounds, -bounds, bounds};
         quadrilateral(&view, corners, INFINITY, ground);
@@ -292,7 +291,7 @@ static PyObject *bar(PyObject *self, PyObject *args)
         return NULL;
     bool fits = out.len >= (CELLS - SCENE_ROWS) * CELLS * 3;
     if (fits) {
-        canvas_begin(&canvas, 0);
+        canvas_begin(&canvas, SCENE, HEIGHT - 1);
         upright(5, 0.02 * speed, speed, 0xffffff);
         upright(7, 0.01 * omega[0], omega[0], 0x0000ff);
         upright(8, 0.01 * omega[1], omega[1], 0x0000ff);
@@ -304,33 +303,6 @@ static PyObject *bar(PyObject *self, PyObject *args)
     }
     PyBuffer_Release(&out);
     return fits ? Py_NewRef(Py_None) : (fail("the picture is too small"), NULL);
-}
-
-enum { TEXT_WIDTH = 125, TEXT_HEIGHT = HEIGHT - SCENE };
-
-/* shrink_text(out, pixels): the bar's rows from 100 x 125 x 3 pixels at its left end. */
-static PyObject *shrink_text(PyObject *self, PyObject *args)
-{
-    (void)self;
-    Py_buffer out, in;
-    if (!PyArg_ParseTuple(args, "w*y*", &out, &in))
-        return NULL;
-    bool fits = out.len >= (CELLS - SCENE_ROWS) * CELLS * 3 && in.len == TEXT_HEIGHT * TEXT_WIDTH * 3;
-    if (fits) {
-        const uint8_t *pixel = in.buf;
-        canvas_begin(&canvas, 0);
-        for (int row = SCENE; row < HEIGHT; row++)
-            for (int x = 0; x < TEXT_WIDTH; x++, pixel += 3) {
-                uint32_t colour = (uint32_t)pixel[0] << 16 | (uint32_t)pixel[1] << 8 | pixel[2];
-                int px[4] = {x, x, x, x}, py[4] = {row, row, row, row};
-                if (colour)
-                    canvas_solid(&canvas, px, py, 4, colour, true);
-            }
-        canvas_finish(&canvas, 0, SCENE_ROWS, CELLS, out.buf);
-    }
-    PyBuffer_Release(&in);
-    PyBuffer_Release(&out);
-    return fits ? Py_NewRef(Py_None) : (fail("pixels of a wrong size"), NULL);
 }
 
 /* picture(out, observation): the 64x64 picture of 84 or more rows of an observation, as worker.tasks.preprocessing. */
@@ -371,7 +343,6 @@ static PyObject *picture(PyObject *self, PyObject *args)
 static PyMethodDef methods[] = {
     {"scene", scene, METH_VARARGS, "Draw the 84 rows of cells above the bar."},
     {"bar", bar, METH_VARARGS, "Draw the bar's 12 rows without its text."},
-    {"shrink_text", shrink_text, METH_VARARGS, "Average the score's text as the bar's rows."},
     {"picture", picture, METH_VARARGS, "The 64x64 picture of an observation's scene."},
     {NULL, NULL, 0, NULL},
 };

@@ -11,65 +11,74 @@
 #define MIN(a, b) ((a) < (b) ? (a) : (b))
 #define MAX(a, b) ((a) > (b) ? (a) : (b))
 
-/* ---- what a shape leaves behind ---- */
+enum { MAX_POINTS = 16 };
 
-static void mark(Canvas *canvas, int row, int left, int right)
-{
-    if (row < 0 || row >= HEIGHT)
-        return;
-    left = MAX(left, 0);
-    right = MIN(right, WIDTH - 1);
-    if (left > right)
-        return;
-    int first = canvas->across.low[left], count = canvas->across.high[right] - first + 1;
-    memset(&canvas->dirty[canvas->down.low[row]][first], 1, (size_t)count);
-    if (canvas->down.high[row] != canvas->down.low[row])
-        memset(&canvas->dirty[canvas->down.high[row]][first], 1, (size_t)count);
-}
+/* ---- keeping shapes ---- */
 
-static void push(Canvas *canvas, int row, int left, int right, int alpha, uint32_t colour)
+static Shape *new_shape(Canvas *canvas, uint32_t colour)
 {
-    int32_t index = canvas->count;
-    if (index == MAX_OPS) {
+    if (canvas->count == MAX_SHAPES) {
         canvas->overflow = true;
-        return;
+        return NULL;
     }
-    canvas->count++;
-    canvas->ops[index] = (Op){-1, (int16_t)left, (int16_t)right, colour & 0xffffff, (uint8_t)alpha};
-    if (canvas->tail[row] < 0)
-        canvas->head[row] = index;
-    else
-        canvas->ops[canvas->tail[row]].next = index;
-    canvas->tail[row] = index;
+    if (canvas->count % 64 == 0)
+        memset(canvas->active[canvas->count / 64], 0, sizeof canvas->active[0]);
+    Shape *shape = &canvas->shapes[canvas->count++];
+    shape->colour = colour & 0xffffff;
+    shape->edges = 0;
+    shape->top = 0;
+    shape->bottom = -1;
+    return shape;
 }
 
-/* One pixel of an outline; `y` counts upwards as gymnasium draws. */
-static void dot(Canvas *canvas, int x, int y, int alpha, uint32_t colour)
+/* Lets the rows of cells know that these source rows of the shape concern them. */
+static void concern(Canvas *canvas, const Shape *shape, int top, int bottom)
 {
-    int row = HEIGHT - 1 - y;
-    if (alpha == 0 || (unsigned)row >= SCENE || (unsigned)x >= WIDTH)
+    top = MAX(top, canvas->top);
+    bottom = MIN(bottom, canvas->bottom);
+    if (top > bottom)
         return;
-    int up = canvas->down.low[row], under = canvas->down.high[row];
-    int left = canvas->across.low[x], right = canvas->across.high[x];
-    canvas->dirty[up][left] = canvas->dirty[up][right] = 1;
-    canvas->dirty[under][left] = canvas->dirty[under][right] = 1;
-    push(canvas, row, x, x, alpha, colour);
+    int index = (int)(shape - canvas->shapes);
+    uint64_t *active = canvas->active[index / 64];
+    for (int i = canvas->down.low[top]; i <= canvas->down.high[bottom]; i++)
+        active[i] |= (uint64_t)1 << index % 64;
 }
 
-/* A run of an outline, or of a solid shape: its cells are dirty. */
-static void run(Canvas *canvas, int left, int right, int row, uint32_t colour)
+/* Room for the interior's spans, all still empty; NULL where none of its rows are drawn on. */
+static Span *new_spans(Canvas *canvas, Shape *shape, int top, int bottom)
 {
-    if (left > right) {
-        int swap = left;
-        left = right;
-        right = swap;
+    shape->top = MAX(top, canvas->top);
+    shape->bottom = MIN(bottom, canvas->bottom);
+    int count = shape->bottom - shape->top + 1;
+    if (count <= 0)
+        return NULL;
+    if (canvas->spans_used + count > MAX_SPANS) {
+        canvas->overflow = true;
+        shape->bottom = shape->top - 1;
+        return NULL;
     }
-    left = MAX(left, 0);
-    right = MIN(right, WIDTH - 1);
-    if ((unsigned)row >= HEIGHT || left > right)
-        return;
-    mark(canvas, row, left, right);
-    push(canvas, row, left, right, 255, colour);
+    Span *spans = canvas->spans + canvas->spans_used;
+    canvas->spans_used += count;
+    shape->spans = spans;
+    concern(canvas, shape, shape->top, shape->bottom);
+    return spans;
+}
+
+static const Span EMPTY = {WIDTH, -1};
+
+static Span span_of(int left, int right)
+{
+    int first = MAX(MIN(left, right), 0), last = MIN(MAX(left, right), WIDTH - 1);
+    return first <= last ? (Span){(int16_t)first, (int16_t)last} : EMPTY;
+}
+
+/* One run of an interior, as a shape of its own. */
+static void run(Canvas *canvas, int row, int left, int right, uint32_t colour)
+{
+    Shape *shape = new_shape(canvas, colour);
+    Span *span = shape ? new_spans(canvas, shape, row, row) : NULL;
+    if (span)
+        *span = span_of(left, right);
 }
 
 /* ---- the anti-aliased outline ---- */
@@ -113,60 +122,27 @@ static bool clip(Point *a, Point *b)
     }
 }
 
-/* Wu's line without its last pixel: two weighted pixels a step along the longer axis. */
-static void line(Canvas *canvas, Point a, Point b, uint32_t colour)
+/* Wu's line without its last pixel, still to be drawn: two weighted pixels a step along the longer axis. */
+static void add_edge(Canvas *canvas, Shape *shape, Point a, Point b)
 {
     if (!clip(&a, &b))
         return;
-    Point low = a.y > b.y ? b : a, high = a.y > b.y ? a : b;
-    int dx = high.x - low.x, dy = high.y - low.y;
-    if (dx == 0) {
-        if (dy == 0)
-            dot(canvas, a.x, a.y, 255, colour);
-        for (int y = low.y; dy > 0 && y <= high.y; y++)
-            dot(canvas, a.x, y, 255, colour);
+    Edge *edge = &shape->edge[shape->edges++];
+    edge->first = a; /* as it was given, not the lower one */
+    edge->low = a.y > b.y ? b : a;
+    edge->high = a.y > b.y ? a : b;
+    int dx = edge->high.x - edge->low.x, dy = edge->high.y - edge->low.y;
+    concern(canvas, shape, HEIGHT - 1 - edge->high.y, HEIGHT - 1 - edge->low.y);
+    edge->kind = dy == 0 ? LEVEL : dx == 0 ? UPRIGHT : dy > abs(dx) ? STEEP : SHALLOW;
+    if (dx == 0 || dy == 0)
         return;
-    }
-    if (dy == 0) {
-        int row = HEIGHT - 1 - a.y;
-        if (row < SCENE)
-            run(canvas, low.x, high.x, row, colour);
-        return;
-    }
-    int step = dx > 0 ? 1 : -1;
+    edge->step = dx > 0 ? 1 : -1;
     dx = abs(dx);
-    dot(canvas, a.x, a.y, 255, colour); /* the first pixel as it was given, not the lower one */
-    bool steep = dy > dx;
-    int longer = steep ? dy : dx, shorter = steep ? dx : dy;
-    uint32_t error = 0, slope = (uint32_t)((shorter << 16) / longer) << 16;
-    int x = low.x, y = low.y;
-    while (--longer) {
-        uint32_t before = error;
-        error += slope;
-        bool turned = error <= before;
-        int weight = (int)(error >> 24);
-        if (steep) {
-            x += turned ? step : 0;
-            y++;
-        }
-        else {
-            y += turned;
-            x += step;
-        }
-        dot(canvas, x, y, 255 * (255 - weight) >> 8, colour);
-        dot(canvas, steep ? x + step : x, steep ? y : y + 1, 255 * weight >> 8, colour);
-    }
-}
-
-void canvas_outline(Canvas *canvas, const Point *points, int count, uint32_t colour)
-{
-    for (int i = 0; i < count; i++)
-        line(canvas, points[i], points[(i + 1) % count], colour);
+    edge->longer = MAX(dx, dy);
+    edge->slope = (uint32_t)(MIN(dx, dy) << 16) / (uint32_t)edge->longer;
 }
 
 /* ---- the filled polygon ---- */
-
-enum { MAX_POINTS = 16 };
 
 static int ascending(const void *a, const void *b)
 {
@@ -201,7 +177,7 @@ static int crossings(const Point *points, int count, int y, int bottom, int *fou
             high = swap;
         }
         if ((y >= low.y && y < high.y) || (y == bottom && y > low.y && y <= high.y)) {
-            uint32_t part = (uint32_t)((65536 * (y - low.y)) / (high.y - low.y));
+            uint32_t part = (uint32_t)((int64_t)65536 * (y - low.y) / (high.y - low.y));
             found[n++] = (int)(part * (uint32_t)(high.x - low.x) + 65536u * (uint32_t)low.x);
         }
     }
@@ -209,76 +185,95 @@ static int crossings(const Point *points, int count, int y, int bottom, int *fou
     return n;
 }
 
-/* Colours the clean cells whose middle row this is: those whose middle column lies in the run. */
-static void colour_cells(Canvas *canvas, int row, int left, int right, uint32_t colour)
+/* The span between two crossings. */
+static Span between(int a, int b)
 {
-    int i = canvas->middle[row];
-    if (i < 0)
-        return;
-    const Axis *across = &canvas->across;
-    for (int j = across->low[left]; j <= across->high[right]; j++) {
-        int centre = (across->first[j] + across->last[j]) / 2;
-        if (centre >= left && centre <= right)
-            canvas->colour[i][j] = colour;
-    }
+    a++;
+    b--;
+    return span_of((int16_t)((a >> 16) + ((a & 32768) >> 15)), (int16_t)((b >> 16) + ((b & 32768) >> 15)));
 }
 
-typedef struct {
-    int count, left, right;
-} Line;
-
-/* Marks what lies between two neighbouring scan lines' ends, where the boundary passes. */
-static void mark_between(Canvas *canvas, int row, Line above, Line here)
+/* Whether a walk along the edges goes up once and down once, so that every line crosses exactly two. */
+static bool two_sided(const Point *points, int count)
 {
-    if (above.count != 1 || here.count != 1) {
-        int left = MIN(above.left, here.left), right = MAX(above.right, here.right);
-        if (!above.count)
-            left = here.left, right = here.right;
-        if (!here.count)
-            left = above.left, right = above.right;
-        mark(canvas, row, left, right);
-        return;
+    int turns = 0, way = 0, first = 0;
+    for (int i = 0; i < count; i++) {
+        int next = points[(i + 1) % count].y - points[i].y;
+        if (next == 0)
+            continue;
+        next = next > 0 ? 1 : -1;
+        turns += way && next != way;
+        first = first ? first : next;
+        way = next;
     }
-    mark(canvas, row, MIN(above.left, here.left), MAX(above.left, here.left));
-    mark(canvas, row, MIN(above.right, here.right), MAX(above.right, here.right));
+    return turns + (way != first) == 2;
 }
 
-void canvas_fill(Canvas *canvas, const Point *points, int count, uint32_t colour)
+/* The crossings of lines `bottom` to `top` (y, clipped) with one edge, without a division a line. */
+static void walk_edge(Point low, Point high, int bottom, int top, bool last, int *found)
 {
-    int top = points[0].y, bottom = points[0].y, found[MAX_POINTS];
-    for (int i = 1; i < count; i++) {
-        top = MIN(top, points[i].y);
-        bottom = MAX(bottom, points[i].y);
-    }
-    Line before = {0, 0, 0};
-    int first = MAX(top, HEIGHT - SCENE - 1), last = MIN(bottom, HEIGHT - 1);
-    for (int y = first; y <= last; y++) {
-        int row = HEIGHT - 1 - y, n = crossings(points, count, y, bottom, found);
-        Line here = {n / 2, WIDTH, -1};
-        for (int i = 0; i + 1 < n; i += 2) {
-            int a = found[i] + 1, b = found[i + 1] - 1;
-            int left = (int16_t)((a >> 16) + ((a & 32768) >> 15)), right = (int16_t)((b >> 16) + ((b & 32768) >> 15));
-            if (left > right) {
-                int swap = left;
-                left = right;
-                right = swap;
-            }
-            here.left = MIN(here.left, left);
-            here.right = MAX(here.right, right);
-            left = MAX(left, 0);
-            right = MIN(right, WIDTH - 1);
-            if (row < SCENE && left <= right) {
-                push(canvas, row, left, right, FILL, colour);
-                colour_cells(canvas, row, left, right, colour);
-            }
+    int from = MAX(low.y, bottom), to = MIN(high.y - !last, top), height = high.y - low.y;
+    if (from > to)
+        return;
+    int64_t scaled = (int64_t)65536 * (from - low.y);
+    int part = (int)(scaled / height), rest = (int)(scaled % height);
+    int whole = 65536 / height, more = 65536 % height;
+    uint32_t dx = (uint32_t)(high.x - low.x), start = 65536u * (uint32_t)low.x;
+    for (int y = from; y <= to; y++) {
+        found[y - bottom] = (int)((uint32_t)part * dx + start);
+        part += whole;
+        rest += more;
+        if (rest >= height) {
+            rest -= height;
+            part++;
         }
-        if (y == top)
-            mark(canvas, row, here.left, here.right);
-        else
-            mark_between(canvas, row, y == first ? here : before, here);
-        if (y == bottom)
-            mark(canvas, row, here.left, here.right);
-        before = here;
+    }
+}
+
+/* The spans of a polygon of which every line crosses two edges. */
+static void fill_between(Canvas *canvas, Shape *shape, const Point *points, int count, int highest)
+{
+    int up[HEIGHT], down[HEIGHT]; /* the crossing with either side */
+    Span *spans = canvas->spans + canvas->spans_used - (shape->bottom - shape->top + 1);
+    int bottom = HEIGHT - 1 - shape->bottom, top = HEIGHT - 1 - shape->top;
+    for (int i = 0; i < count; i++) {
+        Point a = points[i], b = points[(i + 1) % count];
+        if (a.y < b.y)
+            walk_edge(a, b, bottom, top, b.y == highest, up);
+        else if (a.y > b.y)
+            walk_edge(b, a, bottom, top, a.y == highest, down);
+    }
+    for (int y = top; y >= bottom; y--) {
+        int a = up[y - bottom], b = down[y - bottom];
+        *spans++ = between(MIN(a, b), MAX(a, b));
+    }
+}
+
+/* gfxdraw.aapolygon and gfxdraw.filled_polygon over it. */
+void canvas_polygon(Canvas *canvas, const Point *points, int count, uint32_t colour)
+{
+    Shape *shape = new_shape(canvas, colour);
+    if (!shape)
+        return;
+    int low = points[0].y, high = points[0].y, found[MAX_POINTS];
+    for (int i = 0; i < count; i++) {
+        low = MIN(low, points[i].y);
+        high = MAX(high, points[i].y);
+        add_edge(canvas, shape, points[i], points[(i + 1) % count]);
+    }
+    if (low == high)
+        return;
+    if (two_sided(points, count)) {
+        if (new_spans(canvas, shape, HEIGHT - 1 - high, HEIGHT - 1 - low))
+            fill_between(canvas, shape, points, count, high);
+        return;
+    }
+    for (int y = MAX(low, HEIGHT - 1 - canvas->bottom); y <= MIN(high, HEIGHT - 1 - canvas->top); y++) {
+        int n = crossings(points, count, y, high, found);
+        for (int i = 0; i + 1 < n; i += 2) {
+            Span span = between(found[i], found[i + 1]);
+            run(canvas, HEIGHT - 1 - y, span.left, span.right, colour);
+        }
     }
 }
 
@@ -295,11 +290,15 @@ void canvas_solid(Canvas *canvas, const int *x, const int *y, int count, uint32_
     }
 #define ROW(y) (flipped ? (y) : HEIGHT - 1 - (y))
     if (top == bottom) {
-        run(canvas, low_x, high_x, ROW(top), colour);
+        run(canvas, ROW(top), low_x, high_x, colour);
         return;
     }
-    for (int line = MAX(top, 0); line <= MIN(bottom, HEIGHT - 1); line++) {
-        int n = 0;
+    Shape *shape = new_shape(canvas, colour);
+    Span *spans = shape ? new_spans(canvas, shape, MIN(ROW(top), ROW(bottom)), MAX(ROW(top), ROW(bottom))) : NULL;
+    if (!spans)
+        return;
+    for (int row = shape->top; row <= shape->bottom; row++) {
+        int line = ROW(row), n = 0;
         for (int i = 0, before = count - 1; i < count; before = i++) {
             int a = y[before] <= y[i] ? before : i, b = a == before ? i : before;
             if (y[a] == y[b])
@@ -312,13 +311,12 @@ void canvas_solid(Canvas *canvas, const int *x, const int *y, int count, uint32_
             }
         }
         sort(found, n);
-        for (int i = 0; i + 1 < n; i += 2)
-            run(canvas, found[i], found[i + 1], ROW(line), colour);
+        *spans++ = n > 1 ? span_of(found[0], found[1]) : EMPTY;
+        for (int i = 2; i + 1 < n; i += 2)
+            run(canvas, row, found[i], found[i + 1], colour);
     }
     for (int i = 0, before = count - 1; i < count; before = i++)
         if (top < y[i] && y[before] == y[i] && y[i] < bottom)
-            run(canvas, x[i], x[before], ROW(y[i]), colour);
-    for (int line = MAX(top, 0); line <= MIN(bottom, HEIGHT - 1); line++)
-        mark(canvas, ROW(line), low_x, high_x);
+            run(canvas, ROW(y[i]), x[i], x[before], colour);
 #undef ROW
 }
