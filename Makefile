@@ -3,9 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
-SOURCES := pyproject.toml constraints.txt
+SOURCES := pyproject.toml constraints.txt $(wildcard worker/render/native/*)
 
-.PHONY: demo test setup check wheel long box2d-py bundle worker-size clean
+.PHONY: demo test setup check wheel long box2d-py sanitize bundle worker-size clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(ARGS)
@@ -43,6 +43,14 @@ box2d-py: $(VENV)/bin/python  ## the same library from its source archive instea
 	.venv-box2d-py/bin/python -m pip uninstall --quiet --yes box2d
 	PATH=$(CURDIR)/.venv-box2d-py/bin:$$PATH .venv-box2d-py/bin/python -m pip install --quiet --no-build-isolation box2d-py==2.3.8
 	.venv-box2d-py/bin/pytest -m "not long" $(ARGS)
+
+sanitize: $(VENV)/.dev  ## 200,000 steps of the native picture under AddressSanitizer: ten minutes
+	mkdir -p build
+	cc -std=c11 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -ffp-contract=off -fwrapv -shared -fPIC \
+	  -I$$($(BIN)/python -c "import sysconfig; print(sysconfig.get_path('include'))") \
+	  worker/render/native/*.c -lm -o build/sanitized.so
+	LD_PRELOAD=$$(cc -print-file-name=libasan.so) ASAN_OPTIONS=detect_leaks=0 SDL_VIDEODRIVER=dummy \
+	  $(BIN)/python deploy/sanitize.py build/sanitized.so $(or $(STEPS),200000)
 
 bundle: $(VENV)/.dev  ## the shipped world model again, from nothing: about 20 minutes of two cores
 	$(BIN)/dreamfleet collect --preset tiny --data data/tiny

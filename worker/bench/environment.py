@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from importlib.util import find_spec
 from time import perf_counter
 from typing import Any
@@ -12,31 +13,32 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bundle import Bundle, pretrained
+from common.bundle import Bundle, find_bundle, pretrained
 from common.controller import Controller
 from common.seeds import VALIDATION
 from worker.render.check import Actions, Difference, compare, leap, make_car_racing
 from worker.tasks.car_racing import CarRacingPolicy, PictureObservation
 
 STEPS = 1000
-Act = Callable[[int, Any], Any]
+Policy = Callable[[NDArray[np.uint8]], Any]
 
 
 def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
-    """Whole episodes, reset and opening zoom included, of every kind in turn; ratios of medians of time a step."""
-    cases: dict[str, Callable[[int], float]] = {
-        "gymnasium": lambda seed: seconds_a_step(gymnasium.make("CarRacing-v3"), weave, seed),
-        "observation": lambda seed: seconds_a_step(make_car_racing(), weave, seed),
-        "gymnasium_picture": lambda seed: seconds_a_step(
-            PictureObservation(gymnasium.make("CarRacing-v3")), weave, seed
-        ),
-        "picture": lambda seed: seconds_a_step(make_car_racing(picture_only=True), weave, seed),
-        "fitness_step": lambda seed: seconds_a_step(make_car_racing(picture_only=True), policy_of(bundle), seed),
+    """Whole driven episodes, reset and opening zoom included, of every kind in turn; ratios of medians of time a step.
+
+    Every kind drives the same actions, which the shipped controller chose on that track beforehand.
+    """
+    cases: dict[str, Callable[[Drive], float]] = {
+        "gymnasium": lambda drive: seconds_a_step(gymnasium.make("CarRacing-v3"), drive),
+        "observation": lambda drive: seconds_a_step(make_car_racing(), drive),
+        "gymnasium_picture": lambda drive: seconds_a_step(PictureObservation(gymnasium.make("CarRacing-v3")), drive),
+        "picture": lambda drive: seconds_a_step(make_car_racing(picture_only=True), drive),
+        "fitness_step": lambda drive: seconds_a_step(make_car_racing(picture_only=True), drive, policy_of(bundle)),
     }
     notes = []
     if find_spec("torch"):
-        cases["torch_fitness_step"] = lambda seed: seconds_a_step(
-            PictureObservation(gymnasium.make("CarRacing-v3")), torch_policy_of(bundle), seed
+        cases["torch_fitness_step"] = lambda drive: seconds_a_step(
+            PictureObservation(gymnasium.make("CarRacing-v3")), drive, torch_policy_of(bundle)
         )
     else:
         notes.append("ratio_fitness_step needs torch: pip install 'dreamfleet[train]'")
@@ -46,8 +48,9 @@ def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
         notes.append("ratio_envpool needs envpool: pip install envpool")
     times: dict[str, list[float]] = {name: [] for name in cases}
     for round_number in range(rounds):
+        drive = recorded_drive(VALIDATION.start + round_number)
         for name, measure in cases.items():
-            times[name].append(measure(VALIDATION.start + round_number))
+            times[name].append(measure(drive))
     seconds = {name: statistics.median(values) for name, values in times.items()}
 
     def ratio(slow: str, fast: str) -> float | None:
@@ -65,55 +68,93 @@ def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
     }
 
 
-def seconds_a_step(environment: gymnasium.Env[Any, Any], act: Act, seed: int) -> float:
-    """One episode from its reset on; it goes on after its end, so that all are equally long."""
+@dataclass(frozen=True)
+class Drive:
+    """A track and what was done on it."""
+
+    seed: int
+    actions: list[NDArray[np.float32]]
+
+
+def recorded_drive(seed: int) -> Drive:
+    """What the shipped controller does on a track; it ends with the lap, or after 1000 steps."""
+    environment, act = make_car_racing(picture_only=True), driver(find_bundle("tiny"))
+    picture, _ = environment.reset(seed=seed)
+    actions: list[NDArray[np.float32]] = []
+    random, ended = np.random.default_rng(seed), False
+    while not ended:
+        actions.append(np.array(act(len(actions), picture, random)))
+        picture, _, terminated, truncated, _ = environment.step(actions[-1])
+        ended = terminated or truncated
+    environment.close()
+    return Drive(seed, actions)
+
+
+def completed_lap(seed: int) -> Drive:
+    """A drive that touches every tile: towards a point ahead on the middle of the road, which the environment knows."""
+    environment = make_car_racing(picture_only=True, max_episode_steps=4 * STEPS)
+    environment.reset(seed=seed)
+    inner: Any = environment.unwrapped
+    middle = np.array(inner.track)[:, 2:]
+    actions: list[NDArray[np.float32]] = []
+    info: dict[str, Any] = {}
+    here = 0
+    while not info.get("lap_finished"):
+        hull = inner.car.hull
+        position = np.array(hull.position)
+        nearby = np.arange(here, here + 10) % len(middle)
+        here = int(nearby[np.linalg.norm(middle[nearby] - position, axis=1).argmin()])
+        x, y = hull.GetLocalVector(middle[(here + 4) % len(middle)] - position)
+        speed = float(np.hypot(*hull.linearVelocity))
+        steer = np.clip(2 * np.arctan2(x, y), -1, 1)
+        target = 45 - 25 * abs(steer)
+        actions.append(np.array([steer, 0.3 * (speed < target), 0.3 * (speed > target + 8)], np.float32))
+        _, _, terminated, truncated, info = environment.step(actions[-1])
+        if (terminated or truncated) and not info.get("lap_finished"):
+            raise RuntimeError(f"no lap on track {seed}")  # a mistake in this function
+    environment.close()
+    return Drive(seed, actions)
+
+
+def seconds_a_step(environment: gymnasium.Env[Any, Any], drive: Drive, policy: Policy | None = None) -> float:
+    """One episode from its reset on. What the policy answers costs its time and is not driven."""
     started = perf_counter()
-    observation, _ = environment.reset(seed=seed)
-    for step in range(STEPS):
-        observation, _, terminated, truncated, _ = environment.step(act(step, observation))
-        if (terminated or truncated) and step < STEPS - 1:
-            observation, _ = environment.reset(seed=seed)
-    seconds = (perf_counter() - started) / STEPS
+    observation, _ = environment.reset(seed=drive.seed)
+    for action in drive.actions:
+        if policy is not None:
+            policy(observation)
+        observation = environment.step(action)[0]
+    seconds = (perf_counter() - started) / len(drive.actions)
     environment.close()
     return seconds
 
 
-def weave(step: int, _observation: Any) -> NDArray[np.float32]:
-    """Gentle bends with some gas: the car moves and leaves the road at times."""
-    return np.array([0.15 * np.sin(step / 11), 0.25, 0.0], dtype=np.float32)
-
-
-def policy_of(bundle: Bundle) -> Act:
+def policy_of(bundle: Bundle) -> Policy:
     """A controller at work, its parameters at random."""
     policy = CarRacingPolicy(bundle)
     policy.begin(np.random.default_rng(0).normal(0, 0.1, bundle.controller_shape.size).astype(np.float32))
-    return lambda _step, observation: policy.act(observation)
+    return policy.act
 
 
-def torch_policy_of(bundle: Bundle) -> Act:
-    """The same work in torch, one operation at a time; the action is thrown away for a gentle one."""
+def torch_policy_of(bundle: Bundle) -> Policy:
+    """The same work in torch, one operation at a time, on a picture of its own."""
     from worker.worldmodel.eager import make_torch_step
 
     parameters = np.zeros((1, bundle.controller_shape.size), np.float32)
     step_once = make_torch_step(bundle, np.zeros((1, *bundle.manifest.picture), np.uint8), parameters)
-
-    def act(step: int, observation: Any) -> Any:
-        step_once()
-        return weave(step, observation)
-
-    return act
+    return lambda _picture: step_once()
 
 
-def envpool_seconds_a_step(seed: int) -> float:
-    """EnvPool's CarRacing, one environment; not the same pixels."""
+def envpool_seconds_a_step(drive: Drive) -> float:
+    """EnvPool's CarRacing, one environment; not the same pixels, and the same actions on tracks of its own."""
     import envpool
 
-    environment = envpool.make("CarRacing-v3", env_type="gymnasium", num_envs=1, seed=seed)
+    environment = envpool.make("CarRacing-v3", env_type="gymnasium", num_envs=1, seed=drive.seed)
     started = perf_counter()
     environment.reset()
-    for step in range(STEPS):
-        environment.step(weave(step, None)[None])
-    return (perf_counter() - started) / STEPS
+    for action in drive.actions:
+        environment.step(action[None])
+    return (perf_counter() - started) / len(drive.actions)
 
 
 def prove_exact(bundle: Bundle) -> Iterator[tuple[str, Difference | None]]:
@@ -122,6 +163,11 @@ def prove_exact(bundle: Bundle) -> Iterator[tuple[str, Difference | None]]:
         yield f"random, seed {seed}, 400 steps", compare(seed, 400, leap)
     for seed in range(5):
         yield f"driven, seed {seed}, to the end", compare(seed, STEPS, driver(bundle))
+    lap = completed_lap(3)
+    yield (
+        f"a completed lap of {len(lap.actions)} steps",
+        compare(lap.seed, len(lap.actions) + 1, lambda step, _picture, _random: lap.actions[step]),
+    )
     yield "off the field", compare(30, STEPS, lambda _step, _picture, _random: np.array([0.0, 1.0, 0.0], np.float32))
     for seed in range(2):
         yield f"domain_randomize, seed {seed}", compare(seed, 300, leap, domain_randomize=True)

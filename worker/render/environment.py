@@ -7,6 +7,7 @@ so and gymnasium draws.
 from __future__ import annotations
 
 import math
+from array import array
 from functools import lru_cache
 from typing import Any
 
@@ -17,6 +18,7 @@ from gymnasium.envs.box2d import car_dynamics, car_racing
 from gymnasium.error import InvalidAction
 from numpy.typing import NDArray
 
+from worker.render.car import Car
 from worker.tasks import preprocessing
 
 try:
@@ -40,8 +42,6 @@ class CarRacing(_Base):  # type: ignore[misc]
         super().__init__(*arguments, **more)
         self._native = native and available()
         self._picture_only = picture_only
-        self._bodies = np.zeros((5, 4))
-        self._sight = np.array([0.0, 0.0, 0.0, 0.0, car_racing.PLAYFIELD])
         self._fixtures = np.zeros(0)
         if picture_only:
             self.observation_space = gymnasium.spaces.Box(0, 255, PICTURE_SHAPE, np.uint8)
@@ -53,9 +53,11 @@ class CarRacing(_Base):  # type: ignore[misc]
 
     def step(self, action: Any) -> Any:
         """Gymnasium's step; an action of another shape, or NaN, is refused before anything moves."""
+        if self.car.__class__ is car_dynamics.Car:  # a new one, of a reset
+            self.car.__class__ = Car
         if action is not None and self.continuous:
             action = np.asarray(action)
-            if action.shape != (3,) or not np.isfinite(action).all():
+            if action.shape != (3,) or not all(map(math.isfinite, action)):
                 raise InvalidAction(f"an action is three finite numbers (steering, gas, brake), not {action!r}")
         return super().step(action)
 
@@ -70,6 +72,7 @@ class CarRacing(_Base):  # type: ignore[misc]
             row = rows[id(tile.color)]
             tile.color = self._road_colours[row]
             self.road_poly[row] = (self.road_poly[row][0], tile.color)
+        self._palette = np.array([self.bg_color, self.grass_color], dtype=np.float64)
         self._fixtures = np.zeros(0)
         return True
 
@@ -87,19 +90,15 @@ class CarRacing(_Base):  # type: ignore[misc]
         hull = car.hull
         if not self._fixtures.size:
             self._fixtures = fixtures_of(car)
-        for row, body in zip(self._bodies, car.wheels, strict=False):
-            row[0], row[1] = body.position
-            row[2], row[3] = body.angle, body.phase
-        x, y = hull.position
-        angle = hull.angle
-        self._bodies[4] = x, y, angle, 0.0
+        bodies = array("d")
+        for body in (*car.wheels, hull):
+            at = body.position
+            bodies.extend((at.x, at.y, body.angle, 0.0 if body is hull else body.phase))
+        x, y, angle = bodies[-4:-1]
         zoom = 0.1 * car_racing.SCALE * max(1 - t, 0) + car_racing.ZOOM * car_racing.SCALE * min(t, 1)
-        self._sight[:4] = zoom, -angle, x, y
-        palette = np.array([self.bg_color, self.grass_color], dtype=np.float64)
+        sight = array("d", (zoom, -angle, x, y, car_racing.PLAYFIELD))
         out = np.empty((96, 96, 3), np.uint8)
-        _native.scene(
-            out, self._road, self._road_colours, GRASS, palette, self._sight, self._bodies, self._fixtures, WHEEL
-        )
+        _native.scene(out, self._road, self._road_colours, GRASS, self._palette, sight, bodies, self._fixtures, WHEEL)
         if self._picture_only:
             picture = np.empty(PICTURE_SHAPE, np.uint8)
             _native.picture(picture, out)
@@ -109,7 +108,8 @@ class CarRacing(_Base):  # type: ignore[misc]
 
     def _draw_bar(self, rows: NDArray[np.uint8]) -> None:
         car, hull = self.car, self.car.hull
-        vx, vy = hull.linearVelocity
+        velocity = hull.linearVelocity
+        vx, vy = velocity.x, velocity.y
         wheels = car.wheels
         _native.bar(
             rows, math.sqrt(vx * vx + vy * vy), *(wheel.omega for wheel in wheels),

@@ -1,5 +1,8 @@
 """The native picture is gymnasium's, to the bit. `dreamfleet bench env --exact` compares far more."""
 
+import os
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -7,9 +10,9 @@ from gymnasium.error import InvalidAction
 
 import worker.render  # noqa: F401 - registers the environment
 from common.bundle import find_bundle
-from worker.bench.environment import discrete, policy_of
+from worker.bench.environment import completed_lap, discrete, policy_of
 from worker.render.check import compare, leap, make_car_racing, native_is_exact
-from worker.render.environment import CarRacing, available, score_text
+from worker.render.environment import GRASS, WHEEL, CarRacing, _native, available, score_text
 from worker.tasks.preprocessing import picture
 
 needs_native = pytest.mark.skipif(not available(), reason="no native module was built")
@@ -29,7 +32,27 @@ def test_random_driving_looks_the_same(seed):
 @needs_native
 def test_evolved_driving_looks_the_same():
     act = policy_of(find_bundle("tiny"))
-    assert compare(5, 160, lambda step, seen, _random: act(step, seen)) is None
+    assert compare(5, 160, lambda _step, seen, _random: act(seen)) is None
+
+
+@needs_native
+def test_a_completed_lap_looks_the_same_to_its_end():
+    lap = completed_lap(3)
+    assert compare(lap.seed, len(lap.actions) + 1, lambda step, _seen, _random: lap.actions[step]) is None
+
+
+@needs_native
+def test_wider_instructions_change_no_bit():
+    if not _native.widen(True):
+        pytest.skip("this processor has none")
+    try:
+        pictures = []
+        for wide in (True, False):
+            _native.widen(wide)
+            pictures.append(drive_all([CarRacing()], [11], 120)[0])
+    finally:
+        _native.widen(True)
+    assert np.array_equal(*pictures)
 
 
 @needs_native
@@ -71,6 +94,36 @@ def drive_all(environments, seeds, steps):
             if step == 10:
                 environment.t += 1.0
     return [np.stack(pictures) for pictures in seen]
+
+
+@needs_native
+def test_one_more_environment_adds_little_memory():
+    def drawing():
+        environment = CarRacing(picture_only=True)
+        drive_all([environment], [1], 20)
+        return environment
+
+    kept = [drawing() for _ in range(8)]
+    before = memory()
+    kept.append(drawing())
+    assert memory() - before < 6 * 2**20
+
+
+def memory():
+    """Bytes of this process that lie in memory."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@needs_native
+@pytest.mark.parametrize("x", [np.nan, np.inf, 1e30])
+def test_a_car_that_cannot_be_drawn_is_a_clear_error(x):
+    environment = CarRacing(picture_only=True)
+    environment.reset(seed=1)
+    with pytest.raises(ValueError, match="too far away"):
+        _native.scene(
+            np.empty((96, 96, 3), np.uint8), environment._road, environment._road_colours, GRASS, environment._palette,
+            np.array([16.2, 0, x, 0, 333]), np.zeros((5, 4)), environment._fixtures, WHEEL,
+        )  # fmt: skip
 
 
 def test_where_it_was_not_built_gymnasium_draws():

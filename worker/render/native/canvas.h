@@ -82,6 +82,17 @@ void canvas_polygon(Canvas *canvas, const Point *points, int count, uint32_t col
 void canvas_solid(Canvas *canvas, const int *x, const int *y, int count, uint32_t colour, bool flipped);
 
 /* Cell rows `from` to `to` of the finished picture: out is (to - from) x 96 x 3 bytes. */
-void canvas_finish(Canvas *canvas, uint32_t background, int from, int to, uint8_t *out);
+typedef void CanvasFinish(Canvas *canvas, uint32_t background, int from, int to, uint8_t *out);
+CanvasFinish canvas_finish;
+
+/* Whether the processor's wider instructions draw. They change no bit; to do without is for comparing. */
+bool canvas_widen(bool wide);
+
+/* What canvas_finish chooses from. */
+CanvasFinish band_finish;
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#define DREAMFLEET_AVX2
+CanvasFinish band_finish_avx2;
+#endif
 
 #endif

@@ -1,4 +1,4 @@
-/* CarRacing's picture for Python: `scene`, `bar`, `picture`. Arrays come as buffers of doubles.
+/* CarRacing's picture for Python: `scene`, `bar`, `picture`, `widen`. Arrays come as buffers of doubles.
 
    One canvas a process, whatever the number of environments: it is rebuilt for every picture, and the interpreter
    lock is held throughout. */
@@ -195,12 +195,18 @@ static bool fail(const char *what)
     return false;
 }
 
-static bool all_finite(const double *values, int count)
+/* Nothing that drives gets near this; beyond it, pixels could not be counted in whole numbers. */
+static bool near(double value)
 {
-    for (int i = 0; i < count; i++)
-        if (!isfinite(values[i]))
+    return fabs(value) <= 1e5;
+}
+
+static bool is_sound(const double *sight, const double *bodies)
+{
+    for (int i = 0; i < BODIES; i++, bodies += BODY)
+        if (!near(bodies[0]) || !near(bodies[1]) || !isfinite(bodies[2]) || !isfinite(bodies[3]))
             return false;
-    return true;
+    return sight[0] > 0 && sight[0] < 100 && isfinite(sight[1]) && near(sight[2]) && near(sight[3]) && near(sight[4]);
 }
 
 enum { ROAD, ROAD_COLOURS, GRASS, PALETTE, SIGHT, BODY_STATE, FIXTURES, WHEEL, ARRAYS };
@@ -217,8 +223,8 @@ static bool draw_scene(Doubles *in, uint8_t *out)
         in[BODY_STATE].length != BODIES * BODY || in[WHEEL].length != 6)
         return fail("arrays of wrong sizes");
     const double *sight = in[SIGHT].values; /* zoom, angle, hull x, hull y, the field's half side */
-    if (!all_finite(sight, VIEW) || !all_finite(in[BODY_STATE].values, BODIES * BODY) || !(sight[0] > 0))
-        return fail("the car's state is not finite");
+    if (!is_sound(sight, in[BODY_STATE].values))
+        return fail("the car's state is not finite, or it is too far away to be drawn");
     View view = view_of(sight[0], sight[1], (Vector){0, 0});
     Vector scroll = rotate(&view, (Vector){-sight[2] * sight[0], -sight[3] * sight[0]});
     view.shift = (Vector){WIDTH / 2.0 + scroll.x, HEIGHT / 4.0 + scroll.y};
@@ -261,7 +267,7 @@ static PyObject *scene(PyObject *self, PyObject *args)
 /* An indicator: a rectangle from (x, y) to (u, v), given as gymnasium gives its corners. */
 static void indicator(double value, double x, double y, double u, double v, uint32_t colour)
 {
-    if (!(fabs(value) > 1e-4))
+    if (!(fabs(value) > 1e-4 && near(value)))
         return;
     int left = (int)x, top = (int)y, right = (int)u, bottom = (int)v;
     int upright_x[4] = {left, right, right, left}, upright_y[4] = {top, top, bottom, bottom};
@@ -316,9 +322,9 @@ static PyObject *picture(PyObject *self, PyObject *args)
     if (fits) {
         const uint8_t *source = in.buf;
         uint8_t *target = out.buf;
-        for (int i = 0; i < SMALL; i++) {
-            uint16_t sums[CELLS * 3] = {0};
-            int top = 21 * i, bottom = top + 21; /* in sixteenths of a row */
+        for (int i = 0; i < SMALL; i++, target += SMALL * 3) {
+            uint16_t sums[CELLS * 3 + 6] = {0}; /* 21 sixteenths of a row down; 6 more that nobody looks at */
+            int top = 21 * i, bottom = top + 21;
             for (int row = top / 16; 16 * row < bottom; row++) {
                 int low = 16 * row > top ? 16 * row : top, high = 16 * row + 16 < bottom ? 16 * row + 16 : bottom;
                 const uint8_t *line = source + row * CELLS * 3;
@@ -326,13 +332,16 @@ static PyObject *picture(PyObject *self, PyObject *args)
                 for (int x = 0; x < CELLS * 3; x++)
                     sums[x] = (uint16_t)(sums[x] + weight * line[x]);
             }
-            for (int pair = 0; pair < SMALL / 2; pair++)
-                for (int c = 0; c < 3; c++) {
-                    const uint16_t *three = sums + 9 * pair + c;
-                    target[6 * pair + c] = (uint8_t)((2 * three[0] + three[3] + 31) / 63);
-                    target[6 * pair + 3 + c] = (uint8_t)((three[3] + 2 * three[6] + 31) / 63);
-                }
-            target += SMALL * 3;
+            /* Three cells become two: averages for every place, of which each third is one. */
+            uint8_t left[CELLS * 3], right[CELLS * 3];
+            for (int x = 0; x < CELLS * 3; x++) {
+                left[x] = (uint8_t)((uint16_t)(2 * sums[x] + sums[x + 3] + 31) / 63);
+                right[x] = (uint8_t)((uint16_t)(sums[x + 3] + 2 * sums[x + 6] + 31) / 63);
+            }
+            for (int pair = 0; pair < SMALL / 2; pair++) {
+                memcpy(target + 6 * pair, left + 9 * pair, 3);
+                memcpy(target + 6 * pair + 3, right + 9 * pair, 3);
+            }
         }
     }
     PyBuffer_Release(&in);
@@ -340,10 +349,19 @@ static PyObject *picture(PyObject *self, PyObject *args)
     return fits ? Py_NewRef(Py_None) : (fail("pictures of wrong sizes"), NULL);
 }
 
+/* widen(wide): whether the processor's wider instructions draw from now on, which changes no bit. */
+static PyObject *widen(PyObject *self, PyObject *wide)
+{
+    (void)self;
+    int wanted = PyObject_IsTrue(wide);
+    return wanted < 0 ? NULL : PyBool_FromLong(canvas_widen(wanted));
+}
+
 static PyMethodDef methods[] = {
     {"scene", scene, METH_VARARGS, "Draw the 84 rows of cells above the bar."},
     {"bar", bar, METH_VARARGS, "Draw the bar's 12 rows without its text."},
     {"picture", picture, METH_VARARGS, "The 64x64 picture of an observation's scene."},
+    {"widen", widen, METH_O, "Draw with the processor's wider instructions, or not; say whether it does."},
     {NULL, NULL, 0, NULL},
 };
 

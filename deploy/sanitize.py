@@ -1,0 +1,60 @@
+"""Drive natively under AddressSanitizer with the wildest actions; `make sanitize` builds the module for it.
+
+python sanitize.py MODULE STEPS
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.machinery import ExtensionFileLoader
+from importlib.util import module_from_spec, spec_from_file_location
+
+NAME = "worker.render._native"
+
+
+def use(path: str) -> None:
+    """Let the environment draw with the module at `path`."""
+    loader = ExtensionFileLoader(NAME, path)
+    spec = spec_from_file_location(NAME, path, loader=loader)
+    assert spec is not None
+    module = module_from_spec(spec)
+    loader.exec_module(module)
+    sys.modules[NAME] = module
+
+
+def wild(random):
+    """Now held, now shaken, far beyond what the action space allows."""
+    size = random.choice([0.0, 1.0, 3.0, 1e3, 1e30])
+    return lambda: random.choice([-size, size, random.uniform(-1, 1)], 3)
+
+
+def drive(steps: int) -> None:
+    """`steps` environment steps; episodes go on for a while after they leave the field."""
+    import numpy as np
+
+    from worker.render.environment import CarRacing, _native
+
+    random = np.random.default_rng(0)
+    environments = [CarRacing(domain_randomize=bool(i % 2), picture_only=i == 2) for i in range(3)]
+    done = episode = 0
+    while done < steps:
+        environment = environments[episode % 3]
+        _native.widen(bool(episode % 2))
+        environment.reset(seed=episode)
+        environment.t = random.uniform(0, 1.5)
+        act = wild(random)
+        for step in range(int(random.integers(1, 2000))):
+            if step % 50 == 0:
+                act = wild(random)
+                environment.car.hull.angle += random.choice([0.0, 0.5, np.pi / 2])
+            environment.step(act())
+            done += 1
+        episode += 1
+        if episode % 20 == 0:
+            print(f"{done} steps", flush=True)
+    print(f"{done} steps in {episode} episodes: nothing found")
+
+
+if __name__ == "__main__":
+    use(sys.argv[1])
+    drive(int(sys.argv[2]))
