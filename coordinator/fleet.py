@@ -1,7 +1,7 @@
 """Who works on what: credits, leases, losses, verdicts. Pure: events and a clock in, batches out.
 
 No message is trusted to arrive. A batch is kept until its worker has seen it; a job is wanted until its first valid
-result; what a beat does not show is dispatched again. Rules 2, 3, 5, 6 and 7 of the protocol.
+result; what a beat does not show is dispatched again. Rules 2, 3, 5, 6, 7 and 8 of the protocol.
 """
 
 from __future__ import annotations
@@ -11,63 +11,17 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from common.messages import MAX_LEASES, TAG_BYTES, Beat, Kind, Result, Verdict, VerdictWord
+from common.messages import TAG_BYTES, Beat, Kind, Result, Verdict, VerdictWord
 from coordinator.jobs import Work
+from coordinator.member import Lease, Member, Sent
 from coordinator.packing import Content, pack
+from coordinator.tail import Move, Tail
 
 DEPARTURE_GRACE = 0.05  # seconds: a token's end overtakes results that are still on their way
 CLOCK_GAP = 2.0  # seconds between ticks that mean a suspended host
 SILENT_BEATS = 5
 ABSENT_BEATS = 2
-
-
-@dataclass
-class Lease:
-    """A job in a worker's hands."""
-
-    batch: int
-    absent: int = 0  # beats in a row that have seen the batch and do not show the job
-
-
-@dataclass
-class Sent:
-    """A batch that its worker has not confirmed."""
-
-    content: Content
-    at: float
-
-
-@dataclass
-class Member:
-    """What the coordinator believes of one worker."""
-
-    identity: str
-    slots: int
-    fingerprint: str
-    heard: float
-    capacity: int = 0  # unknown, and so without credit, before its first beat
-    lost: float | None = None
-    silent: bool = False
-    number: int = 0
-    seen: int = 0
-    load: float = 0.0
-    steps_per_second: float = 0.0
-    drawn_by: str = "-"
-    finished: int = 0
-    leases: dict[bytes, Lease] = field(default_factory=dict)
-    unseen: dict[int, Sent] = field(default_factory=dict)
-    verdicts: list[Verdict] = field(default_factory=list)
-    cancels: list[bytes] = field(default_factory=list)
-
-    @property
-    def present(self) -> bool:
-        """Whether it may be given work."""
-        return self.lost is None and not self.silent
-
-    @property
-    def credit(self) -> int:
-        """How many more jobs it may be given."""
-        return min(2 * self.capacity, MAX_LEASES) - len(self.leases) if self.present else 0
+ATTEMPTS = 3  # of a failing job on one worker, where there is no other
 
 
 @dataclass
@@ -78,6 +32,7 @@ class Wanted:
     order: int
     holders: set[str] = field(default_factory=set)
     failed: dict[str, str] = field(default_factory=dict)  # worker -> error
+    attempts: Counter[str] = field(default_factory=Counter)  # worker -> how often it failed there
 
 
 @dataclass(frozen=True)
@@ -98,7 +53,9 @@ class Fleet:
         self._tags: dict[bytes, bytes] = {}
         self._queue: list[tuple[bool, int, bytes]] = []  # evaluations last, then in order of offer
         self._orders = 0
+        self._evaluating = 0  # evaluations that somebody holds
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this one and the last
+        self._tail = Tail(beat)
         self._ticked: float | None = None
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
@@ -144,17 +101,17 @@ class Fleet:
         if member is None:
             return
         self._hear(member, now)
-        member.capacity, member.slots, member.seen = beat.capacity, beat.slots, beat.seen
-        member.load, member.steps_per_second, member.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
-        member.unseen = {number: sent for number, sent in member.unseen.items() if number > beat.seen}
-        shown = {self._tags.get(tag) for tag in (*beat.queued, *(run.tag for run in beat.running), *beat.unacked)}
+        member.observe(beat)
+        running = {self._tags.get(run.tag): run.steps for run in beat.running}
+        shown = {self._tags.get(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
         for digest, lease in list(member.leases.items()):
             lease.absent = 0 if digest in shown or lease.batch > beat.seen else lease.absent + 1
+            lease.steps = running.get(digest)
             if lease.absent >= ABSENT_BEATS:
                 self._drop_lease(member, digest)
         for found in shown - member.leases.keys():
             if found in self._wanted and len(self._wanted[found].holders) < 2:
-                self._take(member, found, Lease(beat.seen))
+                self._take(member, found, Lease(beat.seen, steps=running.get(found)))
 
     def result(self, identity: str, result: Result, now: float) -> tuple[VerdictWord, Work | None]:
         """Judge one result; the work comes back when it is the first wanted one, for the journal."""
@@ -166,6 +123,8 @@ class Fleet:
             member.leases.pop(result.digest, None)
             member.verdicts.append(Verdict(result.digest, verdict))
             member.finished += verdict == "accepted"
+        if verdict == "accepted":
+            self._tail.learn(result.steps)
         self.counts["accepted_steps" if verdict == "accepted" else "discarded_steps"] += result.steps
         self.counts[verdict] += 1
         return verdict, work
@@ -189,6 +148,9 @@ class Fleet:
     def dispatch(self, now: float) -> list[Send]:
         """Batches to send now: verdicts, cancellations, jobs to credit, and what was not seen in time."""
         given = self._assign()
+        if not self._queue and not self.paused:
+            for move in self._tail.plan(self._wanted, self.members, given, now):
+                self._apply(move, given)
         sends = []
         for member in self.members.values():
             if member.lost is not None:
@@ -223,20 +185,24 @@ class Fleet:
         return [(wanted.work, dict(wanted.failed)) for wanted in self._wanted.values() if wanted.failed]
 
     def poison(self) -> tuple[Work, dict[str, str]] | None:
-        """A job that failed on two different workers."""
-        return next(((work, failed) for work, failed in self.failures if len(failed) > 1), None)
+        """A job that failed on two different workers, or again and again on the only one there is."""
+        for wanted in self._wanted.values():
+            if len(wanted.failed) > 1 or any(count >= ATTEMPTS for count in wanted.attempts.values()):
+                return wanted.work, dict(wanted.failed)
+        return None
 
     def _judge(self, identity: str, result: Result) -> tuple[VerdictWord, Work | None]:
         wanted = self._wanted.get(result.digest)
         if wanted is None:
             return ("duplicate" if result.digest in self._accepted else "obsolete"), None
         if result.fitness is None:
+            wanted.attempts[identity] += 1
             wanted.failed[identity] = result.error or "no fitness and no reason"
             self.counts["errors"] += 1
             if member := self.members.get(identity):
                 self._drop_lease(member, result.digest)
             return "refused", None
-        wanted.holders.discard(identity)
+        self._unhold(wanted, identity)
         self._unwant(result.digest)
         self._accepted[result.digest] = wanted.work.job.generation
         return "accepted", wanted.work
@@ -244,9 +210,11 @@ class Fleet:
     def _unwant(self, digest: bytes) -> None:
         wanted = self._wanted.pop(digest)
         self._tags.pop(digest[:TAG_BYTES], None)
-        for holder in wanted.holders:
-            self.members[holder].leases.pop(digest, None)
+        for holder in list(wanted.holders):
+            lease = self.members[holder].leases.pop(digest, None)
+            self._unhold(wanted, holder)
             self.members[holder].cancels.append(digest)
+            self.counts["discarded_steps"] += (lease and lease.steps) or 0
 
     def _hear(self, member: Member, now: float) -> None:
         member.heard = now
@@ -260,7 +228,28 @@ class Fleet:
 
     def _take(self, member: Member, digest: bytes, lease: Lease) -> None:
         member.leases[digest] = lease
-        self._wanted[digest].holders.add(member.identity)
+        self._hold(self._wanted[digest], member.identity)
+
+    def _hold(self, wanted: Wanted, identity: str) -> None:
+        self._evaluating += wanted.work.job.kind == "evaluate" and not wanted.holders
+        wanted.holders.add(identity)
+
+    def _unhold(self, wanted: Wanted, identity: str) -> None:
+        if identity in wanted.holders:
+            wanted.holders.discard(identity)
+            self._evaluating -= wanted.work.job.kind == "evaluate" and not wanted.holders
+
+    def _apply(self, move: Move, given: dict[str, list[Work]]) -> None:
+        """Give a job to an idle slot too, or instead of to a worker that has not begun it."""
+        wanted = self._wanted[move.digest]
+        if move.instead_of:
+            donor = self.members[move.instead_of]
+            donor.leases.pop(move.digest)
+            donor.cancels.append(move.digest)
+            self._unhold(wanted, donor.identity)
+        self.counts["recalled" if move.instead_of else "copied"] += 1
+        self._hold(wanted, move.to)
+        given.setdefault(move.to, []).append(wanted.work)
 
     def _drop_lease(self, member: Member, digest: bytes) -> None:
         """End a lease without a result; the job is queued again unless another worker holds it."""
@@ -268,7 +257,7 @@ class Fleet:
         wanted = self._wanted.get(digest)
         if wanted is None or member.identity not in wanted.holders:
             return
-        wanted.holders.discard(member.identity)
+        self._unhold(wanted, member.identity)
         if not wanted.holders:
             self.counts["reissued"] += 1
             self._enqueue(digest)
@@ -288,26 +277,24 @@ class Fleet:
         if self.paused:
             return given
         loads = {name: len(member.leases) for name, member in self.members.items() if member.credit > 0}
-        evaluating = sum(
-            wanted.work.job.kind == "evaluate" and bool(wanted.holders) for wanted in self._wanted.values()
-        )
         passed_over = []
         while self._queue and loads:
             entry = heapq.heappop(self._queue)
             wanted = self._wanted.get(entry[2])
             if wanted is None or wanted.holders:
                 continue  # answered meanwhile, or adopted again from a worker that came back
-            if entry[0] and not self.hurry and evaluating >= self._evaluation_slots():
+            if entry[0] and not self.hurry and self._evaluating >= self._evaluation_slots():
                 passed_over.append(entry)
                 break  # evaluations are last in the queue
             able = [name for name in loads if name not in wanted.failed]
+            if not able and all(name in wanted.failed for name, member in self.members.items() if member.present):
+                able = list(loads)  # nobody else is there: a killed child must not hang a run
             if not able:
                 passed_over.append(entry)
                 continue
             name = min(able, key=lambda name: loads[name] / self.members[name].capacity)
             given.setdefault(name, []).append(wanted.work)
-            wanted.holders.add(name)
-            evaluating += entry[0]
+            self._hold(wanted, name)
             loads[name] += 1
             if len(given[name]) >= self.members[name].credit:
                 del loads[name]

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 from common.fingerprint import package_version
-from coordinator.fleet import Member
+from coordinator.member import Member
 from coordinator.run import Run
 
 SCHEMA = 1
@@ -111,7 +111,17 @@ def _waste(run: Run) -> dict[str, Any]:
         "discarded_steps": discarded,
         "share": round(discarded / (discarded + accepted), 4) if discarded else 0.0,
         **{
-            name: counts[name] for name in ("reissued", "duplicate", "obsolete", "errors", "resent_batches", "silences")
+            name: counts[name]
+            for name in (
+                "reissued",
+                "recalled",
+                "copied",
+                "duplicate",
+                "obsolete",
+                "errors",
+                "resent_batches",
+                "silences",
+            )
         },
     }
 

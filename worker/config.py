@@ -18,6 +18,10 @@ class WorkerConfig:
     name: str | None = option(None, "name of this worker (default: the host's)")
     slots: int = option(0, "scoring processes; 0: one a core")
     drain_timeout: float = option(30.0, "seconds that running episodes may take after the first Ctrl-C")
+    lifetime: float = option(0.0, "leave by itself after so many seconds, as at the first Ctrl-C; 0: never")
+    slot_memory: int = option(
+        2048, "MiB of a scoring process; one that holds more is replaced between jobs; 0: no limit"
+    )
     exit_when_done: bool = option(False, "leave when the run has ended, instead of waiting for its coordinator")
 
     def __post_init__(self) -> None:
@@ -25,3 +29,6 @@ class WorkerConfig:
             check_run_name(self.run)
         if not 0 <= self.slots <= MAX_LEASES:
             raise UsageError(f"--slots must be from 0 to {MAX_LEASES}, not {self.slots}")
+        for name in ("drain_timeout", "lifetime", "slot_memory"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise UsageError(f"--{name.replace('_', '-')} must not be negative, nor without end")

@@ -7,6 +7,7 @@ callbacks and slot readers only enqueue.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import queue
 import random
@@ -35,6 +36,7 @@ log = logging.getLogger(__name__)
 RETRY = 1.0  # seconds between attempts to connect or join
 GONE = 5.0  # seconds without a coordinator after which a run counts as over
 SILENT_BEATS = 5  # in which a coordinator that knows this worker would have answered
+CLOCK_GAP = 2.0  # seconds between turns of the loop that mean a suspended host
 SMOOTHING = 0.3  # weight of the newest interval in the throughput
 
 
@@ -77,7 +79,8 @@ class Worker:
                 return
             stack.callback(self._stop_slots)
             self._slots = [
-                Slot(number, admission.spec, bundle.path, self._events) for number in range(self._slot_count)
+                Slot(number, admission.spec, bundle.path, self._events, self._config.slot_memory << 20)
+                for number in range(self._slot_count)
             ]
             self._backlog = Backlog(admission.spec)
             self._outbox = Outbox(admission.intervals.repeat)
@@ -142,11 +145,15 @@ class Worker:
         self._quiet_since = now = monotonic()
         self._alone_since: float | None = now  # until a coordinator's token says otherwise
         self._beat_at, self._rate, self._counted = now, 0.0, (now, 0)
-        drain_until = None
+        drain_until, leave_at = None, now + (self._config.lifetime or math.inf)
         while not self._left(drain_until):
+            before = now
             self._wait()
             now = monotonic()
-            if self._stops and drain_until is None:
+            gap = now - before if now - before > CLOCK_GAP else 0.0
+            for slot in self._slots:
+                slot.check(now, gap)
+            if (self._stops or now >= leave_at) and drain_until is None:
                 drain_until = now + self._config.drain_timeout
                 self._backlog.clear()
                 log.info("draining: running episodes finish, queued jobs go back")
@@ -207,6 +214,9 @@ class Worker:
         for job, why in self._backlog.take_in(batch):
             self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
         self._outbox.settle(verdict.digest for verdict in batch.verdicts)
+        for slot in self._slots:
+            if slot.job is not None and slot.job.digest in batch.cancels:
+                slot.abandon()
 
     def _take_slot_event(self, event: SlotEvent) -> None:
         self._quiet_since = monotonic()

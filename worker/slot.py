@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
-from time import perf_counter
+from time import monotonic, perf_counter
 from typing import Any
 
 import numpy as np
@@ -39,20 +39,34 @@ class Ready:
 
 
 @dataclass(frozen=True)
+class Abandoned:
+    """A child's word that it gave a job up, as it was told to."""
+
+
+@dataclass(frozen=True)
 class SlotEvent:
-    """What a slot tells its worker: ready, a result, or (with neither) that the child is gone."""
+    """What a slot tells its worker: ready, a result, a job given up, or that the child is gone."""
 
     slot: int
     life: int
     ready: Ready | None = None
     result: Result | None = None
+    abandoned: bool = False
     gone: str | None = None
 
 
 class Slot:
     """The parent's side of one child."""
 
-    def __init__(self, number: int, spec: TaskSpec, bundle: Path, events: queue.SimpleQueue[tuple[str, Any]]) -> None:
+    def __init__(
+        self,
+        number: int,
+        spec: TaskSpec,
+        bundle: Path,
+        events: queue.SimpleQueue[tuple[str, Any]],
+        memory_limit: int = 0,
+    ) -> None:
+        """`memory_limit` in bytes; 0: none."""
         self.number = number
         self.job: Job | None = None
         self.ready = False
@@ -60,6 +74,8 @@ class Slot:
         self._spec = spec
         self._bundle = bundle
         self._events = events
+        self._memory_limit = memory_limit
+        self._progress = (0, 0.0)  # steps, and when they were last seen to grow
         self._life = 0
         self._failed_starts = 0
         self._start()
@@ -78,10 +94,29 @@ class Slot:
         """Give an idle child a job; a child that is gone is noticed by its reader."""
         self.job = job
         self._steps.value = 0
+        self._progress = (0, monotonic())
+        self._turn += 1
         try:
-            self._pipe.send((job, vector))
+            self._pipe.send((self._turn, job, vector))
         except OSError:
             log.debug("slot %d is gone", self.number)
+
+    def check(self, now: float, gap: float) -> None:
+        """Kill a child whose job makes no step; `gap` is how long this host itself stood still before `now`."""
+        if self.job is None:
+            return
+        steps, since = self._progress
+        since += gap
+        if self.steps != steps:
+            since = now
+        elif now - since > self.job.stall > 0:
+            self._ended_for = f"no step for {self.job.stall:g} s"
+            self._process.kill()
+        self._progress = (self.steps, since)
+
+    def abandon(self) -> None:
+        """Let the child give up its job at its next step, without a result; it may be done before."""
+        self._abandoned.value = self._turn
 
     def handle(self, event: SlotEvent) -> Result | None:
         """Take one of this slot's events; the result of its job, if that has ended."""
@@ -92,7 +127,10 @@ class Slot:
             self._failed_starts = 0
         elif event.result is not None:
             self.job = None
+            self._replace_if_swollen()
             return event.result
+        elif event.abandoned:
+            self.job = None
         elif event.gone is not None:
             return self._replace(event.gone)
         return None
@@ -107,7 +145,7 @@ class Slot:
     def _replace(self, why: str) -> Result | None:
         self._process.join()
         code = self._process.exitcode or 0
-        reason = f"signal {-code}" if code < 0 else why
+        reason = self._ended_for or (f"signal {-code}" if code < 0 else why)
         self._failed_starts += not self.ready
         if self._failed_starts >= FAILED_STARTS:
             raise DreamfleetError(f"a slot cannot start: {reason}; `dreamfleet doctor` looks for the cause")
@@ -119,14 +157,27 @@ class Slot:
             return None
         return Result(job.digest, None, steps, 0.0, f"slot crashed ({reason})", None)
 
+    def _replace_if_swollen(self) -> None:
+        held = _memory_of(self.pid) if self._memory_limit else 0
+        if held > self._memory_limit:
+            log.warning("slot %d holds %d MiB; starting another", self.number, held >> 20)
+            self.stop()
+            self.ready = False
+            self._start()
+
     def _start(self) -> None:
+        self._ended_for = ""
         pin_thread_pools()
         context = get_context("spawn")
         self._life += 1
+        self._turn = 0  # of this child: its jobs, counted
         self._steps: Any = context.Value("Q", 0, lock=False)
+        self._abandoned: Any = context.Value("Q", 0, lock=False)  # the turn to give up
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
-            target=serve_jobs, args=(theirs, self._steps, self._spec, self._bundle, os.getpid()), daemon=True
+            target=serve_jobs,
+            args=(theirs, self._steps, self._abandoned, self._spec, self._bundle, os.getpid()),
+            daemon=True,
         )
         with _signals_held():
             self._process.start()
@@ -145,13 +196,21 @@ class Slot:
                 why = said
             elif isinstance(said, Ready):
                 self._events.put(("slot", SlotEvent(self.number, life, ready=said)))
+            elif isinstance(said, Abandoned):
+                self._events.put(("slot", SlotEvent(self.number, life, abandoned=True)))
             else:
                 self._events.put(("slot", SlotEvent(self.number, life, result=said)))
         self._events.put(("slot", SlotEvent(self.number, life, gone=why)))
 
 
-def serve_jobs(pipe: Connection[Any, Any], steps: Any, spec: TaskSpec, bundle: Path, parent: int) -> None:
-    """The child: score jobs from the pipe until it closes."""
+class AbandonedError(Exception):
+    """The running job is not wanted any more."""
+
+
+def serve_jobs(
+    pipe: Connection[Any, Any], steps: Any, abandoned: Any, spec: TaskSpec, bundle: Path, parent: int
+) -> None:
+    """The child: score jobs from the pipe until it closes. `steps` and `abandoned` are shared with the parent."""
     _die_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker decides; Ctrl-C reaches the whole group
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -166,15 +225,22 @@ def serve_jobs(pipe: Connection[Any, Any], steps: Any, spec: TaskSpec, bundle: P
         raise SystemExit(1) from error
     pipe.send(Ready(scorer.drawn_by))
 
+    turn = 0
+
     def count(done: int) -> None:
         steps.value = done
+        if abandoned.value == turn:
+            raise AbandonedError
 
     while True:
         try:
-            job, vector = pipe.recv()
+            turn, job, vector = pipe.recv()
         except EOFError:
             return
-        pipe.send(_score(scorer, job, vector, count))
+        try:
+            pipe.send(_score(scorer, job, vector, count))
+        except AbandonedError:
+            pipe.send(Abandoned())
 
 
 @contextmanager
@@ -190,7 +256,6 @@ def _signals_held() -> Iterator[None]:
 
 def _score(scorer: Any, job: Job, vector: bytes, count: Any) -> Result:
     started = perf_counter()
-    count(0)
     made = 0
 
     def on_step(done: int) -> None:
@@ -200,9 +265,19 @@ def _score(scorer: Any, job: Job, vector: bytes, count: Any) -> Result:
 
     try:
         score = scorer.score(job.kind, np.frombuffer(vector, dtype="<f4"), job.seeds[0], on_step)
+    except AbandonedError:
+        raise
     except Exception as error:  # whatever a task raises is this job's error, not the slot's end
         return Result(job.digest, None, made, perf_counter() - started, _one_line(error), None)
     return Result(job.digest, score.fitness, score.steps, perf_counter() - started, None, None)
+
+
+def _memory_of(pid: int) -> int:
+    """Bytes of a process that lie in memory; 0 where that is not known."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0
 
 
 def _one_line(error: Exception) -> str:

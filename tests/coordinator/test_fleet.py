@@ -18,11 +18,11 @@ def work(count, kind="score", generation=0):
     return make_work(SPEC, kind, generation, 0, vector, range(1000, 1000 + count))
 
 
-def beat(capacity=1, seen=0, queued=(), running=(), unacked=()):
+def beat(capacity=1, seen=0, queued=(), running=(), unacked=(), rate=0.0, steps=5):
     return Beat(
-        **HEAD, nonce="n", seen=seen, capacity=capacity, slots=capacity, load=0.0, steps_per_second=0.0, drawn_by="-",
+        **HEAD, nonce="n", seen=seen, capacity=capacity, slots=capacity, load=0.0, steps_per_second=rate, drawn_by="-",
         queued=tuple(digest[:TAG_BYTES] for digest in queued),
-        running=tuple(Running(digest[:TAG_BYTES], 5) for digest in running),
+        running=tuple(Running(digest[:TAG_BYTES], steps) for digest in running),
         unacked=tuple(digest[:TAG_BYTES] for digest in unacked),
     )  # fmt: skip
 
@@ -42,6 +42,10 @@ def fleet_of(*names, capacity=1, jobs=10):
 
 def digests(sends, name):
     return [each.job.digest for send in sends if send.identity == name for each in send.content.work]
+
+
+def cancelled(sends, name):
+    return [digest for send in sends if send.identity == name for digest in send.content.cancels]
 
 
 def test_no_work_before_the_first_beat():
@@ -161,11 +165,19 @@ def test_an_error_is_no_fitness_and_another_worker_tries():
     assert errors == {A: "boom", B: "boom"}
 
 
-def test_the_only_worker_does_not_try_a_failed_job_again_and_goes_on_with_the_others():
-    fleet = fleet_of(A, jobs=2)
-    first, second = digests(fleet.dispatch(0.0), A)
+def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
+    fleet = fleet_of(A, jobs=1)
+    for attempt in range(3):
+        assert fleet.poison() is None
+        (digest,) = digests(fleet.dispatch(attempt), A)
+        fleet.result(A, result(digest, error="boom"), attempt)
+    assert fleet.poison()[1] == {A: "boom"}
+
+
+def test_a_failed_job_waits_for_another_worker_that_is_busy():
+    fleet = fleet_of(A, B, jobs=4)
+    first, *_ = digests(fleet.dispatch(0.0), A)
     fleet.result(A, result(first, error="boom"), 0.1)
-    fleet.result(A, result(second), 0.1)
     assert digests(fleet.dispatch(0.2), A) == []
     assert [errors for _, errors in fleet.failures] == [{A: "boom"}]
 
@@ -189,6 +201,61 @@ def test_a_paused_fleet_gives_nothing_and_still_judges():
     assert len(send.content.verdicts) == 1
 
 
+def test_a_newcomer_takes_over_what_another_worker_has_waiting():
+    fleet = fleet_of(A, capacity=2, jobs=4)
+    given = digests(fleet.dispatch(0.0), A)
+    fleet.welcome(B, 1, "f", 0.1)
+    fleet.beat(B, beat(1), 0.1)
+    sends = fleet.dispatch(0.2)
+    assert digests(sends, B) == [given[-1]], "what was given last begins last"
+    assert cancelled(sends, A) == [given[-1]]
+    assert given[-1] not in fleet.members[A].leases
+    assert fleet.counts["recalled"] == 1
+
+
+def test_what_runs_is_not_recalled():
+    fleet = fleet_of(A, capacity=1, jobs=1)
+    fleet.dispatch(0.0)
+    fleet.welcome(B, 1, "f", 0.1)
+    fleet.beat(B, beat(1), 0.1)
+    assert fleet.dispatch(0.2) == []
+
+
+def tail_of_two(pace_a, pace_b, steps_a):
+    """A runs the only job left and has made `steps_a` of a typical 1000 steps; B is idle."""
+    fleet = fleet_of(A, B, jobs=3)
+    for digest in digests(fleet.dispatch(0.0), B):
+        fleet.beat(B, beat(seen=1, running=[digest], rate=pace_b), 0.5)
+        fleet.result(B, Result(digest, 1.0, 1000, 0.1, None, None), 1.0)
+    first = next(iter(fleet.members[A].leases))
+    for digest in list(fleet.members[A].leases)[1:]:
+        fleet.result(A, Result(digest, 1.0, 1000, 0.1, None, None), 1.0)
+    fleet.beat(A, beat(seen=1, running=[first], rate=pace_a, steps=steps_a), 1.0)
+    return fleet, first
+
+
+def test_a_straggler_on_a_slow_host_is_copied_once_and_the_loser_cancelled():
+    fleet, job = tail_of_two(pace_a=10.0, pace_b=1000.0, steps_a=100)
+    assert digests(fleet.dispatch(1.0), B) == [job]
+    assert digests(fleet.dispatch(1.1), B) == []
+    assert fleet.result(B, result(job), 2.0)[0] == "accepted"
+    assert cancelled(fleet.dispatch(2.0), A) == [job]
+    assert fleet.counts["copied"] == 1
+    assert fleet.counts["discarded_steps"] == 100
+
+
+def test_a_job_that_is_nearly_done_is_not_copied():
+    fleet, _ = tail_of_two(pace_a=1000.0, pace_b=1000.0, steps_a=100)
+    assert digests(fleet.dispatch(1.0), B) == []
+
+
+def test_the_job_of_a_worker_that_has_gone_quiet_is_copied_before_it_counts_as_lost():
+    fleet, job = tail_of_two(pace_a=1000.0, pace_b=1000.0, steps_a=100)
+    fleet.beat(B, beat(seen=9), 3.1)
+    assert digests(fleet.dispatch(3.1), B) == [job]
+    assert not fleet.members[A].silent
+
+
 @settings(max_examples=60, stateful_step_count=60, deadline=None)
 class AnyOrder(RuleBasedStateMachine):
     """Workers that hold, lose and finish work while messages vanish; each job must count exactly once."""
@@ -197,7 +264,7 @@ class AnyOrder(RuleBasedStateMachine):
         super().__init__()
         self.fleet = Fleet(BEAT)
         self.now = 0.0
-        self.jobs = work(12)
+        self.jobs = work(9) + work(3, "evaluate")
         self.fleet.offer(self.jobs)
         self.accepted = []
         self.workers = {}  # name -> [seen, held digests, unacked]
@@ -214,11 +281,15 @@ class AnyOrder(RuleBasedStateMachine):
         if self.workers.pop(name, None) is not None:
             self.fleet.depart(name, self.now)
 
-    @rule(name=names, heard=st.booleans())
-    def send_beat(self, name, heard):
+    @rule(name=names, heard=st.booleans(), steps=st.integers(0, 2000), rate=st.sampled_from([0.0, 1.0, 1000.0]))
+    def send_beat(self, name, heard, steps=0, rate=0.0):
         if name in self.workers and heard:
             seen, held, unacked = self.workers[name]
-            self.fleet.beat(name, beat(2, seen, queued=held, unacked=unacked), self.now)
+            self.fleet.beat(
+                name,
+                beat(2, seen, queued=held[2:], running=held[:2], unacked=unacked, rate=rate, steps=steps),
+                self.now,
+            )
 
     @rule(lost=st.sets(st.integers(0, 3)))
     def dispatch(self, lost):
@@ -261,6 +332,17 @@ class AnyOrder(RuleBasedStateMachine):
     def each_job_counts_at_most_once(self):
         assert len(self.accepted) == len(set(self.accepted))
         assert self.fleet.open + len(self.accepted) == len(self.jobs)
+
+    @invariant()
+    def at_most_two_hold_a_job(self):
+        for digest, wanted in self.fleet._wanted.items():
+            assert len(wanted.holders) <= 2
+            assert all(digest in self.fleet.members[holder].leases for holder in wanted.holders)
+
+    @invariant()
+    def held_evaluations_are_counted(self):
+        held = [each for each in self.fleet._wanted.values() if each.holders and each.work.job.kind == "evaluate"]
+        assert self.fleet._evaluating == len(held)
 
     @invariant()
     def credit_is_accounted(self):

@@ -4,6 +4,8 @@ import select
 import signal
 import subprocess
 import sys
+from dataclasses import replace
+from time import monotonic
 
 import pytest
 
@@ -24,10 +26,10 @@ def spec(task):
 class Harness:
     """A slot and its worker's queue."""
 
-    def __init__(self, task, bundle):
+    def __init__(self, task, bundle, memory_limit):
         self.spec = spec(task)
         self.events = queue.SimpleQueue()
-        self.slot = Slot(0, self.spec, bundle, self.events)
+        self.slot = Slot(0, self.spec, bundle, self.events, memory_limit)
 
     def wait_ready(self):
         while not self.slot.ready:
@@ -48,8 +50,8 @@ class Harness:
 def harness(random_bundle):
     made = []
 
-    def make(task, bundle=None):
-        made.append(Harness(task, bundle or random_bundle.path))
+    def make(task, bundle=None, memory_limit=0):
+        made.append(Harness(task, bundle or random_bundle.path, memory_limit))
         return made[-1]
 
     yield make
@@ -93,6 +95,43 @@ def test_a_killed_child_is_replaced_alone(harness):
     os.kill(slot.slot.pid, signal.SIGKILL)
     assert "signal 9" in slot.result().error
     assert slot.score().fitness is not None
+
+
+def test_a_job_that_is_given_up_ends_without_a_result_and_the_child_lives_on(harness):
+    slot = harness(tasks.SLOW_TOY)
+    slot.wait_ready()
+    pid = slot.slot.pid
+    slot.slot.submit(job(0, spec=slot.spec), VECTOR)
+    slot.slot.abandon()
+    while slot.slot.job is not None:
+        assert slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1]) is None
+    assert slot.score(1).fitness is not None
+    assert slot.slot.pid == pid
+
+
+def test_a_hung_job_is_killed_and_its_child_replaced(harness):
+    slot = harness(tasks.HANGING)
+    slot.wait_ready()
+    stalling = replace(job(0, spec=slot.spec), stall=5.0)
+    slot.slot.submit(stalling, VECTOR)
+    now = monotonic()
+    slot.slot.check(now + 4.0, 0.0)
+    slot.slot.check(now + 8.0, 4.0)  # the host stood still for four of the eight seconds
+    assert slot.slot.job is not None
+    slot.slot.check(now + 9.5, 0.0)
+    result = slot.result()
+    assert (result.fitness, result.error) == (None, "slot crashed (no step for 5 s)")
+    slot.wait_ready()
+
+
+def test_a_child_over_its_memory_limit_is_replaced_between_jobs(harness):
+    slot = harness(tasks.TOY, memory_limit=1)
+    slot.wait_ready()
+    pid = slot.slot.pid
+    assert slot.score().fitness is not None
+    assert not slot.slot.ready
+    assert slot.score(1).fitness is not None
+    assert slot.slot.pid != pid
 
 
 def test_a_child_that_cannot_start_ends_with_its_reason(harness, tmp_path):
