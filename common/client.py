@@ -1,4 +1,4 @@
-"""Asking a run over Zenoh how it is: status, its parts, and watching generations end. Read-only but for `stop`."""
+"""Asking a run over Zenoh how it is: status, its parts, and watching generations end. Read-only but for `control`."""
 
 from __future__ import annotations
 
@@ -66,15 +66,18 @@ class Client:
             if offset >= document["total"] or not document[part]:
                 return
 
-    def stop(self, run: str) -> None:
-        """Ask the coordinator to leave; the run can be continued."""
-        for reply in self._session.get(keys.control(run, "stop"), timeout=QUERY_TIMEOUT):
+    def control(self, run: str, verb: str) -> None:
+        """Ask the coordinator to `pause`, `resume`, `drain` or `stop`; `RefusedError` says why it does not."""
+        for reply in self._session.get(keys.control(keys.check_run_name(run), verb), timeout=QUERY_TIMEOUT):
             if reply.ok is not None:
                 answer = decode_json(ControlReply, reply.ok.payload.to_bytes())
                 if not answer.accepted:
                     raise RefusedError(answer.why)
                 return
-        raise ConnectionFailedError(f"no coordinator of run {run!r} answers through {self._where}")
+        raise ConnectionFailedError(
+            f"no coordinator of run {run!r} answers through {self._where}: it is not running, or you lack the right "
+            "to ask"
+        )
 
     def _ask(self, selector: str) -> list[dict[str, Any]]:
         replies: queue.SimpleQueue[Any] = queue.SimpleQueue()

@@ -179,6 +179,11 @@ class RunFolder:
         query = "SELECT generation, episodes, mean, std FROM evaluation WHERE mean IS NOT NULL ORDER BY generation"
         return [StoredEvaluation(*row) for row in self._all(query)]
 
+    def strategy_state(self) -> bytes | None:
+        """The strategy as it was before its latest generation was asked; `None` before the first."""
+        row = self._one("SELECT state FROM strategy ORDER BY generation DESC LIMIT 1")
+        return None if row is None else bytes(row[0])
+
     def _fact(self, key: str) -> str | None:
         row = self._one("SELECT value FROM run WHERE key = ?", key)
         return None if row is None else str(row[0])

@@ -54,6 +54,12 @@ def restore(strategy: Any, arrays: dict[str, NDArray[Any]]) -> None:
             _assign(owner, name, _value(path, about, arrays))
 
 
+def mean_and_sigma(arrays: dict[str, NDArray[Any]]) -> tuple[NDArray[np.float64], float]:
+    """The distribution's mean `(dimension,)` and its overall step size."""
+    about = json.loads(str(arrays["about"]))
+    return arrays["mean"].astype(np.float64), float(_untag(about["sigma"]))
+
+
 def pack(arrays: dict[str, NDArray[Any]]) -> bytes:
     """Arrays as one `.npz`."""
     buffer = io.BytesIO()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, Literal
 
 from common.bundle import Bundle
@@ -49,6 +50,13 @@ class RunConfig:
             evaluate_every=self.evaluate_every,
             evaluation_episodes=self.evaluation_episodes,
         )
+
+
+def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:
+    """The settings of a run as they would be configured; `bundle` is where its copy of the world model lies."""
+    frozen = {each.name: getattr(run, each.name) for each in fields(RunConfig) if hasattr(run, each.name)}
+    spec = run.task
+    return {**frozen, "task": spec.task, "horizon": spec.horizon, "patience": spec.patience, "bundle": str(bundle)}
 
 
 @dataclass(frozen=True)

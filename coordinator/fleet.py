@@ -191,6 +191,12 @@ class Fleet:
                 return wanted.work, dict(wanted.failed)
         return None
 
+    def pardon(self) -> None:
+        """Forget what failed."""
+        for wanted in self._wanted.values():
+            wanted.failed.clear()
+            wanted.attempts.clear()
+
     def _judge(self, identity: str, result: Result) -> tuple[VerdictWord, Work | None]:
         wanted = self._wanted.get(result.digest)
         if wanted is None:

@@ -18,6 +18,7 @@ from coordinator.fleet import Fleet
 from coordinator.journal import Journal
 from coordinator.run import Run
 from coordinator.service import Service
+from coordinator.start import Start
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class RunRequest:
     network: Network
     beat: float = 1.0
     mixed: bool = False
+    start: Start | None = None  # of a new run; it begins with zero parameters otherwise
 
 
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
@@ -53,7 +55,9 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         )
         on_stoppable(service.stop)
         try:
-            return service.serve(lambda: Run(journal, settings, request.limits, Fleet(request.beat), monotonic()))
+            return service.serve(
+                lambda: Run(journal, settings, request.limits, Fleet(request.beat), monotonic(), request.start)
+            )
         finally:
             journal.close()
 
@@ -62,6 +66,8 @@ def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle]:
     """What the run is, and its verified bundle."""
     if request.config is not None:
         bundle = find_bundle(request.config.bundle)
+        if request.start is not None:
+            request.start.check(request.config.task, bundle)
         return request.config.settings(bundle), bundle
     with open_run(request.runs_dir, request.name) as stored:
         settings = stored.settings

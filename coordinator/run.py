@@ -21,6 +21,7 @@ from coordinator.fleet import Fleet
 from coordinator.generation import Generation
 from coordinator.jobs import travelling
 from coordinator.journal import Journal
+from coordinator.start import Start
 
 
 @dataclass
@@ -35,7 +36,15 @@ class OpenEvaluation:
 class Run:
     """One incarnation of a run, new or continued."""
 
-    def __init__(self, journal: Journal, settings: RunSettings, limits: LimitsConfig, fleet: Fleet, now: float) -> None:
+    def __init__(
+        self,
+        journal: Journal,
+        settings: RunSettings,
+        limits: LimitsConfig,
+        fleet: Fleet,
+        now: float,
+        start: Start | None = None,
+    ) -> None:
         self.settings = settings
         self.limits = limits
         self.fleet = fleet
@@ -52,8 +61,11 @@ class Run:
         self._evolution = Evolution(
             EvolutionConfig(
                 settings.controller.size, settings.population, settings.sigma0, settings.covariance, settings.seed
-            )
+            ),
+            start.mean if start else None,
         )
+        if start:
+            journal.set_fact("start", start.source)
         self.opened = now
         self.generation = self._begin(now)
 
@@ -112,6 +124,12 @@ class Run:
         """Dispatch nothing more until the run is resumed."""
         self.paused = why
         self.fleet.paused = True
+
+    def resume(self) -> None:
+        """Go on; what failed is tried again anywhere."""
+        self.paused = None
+        self.fleet.paused = False
+        self.fleet.pardon()
 
     def take_closed(self) -> list[StoredGeneration]:
         """Generations closed since the last call."""

@@ -58,7 +58,7 @@ class Service:
         self._nonce = secrets.token_hex(8)
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._inbox = Inbox()
-        self._stopping = False
+        self._stopping = self._draining = False
 
     def stop(self) -> None:
         """End the loop soon; the run can be continued. Safe in a signal handler."""
@@ -128,17 +128,19 @@ class Service:
     def _loop(self, session: zenoh.Session) -> None:
         taken = monotonic()
         while not self._stopping and self._run.ended is None:
-            self._drain()
+            self._drain_events()
             now = monotonic()
             self._run.fleet.tick(now)
             self._run.advance(now)
             for send in self._run.fleet.dispatch(now):
                 session.put(keys.job(self._name, send.identity), self._batch(send), encoding=encoding(JobBatch))
             self._publish_closed(session)
+            if self._draining and not self._run.fleet.leased:
+                self.stop()
             if now - taken >= SNAPSHOT_INTERVAL:
                 self._snapshot, taken = self._take_snapshot(), now
 
-    def _drain(self) -> None:
+    def _drain_events(self) -> None:
         """Handle what has arrived, waiting at most a tick for the first."""
         try:
             kind, event = self._events.get(timeout=TICK)
@@ -211,13 +213,27 @@ class Service:
         )
 
     def _control(self, query: zenoh.Query) -> None:
+        verbs: dict[str, Callable[[], None]] = {
+            "pause": lambda: self._run.pause("paused by hand"),
+            "resume": self._resume,
+            "drain": self._drain_run,
+            "stop": self.stop,
+        }
         with query:
             verb = str(query.key_expr).rsplit("/", 1)[-1]
-            if verb == "stop":
-                self.stop()
-            why = "" if verb == "stop" else f"{verb!r} is not a control verb that this version knows; it knows: stop"
+            why = "" if verb in verbs else f"{verb!r} is no control verb of this version; it knows: {', '.join(verbs)}"
+            if not why:
+                verbs[verb]()
             reply = ControlReply(v=keys.PROTOCOL_VERSION, run=self._name, accepted=not why, why=why)
             query.reply(query.key_expr, encode_json(reply), encoding="application/json")
+
+    def _resume(self) -> None:
+        self._draining = False
+        self._run.resume()
+
+    def _drain_run(self) -> None:
+        self._draining = True
+        self._run.pause("draining")
 
     def _batch(self, send: Send) -> bytes:
         content = send.content

@@ -6,9 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from common.runs import open_run
+from coordinator.start import latest
 from tests.support import tasks
 from tests.support.processes import environment, free_port
 
@@ -150,3 +152,54 @@ def test_a_foreign_coordinator_on_the_same_network_is_refused(processes, setting
     )  # fmt: skip
     assert code != 0
     assert "has a live coordinator already" in err
+
+
+def test_pause_resume_and_drain_from_the_command_line(processes, settings):
+    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 500)
+    processes.worker("--task", tasks.SLOW_TOY)
+    coordinator.wait_for("generation 0: mean")
+
+    def say(*words):
+        code, out, err = processes.call(*words, "--connect", processes.endpoint)
+        assert code == 0, err
+        return out
+
+    assert "is paused" in say("pause")
+    assert processes.status()["state"] == "paused"
+    assert "goes on" in say("resume", "test")
+    coordinator.wait_for("generation", times=2)
+    assert "draining" in say("drain", "test")
+    code, _ = coordinator.finish()
+    assert code == 130
+    with open_run(processes.runs, "test") as run:
+        assert run.ended is None
+        number = len(run.history())
+        assert len([each for i in range(4) for each in run.results(number, i)]) <= 8
+
+
+def test_a_fork_begins_where_its_run_was_and_may_change_what_is_frozen(processes, settings, tmp_path):
+    first = processes.coordinator(*settings, "--task", tasks.TOY, "--generations", 3)
+    processes.worker("--task", tasks.TOY, "--exit-when-done")
+    assert first.finish()[0] == 0
+    common = ("--runs-dir", processes.runs, "--listen", processes.endpoint, "--generations", 1, "--beat", "0.2")
+    fork = processes.start("fork", "test", "--population", 6, *common)
+    processes.worker("--task", tasks.TOY, "--run", "test-fork")
+    assert fork.finish()[0] == 0
+    with open_run(processes.runs, "test") as one, open_run(processes.runs, "test-fork") as other:
+        before, sigma = latest(one)
+        start = other.history()[0]
+        assert other.settings.population == 6
+        assert start.sigma == pytest.approx(sigma)
+        population = np.stack([other.candidate(0, i) for i in range(6)])
+        assert np.abs(population - before).max() < 6 * sigma
+        assert np.abs(before).max() > 0
+    from_controller = processes.start("coordinator", "--run", "third", "--init", "test", *settings, "--task", tasks.TOY,
+                                      *common)  # fmt: skip
+    processes.worker("--task", tasks.TOY, "--run", "third")
+    assert from_controller.finish()[0] == 0
+
+
+def test_parameters_of_another_world_model_are_no_beginning(processes, settings):
+    code, _, err = processes.call("coordinator", "--runs-dir", processes.runs, *settings, "--init", "tiny")
+    assert code != 0
+    assert "belongs to the world model" in err

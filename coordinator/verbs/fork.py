@@ -1,0 +1,35 @@
+"""`dreamfleet fork`: a new run that begins where another one is."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from common.runs import default_runs_dir
+
+SUMMARY = "start a new run from another one's mean and step size; any setting may change"
+EXTRAS = ()
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    from coordinator.verbs.coordinator import add_settings
+
+    parser.add_argument("source", metavar="RUN", help="the run to begin from; it is only read")
+    parser.add_argument("--run", dest="run_name", help="name of the new run (default RUN-fork)")
+    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+    add_settings(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the new run until it ends."""
+    from common.runs import open_run
+    from coordinator.config import settings_of
+    from coordinator.start import latest, start_of
+    from coordinator.verbs.coordinator import serve
+
+    with open_run(args.runs_dir, args.source) as stored:
+        start, (_, sigma) = start_of(stored), latest(stored)
+        settings = {**settings_of(stored.settings, stored.bundle_path), "sigma0": sigma}
+    args.run_name = args.run_name or f"{args.source}-fork"
+    return serve(args, settings, start)
