@@ -1,0 +1,219 @@
+"""Measuring the coordinator: how near to ideal it keeps its slots busy, and how many jobs a second it can judge."""
+
+from __future__ import annotations
+
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from common.errors import DreamfleetError
+from common.runs import open_run
+from worker.bench.crowd import serve_crowd
+from worker.bench.naps import NAP_SECONDS, NAPS, NULLS
+
+SLOTS = 8
+CANDIDATES = 200
+GENERATIONS = 6  # the first is not counted: workers join in it
+NULL_JOBS = 4096  # a generation: 64 candidates x 64 episodes
+RUN_SECONDS = 300.0
+ROUNDS = -(-CANDIDATES // SLOTS)
+Figures = dict[str, Any]
+
+
+def bench_dispatch(crowd: int) -> Figures:
+    """50 ms jobs on 8 real slots, null jobs on simulated workers, `crowd` of these; peers where installed."""
+    naps, null = measure_naps(), measure_nulls()
+    peers: dict[str, Figures] = {}
+    for name, run in (("pool", pool_peer), ("dask", dask_peer), ("ray", ray_peer)):
+        if name == "pool" or find_spec({"dask": "distributed"}.get(name, name)):
+            peers[name] = peer_figures(run)
+    figures: Figures = {
+        "efficiency_50ms": round(naps, 4),
+        "null_jobs_per_second": round(null["jobs_per_second"]),
+        "coordinator_rss_mb": round(null["rss_mb"], 1),
+        "peers": peers,
+    }
+    if crowd:
+        figures["crowd"] = measure_crowd(crowd)
+    return figures
+
+
+def measure_naps() -> float:
+    """The ideal makespan of a generation of 50 ms jobs over the measured one, from real workers."""
+    with BenchRun(NAPS, CANDIDATES, 1) as run, run.workers("--task", NAPS, "--slots", SLOTS):
+        run.finish()
+        return ROUNDS * NAP_SECONDS / run.generation_seconds()
+
+
+def measure_nulls() -> Figures:
+    """Jobs a second that cost their workers nothing: two simulated workers of 32 slots each."""
+    with BenchRun(NULLS, 64, NULL_JOBS // 64) as run, run.crowd(2, 32):
+        run.finish()
+        return {"jobs_per_second": NULL_JOBS / run.generation_seconds(), "rss_mb": run.peak_mb}
+
+
+def measure_crowd(count: int) -> Figures:
+    """Simulated workers of one slot each join, work and leave."""
+    started = time.monotonic()
+    with BenchRun(NULLS, 64, NULL_JOBS // 64) as run, run.crowd(count, 1):
+        run.finish()
+        return {
+            "workers": count,
+            "seconds_in_all": round(time.monotonic() - started, 1),
+            "null_jobs_per_second": round(NULL_JOBS / run.generation_seconds()),
+            "coordinator_rss_mb": round(run.peak_mb, 1),
+        }
+
+
+class BenchRun:
+    """A real coordinator, in a process and a folder of its own, of a run that ends by itself."""
+
+    def __init__(self, task: str, population: int, episodes: int) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+        self.peak_mb = 0.0
+        self._arguments = (
+            "--listen", self.endpoint, "--task", task, "--population", population, "--episodes", episodes,
+            "--generations", GENERATIONS, "--evaluate-every", 0,
+        )  # fmt: skip
+
+    def __enter__(self) -> BenchRun:
+        with ExitStack() as stack:
+            self._runs = stack.enter_context(tempfile.TemporaryDirectory())
+            self._coordinator = stack.enter_context(
+                _process("coordinator", "--run", "bench", "--runs-dir", self._runs, *self._arguments)
+            )
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._stack.close()
+
+    def workers(self, *arguments: object) -> AbstractContextManager[object]:
+        """A real worker."""
+        return _process("worker", "--connect", self.endpoint, *arguments)
+
+    @contextmanager
+    def crowd(self, count: int, slots: int) -> Iterator[None]:
+        """Simulated workers, in one process."""
+        process = get_context("spawn").Process(target=serve_crowd, args=(self.endpoint, count, slots), daemon=True)
+        process.start()
+        try:
+            yield
+        finally:
+            process.kill()
+            process.join()
+
+    def finish(self) -> None:
+        """Wait for the run's end."""
+        deadline = time.monotonic() + RUN_SECONDS
+        while self._coordinator.poll() is None:
+            self.peak_mb = max(self.peak_mb, _resident_mb(self._coordinator.pid))
+            if time.monotonic() > deadline:
+                raise DreamfleetError(f"the run did not end within {RUN_SECONDS:g} s")
+            time.sleep(0.1)
+        if self._coordinator.returncode:
+            raise DreamfleetError("the run's coordinator failed")
+
+    def generation_seconds(self) -> float:
+        """The median makespan of a generation, without the first, in which workers join."""
+        with open_run(Path(self._runs), "bench") as run:
+            return statistics.median(each.seconds for each in run.history()[1:])
+
+
+@contextmanager
+def _process(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "-m", "common.cli", *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603 - our own
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.wait(5)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _resident_mb(pid: int) -> float:
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
+# ---- peers: the same work ----
+
+
+def nap(_index: int) -> int:
+    """A 50 ms job."""
+    time.sleep(NAP_SECONDS)
+    return 0
+
+
+def nothing(_index: int) -> int:
+    """A null job."""
+    return 0
+
+
+Mapper = Callable[[Callable[[int], int], int], object]
+
+
+def peer_figures(peer: Callable[[], AbstractContextManager[Mapper]]) -> Figures:
+    """The same two measures of a peer with 8 processes."""
+    with peer() as run:
+        run(nothing, 100)  # its processes are up
+        started = time.perf_counter()
+        run(nap, CANDIDATES)
+        makespan = time.perf_counter() - started
+        started = time.perf_counter()
+        run(nothing, NULL_JOBS)
+        null = time.perf_counter() - started
+    return {
+        "efficiency_50ms": round(ROUNDS * NAP_SECONDS / makespan, 4),
+        "null_jobs_per_second": round(NULL_JOBS / null),
+    }
+
+
+@contextmanager
+def pool_peer() -> Iterator[Mapper]:
+    """The standard library's pool, a job a message."""
+    with get_context("spawn").Pool(SLOTS) as pool:
+        yield lambda work, count: pool.map(work, range(count), chunksize=1)
+
+
+@contextmanager
+def dask_peer() -> Iterator[Mapper]:
+    """A local Dask cluster."""
+    from distributed import Client as DaskClient
+    from distributed import LocalCluster
+
+    with (
+        LocalCluster(n_workers=SLOTS, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        DaskClient(cluster) as client,
+    ):
+        yield lambda work, count: client.gather(client.map(work, range(count), pure=False))
+
+
+@contextmanager
+def ray_peer() -> Iterator[Mapper]:
+    """A local Ray."""
+    import ray
+
+    ray.init(num_cpus=SLOTS, include_dashboard=False, log_to_driver=False)
+    try:
+        yield lambda work, count: ray.get([ray.remote(work).remote(index) for index in range(count)])
+    finally:
+        ray.shutdown()
