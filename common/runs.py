@@ -169,6 +169,10 @@ class RunFolder:
         query = f"SELECT {_RESULT} FROM result WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"  # noqa: S608
         return [StoredResult(*row) for row in self._all(query, kind, generation, number)]
 
+    def result_count(self) -> int:
+        """Accepted results of every kind."""
+        return int(self._one("SELECT count(*) FROM result")[0])
+
     def history(self) -> list[StoredGeneration]:
         """Every closed generation, oldest first."""
         query = "SELECT number, mean, std, best, worst, sigma, steps, seconds FROM generation WHERE closed IS NOT NULL"

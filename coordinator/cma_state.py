@@ -60,6 +60,11 @@ def mean_and_sigma(arrays: dict[str, NDArray[Any]]) -> tuple[NDArray[np.float64]
     return arrays["mean"].astype(np.float64), float(_untag(about["sigma"]))
 
 
+def untold(arrays: dict[str, NDArray[Any]]) -> bool:
+    """Whether the strategy was never told anything: it lacks the parts that the first tell makes."""
+    return int(_untag(json.loads(str(arrays["about"]))["countiter"])) == 0
+
+
 def pack(arrays: dict[str, NDArray[Any]]) -> bytes:
     """Arrays as one `.npz`."""
     buffer = io.BytesIO()

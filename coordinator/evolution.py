@@ -56,10 +56,11 @@ class Evolution:
     def __init__(self, config: EvolutionConfig, start: NDArray[np.float64] | None = None) -> None:
         self._config = config
         self._normals = Normals(config.seed)
-        self._strategy = cma.CMAEvolutionStrategy(
-            np.zeros(config.dimension) if start is None else start, config.sigma0, self._options()
-        )
+        self._begin(np.zeros(config.dimension) if start is None else start)
         self._asked: list[NDArray[np.float64]] = []
+
+    def _begin(self, mean: NDArray[np.float64]) -> None:
+        self._strategy = cma.CMAEvolutionStrategy(mean, self._config.sigma0, self._options())
 
     def _options(self) -> dict[str, object]:
         return {
@@ -105,8 +106,13 @@ class Evolution:
         written, installed = str(arrays.pop("cma")), version("cma")
         if written != installed:
             raise JournalError(f"this run was written with cma {written}: pip install cma=={written} (now {installed})")
-        # pycma builds some of its parts at the first ask and tell; they must be there to be overwritten.
-        self.ask()
-        self.tell(np.arange(self._config.population, dtype=np.float64))
-        self._normals.generator.bit_generator.state = json.loads(str(arrays.pop("random")))
-        cma_state.restore(self._strategy, arrays)
+        random = json.loads(str(arrays.pop("random")))
+        if cma_state.untold(arrays):
+            mean, _ = cma_state.mean_and_sigma(arrays)
+            self._begin(mean)
+        else:
+            # pycma builds some of its parts at the first ask and tell; they must be there to be overwritten.
+            self.ask()
+            self.tell(np.arange(self._config.population, dtype=np.float64))
+            cma_state.restore(self._strategy, arrays)
+        self._normals.generator.bit_generator.state = random

@@ -54,6 +54,7 @@ class Fleet:
         self._queue: list[tuple[bool, int, bytes]] = []  # evaluations last, then in order of offer
         self._orders = 0
         self._evaluating = 0  # evaluations that somebody holds
+        self._failing: dict[bytes, Wanted] = {}  # those of the wanted that failed somewhere
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this one and the last
         self._tail = Tail(beat)
         self._ticked: float | None = None
@@ -182,26 +183,28 @@ class Fleet:
     @property
     def failures(self) -> list[tuple[Work, dict[str, str]]]:
         """Wanted jobs that failed somewhere, with each worker's error."""
-        return [(wanted.work, dict(wanted.failed)) for wanted in self._wanted.values() if wanted.failed]
+        return [(wanted.work, dict(wanted.failed)) for wanted in self._failing.values()]
 
     def poison(self) -> tuple[Work, dict[str, str]] | None:
         """A job that failed on two different workers, or again and again on the only one there is."""
-        for wanted in self._wanted.values():
+        for wanted in self._failing.values():
             if len(wanted.failed) > 1 or any(count >= ATTEMPTS for count in wanted.attempts.values()):
                 return wanted.work, dict(wanted.failed)
         return None
 
     def pardon(self) -> None:
         """Forget what failed."""
-        for wanted in self._wanted.values():
+        for wanted in self._failing.values():
             wanted.failed.clear()
             wanted.attempts.clear()
+        self._failing.clear()
 
     def _judge(self, identity: str, result: Result) -> tuple[VerdictWord, Work | None]:
         wanted = self._wanted.get(result.digest)
         if wanted is None:
             return ("duplicate" if result.digest in self._accepted else "obsolete"), None
         if result.fitness is None:
+            self._failing[result.digest] = wanted
             wanted.attempts[identity] += 1
             wanted.failed[identity] = result.error or "no fitness and no reason"
             self.counts["errors"] += 1
@@ -215,6 +218,7 @@ class Fleet:
 
     def _unwant(self, digest: bytes) -> None:
         wanted = self._wanted.pop(digest)
+        self._failing.pop(digest, None)
         self._tags.pop(digest[:TAG_BYTES], None)
         for holder in list(wanted.holders):
             lease = self.members[holder].leases.pop(digest, None)

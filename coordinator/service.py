@@ -43,6 +43,7 @@ from coordinator.status import PARTS, Snapshot, take_snapshot
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a loss waits to be acted upon
 DRAIN = 256  # events that share one commit at most
+LINGER = 0.005  # seconds that a commit waits for more to share it
 SNAPSHOT_INTERVAL = 0.2
 
 
@@ -141,18 +142,14 @@ class Service:
                 self._snapshot, taken = self._take_snapshot(), now
 
     def _drain_events(self) -> None:
-        """Handle what has arrived, waiting at most a tick for the first."""
+        """Handle what has arrived, waiting at most a tick for the first; what follows closely shares its commit."""
         try:
-            kind, event = self._events.get(timeout=TICK)
+            self._handle(*self._events.get(timeout=TICK))
+            until = monotonic() + LINGER
+            for _ in range(DRAIN):
+                self._handle(*self._events.get(timeout=max(until - monotonic(), 0.0)))
         except queue.Empty:
-            return
-        for _ in range(DRAIN):
-            self._handle(kind, event)
-            try:
-                kind, event = self._events.get_nowait()
-            except queue.Empty:
-                return
-        self._handle(kind, event)
+            pass
 
     def _handle(self, kind: str, event: Any) -> None:
         now = monotonic()

@@ -38,13 +38,14 @@ def test_a_continued_strategy_equals_one_that_never_stopped(covariance, checkpoi
     assert np.array_equal(second.ask(), uninterrupted.ask())
 
 
-def test_a_checkpoint_continues_at_the_real_size():
+@pytest.mark.parametrize("checkpoint", [0, 1, 5])
+def test_a_checkpoint_continues_at_the_real_size(checkpoint):
     uninterrupted, first = (Evolution(config(dimension=867, population=16)) for _ in range(2))
     run(uninterrupted, range(10))
-    run(first, range(5))
+    run(first, range(checkpoint))
     second = Evolution(config(dimension=867, population=16))
     second.restore(first.state())
-    run(second, range(5, 10))
+    run(second, range(checkpoint, 10))
     assert np.array_equal(second.mean, uninterrupted.mean)
 
 

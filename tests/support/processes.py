@@ -108,8 +108,8 @@ class Processes:
         process.wait_for("incarnation")
         return process
 
-    def worker(self, *arguments):
-        return self.start("worker", "--connect", self.endpoint, "--slots", "1", *arguments)
+    def worker(self, *arguments, endpoint=None):
+        return self.start("worker", "--connect", endpoint or self.endpoint, "--slots", "1", *arguments)
 
     def call(self, *arguments, timeout=DEADLINE):
         """Run a verb to its end: exit code, stdout, stderr."""

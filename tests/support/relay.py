@@ -1,8 +1,9 @@
-"""A TCP relay whose connections a test can cut."""
+"""A TCP relay whose connections a test can cut, slow down, or hold."""
 
 import socket
 import struct
 import threading
+import time
 from contextlib import suppress
 
 from tests.support.processes import free_port
@@ -14,13 +15,24 @@ class Relay:
     """Passes connections on to a port of this host."""
 
     def __init__(self, target):
+        self.delay = 0.0  # seconds that every piece takes
         self._target = target
+        self._flowing = threading.Event()
+        self._flowing.set()
         self._pairs = []
         self.port = free_port()
         self.endpoint = f"tcp/127.0.0.1:{self.port}"
         self._server = socket.create_server(("127.0.0.1", self.port))
         self._threads = []
         self._run(self._accept)
+
+    def hold(self):
+        """Pass nothing on, without a word to either side."""
+        self._flowing.clear()
+
+    def release(self):
+        """Go on; nothing that was held is lost."""
+        self._flowing.set()
 
     def cut(self):
         """End every connection; new ones are let through."""
@@ -32,6 +44,7 @@ class Relay:
 
     def close(self):
         self._server.shutdown(socket.SHUT_RDWR)
+        self.release()
         self.cut()
         for thread in self._threads:
             thread.join()
@@ -43,19 +56,24 @@ class Relay:
                 near, _ = self._server.accept()
             except OSError:
                 return
-            far = socket.create_connection(("127.0.0.1", self._target))
+            try:
+                far = socket.create_connection(("127.0.0.1", self._target))
+            except OSError:  # nobody listens there now
+                near.close()
+                continue
             self._pairs.append((near, far))
             for source, sink in ((near, far), (far, near)):
-                self._run(_pump, source, sink)
+                self._run(self._pump, source, sink)
 
     def _run(self, target, *arguments):
         self._threads.append(threading.Thread(target=target, args=arguments, daemon=True))
         self._threads[-1].start()
 
-
-def _pump(source, sink):
-    with source, suppress(OSError):
-        while data := source.recv(65536):
-            sink.sendall(data)
-    with suppress(OSError):
-        sink.shutdown(socket.SHUT_RDWR)
+    def _pump(self, source, sink):
+        with source, suppress(OSError):
+            while data := source.recv(65536):
+                time.sleep(self.delay)
+                self._flowing.wait()
+                sink.sendall(data)
+        with suppress(OSError):
+            sink.shutdown(socket.SHUT_RDWR)

@@ -3,15 +3,17 @@
 import os
 import signal
 import time
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
 MODULE = "tests.support.tasks"
-TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, JUDGED = (
-    f"{MODULE}:{name}" for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Judged")
+TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, JUDGED, COUNTED = (
+    f"{MODULE}:{name}" for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Judged", "Counted")
 )
+STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
 
 
 class ToyEnvironment(gymnasium.Env):
@@ -122,3 +124,30 @@ class Judged(Toy):
 
     def make_judge(self):
         return gymnasium.wrappers.TransformReward(self.make_environment(), lambda reward: reward + 100)
+
+
+class Counted(Toy):
+    """Every step that any process ever makes is counted in a file that outlives it."""
+
+    name = COUNTED
+
+    def make_environment(self):
+        return CountedEnvironment(0.001)
+
+
+class CountedEnvironment(ToyEnvironment):
+    def __init__(self, seconds):
+        super().__init__(seconds)
+        file = (Path(os.environ[STEPS_FOLDER]) / f"{os.getpid()}-{time.monotonic_ns()}").open("w+b")
+        file.write(bytes(8))
+        file.flush()
+        self._made = np.memmap(file, np.uint64, "r+", shape=(1,))
+
+    def step(self, action):
+        self._made[0] += 1
+        return super().step(action)
+
+
+def steps_made(folder):
+    """By all processes together."""
+    return sum(int.from_bytes(path.read_bytes(), "little") for path in Path(folder).iterdir())
