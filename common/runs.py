@@ -40,6 +40,7 @@ class RunSettings:
     seed: Count
     evaluate_every: Count  # generations; 0: never
     evaluation_episodes: Annotated[int, Between(1, 10**4)]
+    racing: bool = False  # only the better half of the candidates drives the second half of the episodes
 
     def to_json(self) -> str:
         """The text kept in the journal."""
@@ -49,8 +50,8 @@ class RunSettings:
     def from_json(cls, text: str) -> RunSettings:
         """Read what `to_json` wrote; `JournalError` if it is damaged."""
         try:
-            return from_plain(cls, json.loads(text))
-        except (ValueError, MalformedError) as error:
+            return from_plain(cls, {"racing": False, **json.loads(text)})
+        except (ValueError, TypeError, MalformedError) as error:
             raise JournalError(f"the journal's settings are damaged: {error}") from error
 
 

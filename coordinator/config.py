@@ -23,6 +23,7 @@ class RunConfig:
     episodes: int = option(2, "episodes a candidate, on the same fresh tracks for all")
     sigma0: float = option(0.1, "first step size")
     covariance: Literal["diagonal", "full"] = option("diagonal", "the model of CMA-ES")
+    racing: bool = option(False, "let only the better half of the candidates drive the second half of the episodes")
     horizon: int = option(1000, "steps of a scored episode at most")
     patience: int = option(0, "cut a scored episode after so many steps without reward; 0: never")
     seed: int = option(1, "makes the run: population and tracks follow from it")
@@ -34,6 +35,8 @@ class RunConfig:
         for name, least in {**bounds, "evaluation_episodes": 1}.items():
             if getattr(self, name) < least:
                 raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
+        if self.racing and self.episodes < 2:
+            raise UsageError("--racing needs at least 2 episodes: there is no second half of one")
         if not 0 < self.sigma0 < float("inf"):
             raise UsageError(f"--sigma0 must be a positive number, not {self.sigma0}")
 
@@ -49,6 +52,7 @@ class RunConfig:
             seed=self.seed,
             evaluate_every=self.evaluate_every,
             evaluation_episodes=self.evaluation_episodes,
+            racing=self.racing,
         )
 
 

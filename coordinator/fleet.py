@@ -60,6 +60,7 @@ class Fleet:
         self._ticked: float | None = None
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
+        self.notes: list[str] = []  # what happened to workers, for whoever writes it down and clears it
         self.hurry = False  # nothing but evaluations is left to wait for
         self.paused = False
 
@@ -139,10 +140,12 @@ class Fleet:
                 self._extend(member, gap)
             if member.lost is not None:
                 if now - max(member.lost, member.heard) >= DEPARTURE_GRACE:
+                    self._note(member, "left")
                     self._release(member)
                     del self.members[member.identity]
             elif not member.silent and now - member.heard > SILENT_BEATS * self._beat:
                 member.silent = True
+                self._note(member, "is silent")
                 self.counts["silences"] += 1
                 self._release(member)
 
@@ -271,6 +274,9 @@ class Fleet:
         if not wanted.holders:
             self.counts["reissued"] += 1
             self._enqueue(digest)
+
+    def _note(self, member: Member, what: str) -> None:
+        self.notes.append(f"worker {member.identity} {what}: {len(member.leases)} jobs are free again")
 
     def _release(self, member: Member) -> None:
         for digest in list(member.leases):

@@ -12,9 +12,15 @@ from coordinator.jobs import Work, make_work
 
 
 class Generation:
-    """Which candidate's which episode each digest is, and its fitness once known."""
+    """Which candidate's which episode each digest is, and its fitness once known.
 
-    def __init__(self, number: int, spec: TaskSpec, vectors: Sequence[bytes], seeds: Sequence[int]) -> None:
+    With `racing` every candidate drives the first half of the episodes, and after this barrier the better half of the
+    candidates the others; of equals the one with the lower index goes on.
+    """
+
+    def __init__(
+        self, number: int, spec: TaskSpec, vectors: Sequence[bytes], seeds: Sequence[int], *, racing: bool = False
+    ) -> None:
         self.number = number
         self.work = [
             work
@@ -26,13 +32,17 @@ class Generation:
         for work in self.work:
             self._places.setdefault(work.job.digest, []).append((work.job.candidate, work.job.episode))
         self._scores = np.full((len(vectors), len(seeds)), np.nan)
+        self._first = -(-len(seeds) // 2) if racing else len(seeds)
+        self._wanted = np.zeros(self._scores.shape, dtype=bool)
+        self._wanted[:, : self._first] = True
         self.steps = 0
 
     @property
     def missing(self) -> list[Work]:
-        """Jobs without a result, each digest once, candidate by candidate."""
+        """Wanted jobs without a result, each digest once, candidate by candidate."""
         first = {work.job.digest: work for work in reversed(self.work)}
-        return [first[digest] for digest, places in self._places.items() if np.isnan(self._scores[places[0]])]
+        open_places = self._wanted & np.isnan(self._scores)
+        return [first[digest] for digest, places in self._places.items() if any(open_places[each] for each in places)]
 
     @property
     def done(self) -> int:
@@ -41,20 +51,29 @@ class Generation:
 
     @property
     def total(self) -> int:
-        """Episodes wanted."""
-        return self._scores.size
+        """Episodes wanted, as far as that is known."""
+        return int((self._wanted | np.isfinite(self._scores)).sum())
 
     @property
     def complete(self) -> bool:
-        """Whether every episode is scored."""
+        """Whether every wanted episode is scored."""
         return self.done == self.total
 
-    def record(self, digest: bytes, fitness: float, steps: int) -> None:
-        """Take one accepted result of this generation."""
+    def record(self, digest: bytes, fitness: float, steps: int) -> bool:
+        """Take one accepted result of this generation; whether it opened the second stage."""
         for place in self._places[digest]:
             self._scores[place] = fitness
         self.steps += steps
+        return self._pass_barrier()
 
     def fitness(self) -> NDArray[np.float64]:
-        """What the strategy is told `(population,)`: the mean of each candidate's episodes."""
-        return np.asarray(self._scores.mean(axis=1))
+        """What the strategy is told `(population,)`: the mean of each candidate's own episodes."""
+        return np.asarray(np.nanmean(self._scores, axis=1))
+
+    def _pass_barrier(self) -> bool:
+        first = self._scores[:, : self._first]
+        if self._first == self._scores.shape[1] or self._wanted[:, self._first :].any() or np.isnan(first).any():
+            return False
+        better = np.argsort(-first.mean(axis=1), kind="stable")[: -(-len(first) // 2)]
+        self._wanted[better, self._first :] = True
+        return True

@@ -178,7 +178,7 @@ class Run:
                 "journal holds; use the host and package versions that wrote it"
             )
         self.history, self.evaluations = self._journal.closed()
-        generation = Generation(last.number, self.settings.task, last.vectors, last.seeds)
+        generation = Generation(last.number, self.settings.task, last.vectors, last.seeds, racing=self.settings.racing)
         for digest, (fitness, steps) in self._journal.results_of("score", last.number).items():
             generation.record(digest, fitness, steps)
         for evaluation in self._journal.pending_evaluations():
@@ -196,7 +196,7 @@ class Run:
         vectors = [travelling(x) for x in self._evolution.ask()]
         seeds = [training_seed(self.settings.seed, number, episode) for episode in range(self.settings.episodes)]
         self._journal.open_generation(number, state, sigma, seeds, vectors)
-        generation = Generation(number, self.settings.task, vectors, seeds)
+        generation = Generation(number, self.settings.task, vectors, seeds, racing=self.settings.racing)
         self.opened = now
         self.fleet.forget(before=number - 1)
         self.fleet.offer(generation.missing)
@@ -243,7 +243,8 @@ class Run:
 
     def _score(self, result: Result) -> None:
         assert result.fitness is not None
-        self.generation.record(result.digest, result.fitness, result.steps)
+        if self.generation.record(result.digest, result.fitness, result.steps):
+            self.fleet.offer(self.generation.missing)
 
     def _evaluated(self, generation: int, result: Result) -> None:
         assert result.fitness is not None

@@ -136,10 +136,17 @@ class Service:
             for send in self._run.fleet.dispatch(now):
                 session.put(keys.job(self._name, send.identity), self._batch(send), encoding=encoding(JobBatch))
             self._publish_closed(session)
+            self._write_notes()
             if self._draining and not self._run.fleet.leased:
                 self.stop()
             if now - taken >= SNAPSHOT_INTERVAL:
                 self._snapshot, taken = self._take_snapshot(), now
+
+    def _write_notes(self) -> None:
+        notes = self._run.fleet.notes
+        for note in notes:
+            log.info("%s", note)
+        notes.clear()
 
     def _drain_events(self) -> None:
         """Handle what has arrived, waiting at most a tick for the first; what follows closely shares its commit."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import queue
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +41,17 @@ def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: I
         names = ", ".join(sorted(reply.run for reply in replies))
         raise UsageError(f"several runs are live: choose one with --run: {names}")
     return _admission(replies[0])
+
+
+def neediest(session: zenoh.Session) -> str | None:
+    """The live run that works with the fewest slots; of equals the first by name."""
+    found = []
+    for payload in _get(session, keys.status("*"), b""):
+        with suppress(ValueError, KeyError, TypeError):  # what answers need not be of this version
+            document = json.loads(payload)
+            if document["state"] not in ("ended", "paused"):
+                found.append((int(document["slots"]), str(document["run"])))
+    return min(found)[1] if found else None
 
 
 def make_request(worker: str, tasks: tuple[str, ...], slots: int) -> HelloRequest:

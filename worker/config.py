@@ -18,6 +18,7 @@ class WorkerConfig:
     name: str | None = option(None, "name of this worker (default: the host's)")
     slots: int = option(0, "scoring processes; 0: one a core")
     drain_timeout: float = option(30.0, "seconds that running episodes may take after the first Ctrl-C")
+    any: bool = option(False, "serve whichever live run has the fewest slots, and the next one when it is over")
     lifetime: float = option(0.0, "leave by itself after so many seconds, as at the first Ctrl-C; 0: never")
     slot_memory: int = option(
         2048, "MiB of a scoring process; one that holds more is replaced between jobs; 0: no limit"
@@ -27,6 +28,8 @@ class WorkerConfig:
     def __post_init__(self) -> None:
         if self.run is not None:
             check_run_name(self.run)
+        if self.any and self.run is not None:
+            raise UsageError("--any and --run exclude each other")
         if not 0 <= self.slots <= MAX_LEASES:
             raise UsageError(f"--slots must be from 0 to {MAX_LEASES}, not {self.slots}")
         for name in ("drain_timeout", "lifetime", "slot_memory"):

@@ -24,7 +24,7 @@ from common.errors import ConnectionFailedError, RefusedError
 from common.fingerprint import fingerprint
 from common.messages import MAX_LEASES, TAG_BYTES, Beat, JobBatch, Result, ResultBatch, Running
 from common.session import Network, enqueue_into, open_session
-from worker.admission import Admission, ask, make_request
+from worker.admission import Admission, ask, make_request, neediest
 from worker.backlog import Backlog
 from worker.bundle_fetch import obtain
 from worker.config import WorkerConfig
@@ -70,13 +70,20 @@ class Worker:
             if session is None:
                 return
             stack.callback(session.close)
-            admission = self._join(session)
-            if admission is None:
-                return
-            self._admission = admission
-            bundle = self._obtain_bundle(session)
-            if bundle is None:
-                return
+            self._leave_at = monotonic() + (self._config.lifetime or math.inf)
+            while (admission := self._join(session)) is not None:
+                self._admission = admission
+                self._serve_run(session)
+                if self._stops or not self._config.any or monotonic() >= self._leave_at:
+                    return
+
+    def _serve_run(self, session: zenoh.Session) -> None:
+        """Work for the joined run until it is over, or until this worker leaves."""
+        admission = self._admission
+        bundle = self._obtain_bundle(session)
+        if bundle is None:
+            return
+        with ExitStack() as stack:
             stack.callback(self._stop_slots)
             self._slots = [
                 Slot(number, admission.spec, bundle.path, self._events, self._config.slot_memory << 20)
@@ -84,6 +91,7 @@ class Worker:
             ]
             self._backlog = Backlog(admission.spec)
             self._outbox = Outbox(admission.intervals.repeat)
+            self._coordinators, self._parted = set(), False
             declared = self._declare(session)
             log.info("joined run %s as %s, %d slots", admission.run, self.identity, self._slot_count)
             self._loop(session)
@@ -108,7 +116,8 @@ class Worker:
         said = False
         request = make_request(self.identity, self._tasks, self._slot_count)
         while not self._stops:
-            admission = ask(session, self._config.run, request, self.inbox)
+            run = neediest(session) if self._config.any else self._config.run
+            admission = ask(session, run, request, self.inbox) if run or not self._config.any else None
             if admission is not None:
                 return admission
             if not said:
@@ -145,7 +154,7 @@ class Worker:
         self._quiet_since = now = monotonic()
         self._alone_since: float | None = now  # until a coordinator's token says otherwise
         self._beat_at, self._rate, self._counted = now, 0.0, (now, 0)
-        drain_until, leave_at = None, now + (self._config.lifetime or math.inf)
+        drain_until = None
         while not self._left(drain_until):
             before = now
             self._wait()
@@ -153,7 +162,7 @@ class Worker:
             gap = now - before if now - before > CLOCK_GAP else 0.0
             for slot in self._slots:
                 slot.check(now, gap)
-            if (self._stops or now >= leave_at) and drain_until is None:
+            if (self._stops or now >= self._leave_at) and drain_until is None:
                 drain_until = now + self._config.drain_timeout
                 self._backlog.clear()
                 log.info("draining: running episodes finish, queued jobs go back")
@@ -174,7 +183,8 @@ class Worker:
             busy = any(slot.job is not None for slot in self._slots) or len(self._outbox)
             return not busy or monotonic() > drain_until
         alone = self._alone_since
-        return self._config.exit_when_done and alone is not None and monotonic() - alone > GONE
+        leaves = self._config.exit_when_done or self._config.any
+        return leaves and alone is not None and monotonic() - alone > GONE
 
     def _wait(self) -> None:
         """Handle what has arrived, waiting until the next beat or repetition at most."""

@@ -34,6 +34,34 @@ def test_equal_candidates_share_one_job():
     assert np.array_equal(generation.fitness(), [3.0, 3.0])
 
 
+def race(order, scores):
+    """A racing generation of three candidates and three episodes, its first stage answered in this order."""
+    generation = Generation(0, SPEC, VECTORS, (100, 200, 300), racing=True)
+    first = generation.missing
+    opened = [generation.record(first[i].job.digest, scores[first[i].job.candidate], steps=1) for i in order]
+    return generation, first, opened
+
+
+@pytest.mark.parametrize("order", [range(6), reversed(range(6)), (3, 0, 5, 1, 4, 2)])
+def test_the_second_half_is_driven_by_the_better_half_after_the_barrier(order):
+    generation, first, opened = race(order, [1.0, 5.0, 3.0])
+    assert [(work.job.candidate, work.job.episode) for work in first] == [(c, e) for c in range(3) for e in range(2)]
+    assert opened == [False] * 5 + [True]
+    second = generation.missing
+    assert [(work.job.candidate, work.job.episode) for work in second] == [(1, 2), (2, 2)]
+    assert not generation.complete
+    for work in second:
+        assert not generation.record(work.job.digest, 8.0, steps=1)
+    assert generation.complete
+    assert generation.done == generation.total == 8
+    assert np.array_equal(generation.fitness(), [1.0, 6.0, 14 / 3])
+
+
+def test_of_equals_the_first_go_on():
+    generation, _, _ = race(range(6), [2.0, 2.0, 2.0])
+    assert [work.job.candidate for work in generation.missing] == [0, 1]
+
+
 @pytest.mark.parametrize(
     ("kind", "vector", "seeds"),
     [("evaluate", VECTORS[0], (1,)), ("score", VECTORS[1], (1,)), ("score", VECTORS[0], (2,))],

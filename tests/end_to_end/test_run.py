@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -203,3 +204,47 @@ def test_parameters_of_another_world_model_are_no_beginning(processes, settings)
     code, _, err = processes.call("coordinator", "--runs-dir", processes.runs, *settings, "--init", "tiny")
     assert code != 0
     assert "belongs to the world model" in err
+
+
+def test_a_race_that_is_stopped_between_its_stages_equals_one_that_is_not(processes, settings):
+    flags = (*settings[:4], "--episodes", 4, "--evaluate-every", 0, "--racing", "--task", tasks.SLOW_TOY)
+    whole = processes.coordinator(*flags, "--generations", 2, name="whole")
+    processes.worker("--task", tasks.SLOW_TOY, "--run", "whole", "--slots", 2)
+    assert whole.finish()[0] == 0
+    parts = processes.coordinator(*flags, "--generations", 2, name="parts")
+    processes.worker("--task", tasks.SLOW_TOY, "--run", "parts", "--slots", 2)
+    with open_run(processes.runs, "parts") as run:
+        while run.result_count() < 9:
+            time.sleep(0.01)  # the first stage is 8 episodes, the second 4
+    parts.popen.send_signal(signal.SIGKILL)
+    again = processes.start(
+        "coordinator", "--resume", "parts", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+        "--beat", "0.2", "--generations", 2,
+    )  # fmt: skip
+    assert again.finish()[0] == 0
+    assert history(processes, "parts") == history(processes, "whole")
+    with open_run(processes.runs, "whole") as run:
+        assert sorted(len(run.results(0, i)) for i in range(4)) == [2, 2, 4, 4]
+
+
+def test_several_runs_on_one_router_never_see_each_other_and_a_worker_serves_the_neediest(processes, settings):
+    """The second coordinator connects to the first one's router."""
+    first = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 9, name="first")
+    second = processes.start(
+        "coordinator", "--run", "second", "--runs-dir", processes.runs, "--connect", processes.endpoint,
+        *settings, "--seed", 9, "--beat", "0.2", "--task", tasks.SLOW_TOY, "--generations", 3,
+    )  # fmt: skip
+    second.wait_for("incarnation")
+    workers = []
+    for number in range(2):
+        workers.append(processes.worker("--task", tasks.SLOW_TOY, "--any", "--name", f"any{number}"))
+        workers[-1].wait_for("joined run")
+        while not all(each["slots"] for each in processes.statuses()[: number + 1]):
+            pass
+    assert sorted(line.split("joined run ")[1].split()[0] for each in workers for line in each.lines
+                  if "joined run" in line) == ["first", "second"]  # fmt: skip
+    assert second.finish()[0] == 0
+    assert first.finish()[0] == 0
+    assert [number for number, *_ in history(processes, "second")] == [0, 1, 2]
+    with open_run(processes.runs, "first") as one, open_run(processes.runs, "second") as other:
+        assert one.results(0, 0)[0].worker != other.results(0, 0)[0].worker

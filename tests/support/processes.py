@@ -10,6 +10,8 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
+from common.client import Client
+
 ROOT = Path(__file__).parents[2]
 DEADLINE = 60
 
@@ -122,6 +124,11 @@ class Processes:
     def status(self):
         code, out, _ = self.call("status", "--connect", self.endpoint, "--json")
         return json.loads(out) if code == 0 else None
+
+    def statuses(self):
+        """Of every live run, those with most slots first."""
+        with Client((self.endpoint,)) as client:
+            return sorted((client.status(run) for run in client.runs()), key=lambda status: -status["slots"])
 
     def end(self):
         for process in self._started:

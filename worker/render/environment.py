@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import gymnasium
@@ -142,15 +142,27 @@ def score_text(text: str) -> NDArray[np.uint8]:
 
     The text lies within the window's first 125 columns, which are exactly twelve of the observation's.
     """
-    pygame.font.init()
-    font = pygame.font.Font(pygame.font.get_default_font(), 42)
-    image = font.render(text, True, (255, 255, 255), (0, 0, 0))
+    image = _write(text)
     place = image.get_rect()
     place.center = (60, int(car_racing.WINDOW_H - car_racing.WINDOW_H * 2.5 / 40.0))
     surface = pygame.Surface((TEXT_WIDTH, car_racing.WINDOW_H))
     surface.blit(image, place)
-    small = pygame.surfarray.array3d(pygame.transform.smoothscale(surface, (12, 96)))
-    return np.ascontiguousarray(small.transpose(1, 0, 2)[84:])
+    small = pygame.transform.smoothscale(surface, (12, 96))
+    return np.array(pygame.surfarray.pixels3d(small)[:, 84:].transpose(1, 0, 2), order="C")
+
+
+def _write(text: str) -> pygame.Surface:
+    try:
+        return _font().render(text, True, (255, 255, 255), (0, 0, 0))
+    except pygame.error:  # somebody closed a window, and with it pygame and its fonts
+        _font.cache_clear()
+        return _font().render(text, True, (255, 255, 255), (0, 0, 0))
+
+
+@cache
+def _font() -> pygame.font.Font:
+    pygame.font.init()
+    return pygame.font.Font(pygame.font.get_default_font(), 42)
 
 
 def _grass() -> NDArray[np.float64]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pygame
 import pytest
 from gymnasium.error import InvalidAction
 
@@ -154,6 +155,13 @@ def test_gymnasium_finds_it_a_well_made_environment():
 
 def test_an_episode_ends_after_a_thousand_steps():
     assert make_car_racing(picture_only=True).spec.max_episode_steps == 1000
+
+
+def test_a_score_is_written_after_somebody_closed_pygame():
+    before = score_text("0012").copy()
+    pygame.quit()
+    score_text.cache_clear()
+    assert np.array_equal(score_text("0012"), before)
 
 
 def test_score_texts_are_kept():
