@@ -4,6 +4,7 @@ A new message's fixture is written by `python -m tests.common.test_codec`; one t
 """
 
 import dataclasses
+import tracemalloc
 from pathlib import Path
 
 import msgpack
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from common.codec import Inbox, MalformedError, decode, decode_json, encode, encode_json, encoding
 from common.messages import MAX_MESSAGE, WIRE, Beat, HelloRequest, JobBatch, ResultBatch
+from tests.support.mutations import mutations
 from tests.support.samples import JSON, MSGPACK, VECTOR_ID
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -141,6 +143,32 @@ def test_vectors_travel_to_the_bit():
     part = dataclasses.replace(MSGPACK["job"].vectors[0], id=VECTOR_ID, shape=(4,), data=vector.tobytes())
     received = decode(JobBatch, encode(dataclasses.replace(MSGPACK["job"], vectors=(part,))))
     assert received.vectors[0].data == vector.tobytes()
+
+
+def decode_all(count, seed):
+    inbox, good = Inbox(), 0
+    kinds = list(MSGPACK.values())
+    for number, payload in enumerate(mutations(count, seed)):
+        good += inbox.decode(type(kinds[number % len(kinds)]), payload) is not None
+    return inbox, good
+
+
+def test_damaged_messages_never_raise_and_are_all_counted():
+    inbox, good = decode_all(20_000, seed=1)
+    assert sum(inbox.dropped.values()) + good == 20_000
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1200)
+def test_a_million_damaged_messages_never_raise_are_all_counted_and_leave_nothing_behind():
+    decode_all(1000, seed=2)
+    tracemalloc.start()
+    inbox, good = decode_all(1_000_000, seed=3)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert sum(inbox.dropped.values()) + good == 1_000_000
+    assert len(inbox.dropped) < 20
+    assert held < 100_000
 
 
 if __name__ == "__main__":

@@ -1,12 +1,17 @@
 """What strangers put on the wire changes nothing, and is counted."""
 
+import os
+from pathlib import Path
+
 import pytest
+import zenoh
 
 from common import keys
 from common.codec import encode
 from common.messages import MAX_MESSAGE
 from common.session import Network, open_session
 from tests.support import tasks
+from tests.support.mutations import mutations
 from tests.support.samples import MSGPACK
 
 pytestmark = pytest.mark.timeout(120)
@@ -45,3 +50,39 @@ def test_a_worker_drops_what_is_malformed_or_of_another_coordinator(processes, r
             session.put(keys.job("test", identity), payload)
     assert coordinator.finish()[0] == 0
     assert worker.finish()[0] == 0
+
+
+def flood(processes, random_bundle, count):
+    """Damaged messages at a coordinator that has work; what it dropped, and by how many bytes it grew."""
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
+    )  # fmt: skip
+    processes.worker("--task", tasks.SLOW_TOY)
+    coordinator.wait_for("generation 1: mean")
+    before = resident(coordinator)
+    kinds = ("result", "beat")
+    with open_session(Network(connect=(processes.endpoint,))) as session:
+        for number, payload in enumerate(mutations(count, seed=5)):
+            key = getattr(keys, kinds[number % 2])("test", "stranger/0badc0de")
+            session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+        while sum((dropped := processes.status()["dropped"]).values()) < count:
+            pass
+    coordinator.wait_for("generation", times=2)
+    return dropped, resident(coordinator) - before
+
+
+def resident(process):
+    return int(Path(f"/proc/{process.popen.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_a_flood_of_damaged_messages_is_counted_to_the_last_and_the_run_goes_on(processes, random_bundle):
+    dropped, _ = flood(processes, random_bundle, 2000)
+    assert sum(dropped.values()) == 2000
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1200)
+def test_a_hundred_thousand_damaged_messages_leave_no_trace_but_their_count(processes, random_bundle):
+    dropped, growth = flood(processes, random_bundle, 100_000)
+    assert sum(dropped.values()) == 100_000
+    assert growth < 20e6

@@ -18,7 +18,7 @@ from common.fingerprint import package_version
 from worker.tasks.preprocessing import PREPROCESSING, SIZE
 from worker.training import train_mdnrnn, train_vae
 from worker.training.checkpoint import load_weights
-from worker.training.dataset import episodes, load
+from worker.training.dataset import episodes, load, split
 from worker.training.encode import ENCODED, encoder_of
 from worker.worldmodel.export import Weights, export_decoder, export_encoder, export_policy
 from worker.worldmodel.mdnrnn import MDNRNNConfig
@@ -44,6 +44,8 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundl
     quality = folder / QUALITY
     provenance = {
         "episodes": len(episodes(folder)),
+        "frames": sum(len(load(path, "reward")["reward"]) for path in episodes(folder)),
+        "held_out_episodes": len(split(episodes(folder))[1]),
         "quality": json.loads(quality.read_text()) if quality.exists() else {},
         "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
     }

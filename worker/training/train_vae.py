@@ -18,7 +18,7 @@ from worker.worldmodel.vae import VAE, VAEConfig
 CHECKPOINT = "vae.safetensors"
 SAVE_EVERY = 200
 VALIDATION_PICTURES = 2000
-ACTIVE_VARIANCE = 0.01  # of mu over the held-out pictures, above which a latent carries something
+ACTIVE_NATS = 0.1  # a picture, on average over the held-out ones, above which a latent carries something
 
 Report = Callable[[int, str], None]
 
@@ -55,16 +55,16 @@ def quality(model: VAE, held_out: Sequence[Path]) -> dict[str, float]:
     """Summed squared error a picture, beside that of the mean picture, and how many latents are active."""
     pictures = np.concatenate([load_pictures(path)[::5] for path in held_out])[:VALIDATION_PICTURES]
     mean = pictures.astype(np.float32).mean(axis=0) / 255
-    errors, baseline, latents = [], [], []
+    errors, baseline, nats = [], [], []
     model.eval()
     with torch.no_grad():
         for start in range(0, len(pictures), 100):
             batch = as_tensor(pictures[start : start + 100])
-            mu, _ = model.encode(batch)
+            mu, logvar = model.encode(batch)
             errors.append((model.decode(mu) - batch).square().sum(dim=(1, 2, 3)).numpy())
             baseline.append(((pictures[start : start + 100] / 255.0 - mean) ** 2).sum(axis=(1, 2, 3)))
-            latents.append(mu.numpy())
-    active = (np.concatenate(latents).var(axis=0) > ACTIVE_VARIANCE).sum()
+            nats.append((0.5 * (mu.square() + logvar.exp() - logvar - 1)).numpy())
+    active = (np.concatenate(nats).mean(axis=0) > ACTIVE_NATS).sum()
     return {
         "reconstruction_error": round(float(np.concatenate(errors).mean()), 2),
         "mean_picture_error": round(float(np.concatenate(baseline).mean()), 2),
