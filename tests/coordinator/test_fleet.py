@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -386,3 +388,36 @@ def test_memory_of_results_is_bounded(count):
     assert len(fleet._accepted) <= 2
     assert fleet.open == 0
     assert len(fleet._tags) == len(fleet._queue) == 0
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_memory_stays_flat_through_a_hundred_thousand_generations_of_churn():
+    fleet = fleet_of(A, capacity=4, jobs=0)
+    random = np.random.default_rng(1)
+    tracemalloc.start()
+    held = []
+    for generation in range(100_000):
+        now = generation / 10
+        fleet.forget(before=generation - 1)
+        fleet.offer(work(2, generation=generation))
+        name = f"w/{random.integers(2**32):08x}"
+        fleet.welcome(name, 2, "f", now)
+        fleet.beat(A, beat(4, seen=10**9), now)
+        fleet.beat(name, beat(2, seen=10**9), now)
+        while fleet.open:
+            for who in (A, name):
+                for digest in digests(fleet.dispatch(now), who):
+                    if random.random() < 0.8:
+                        fleet.result(who, result(digest), now)
+            now += 0.001
+            fleet.beat(A, beat(4, seen=10**9), now)
+            fleet.beat(name, beat(2, seen=10**9), now)
+        fleet.depart(name, now)
+        fleet.tick(now + 0.06)
+        fleet.notes.clear()
+        if generation in (1000, 99_999):
+            held.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    assert held[1] - held[0] < 200_000
+    assert set(fleet.members) == {A}
