@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass
+from functools import cache
 from typing import Annotated, Any, ClassVar, Literal
 
 MAX_MESSAGE = 48 * 1024
@@ -57,8 +58,13 @@ class TaskSpec:
 
     def digest(self, kind: Kind, vector: bytes, seeds: tuple[int, ...]) -> bytes:
         """A job's identity: SHA-256 over its kind, this specification, the parameters' hash and the seeds."""
-        text = json.dumps({"kind": kind, "seeds": seeds, "spec": asdict(self)}, sort_keys=True)
+        text = f'{{"kind": "{kind}", "seeds": {list(seeds)}, "spec": {_spec_text(self)}}}'
         return hashlib.sha256(vector + text.encode()).digest()
+
+
+@cache
+def _spec_text(spec: TaskSpec) -> str:
+    return json.dumps(asdict(spec), sort_keys=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 # Not state: options and callbacks come from the constructor; the clock, logger and archives change no sample.
 _SKIPPED = frozenset({
     "opts", "inopts", "_es_opts", "logger", "timer", "timer2", "_tell2_args", "sent_solutions", "archive", "randn",
-    "repaired_solutions", "_injected_solutions_archive", "_stopdict", "callbackstop", "boundary_handler", "gp",
+    "ary", "pop_sorted", "repaired_solutions", "_injected_solutions_archive", "_stopdict", "callbackstop", "boundary_handler", "gp",
     "_parameters", "params", "more_to_write", "best",
 })  # fmt: skip
 _SCALARS = (bool, int, float, str, type(None), np.bool_, np.integer, np.floating)

@@ -154,7 +154,8 @@ class Service:
             self._handle(*self._events.get(timeout=TICK))
             until = monotonic() + LINGER
             for _ in range(DRAIN):
-                self._handle(*self._events.get(timeout=max(until - monotonic(), 0.0)))
+                left = until - monotonic() if self._run.fleet.open else 0.0  # else a generation's end waits for us
+                self._handle(*self._events.get(timeout=max(left, 0.0)))
         except queue.Empty:
             pass
 

@@ -166,8 +166,7 @@ class Worker:
                 drain_until = now + self._config.drain_timeout
                 self._backlog.clear()
                 log.info("draining: running episodes finish, queued jobs go back")
-            if drain_until is None:
-                self._fill_slots()
+            self._fill_slots()
             for results in self._outbox.due(now):
                 self._send_results(session, results)
             if now >= self._beat_at:
@@ -237,12 +236,15 @@ class Worker:
             self._finished += 1
             self._steps_finished += result.steps
             self._outbox.add(result)
+            self._fill_slots()  # before the other slots' events are looked at
 
     def _capacity(self) -> int:
         width = find_task(self._admission.spec.task).width
         return min(sum(slot.ready for slot in self._slots) * width, MAX_LEASES // 2)
 
     def _fill_slots(self) -> None:
+        if self._stops or monotonic() >= self._leave_at:
+            return
         if len(self._outbox) > 4 * len(self._slots):
             return
         for slot in self._slots:

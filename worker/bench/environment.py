@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from common.bundle import Bundle, find_bundle, pretrained
 from common.controller import Controller
+from common.errors import ControllerError
 from common.seeds import VALIDATION
 from worker.render.check import Actions, Difference, compare, leap, make_car_racing
 from worker.tasks.car_racing import CarRacingPolicy, PictureObservation
@@ -181,6 +182,8 @@ def discrete(_step: int, _picture: Any, random: np.random.Generator) -> int:
 
 def driver(bundle: Bundle) -> Actions:
     """The shipped controller, which drives."""
-    policy = CarRacingPolicy(bundle)
-    policy.begin(Controller.load(pretrained() / f"{bundle.manifest.name}.npz").parameters)
+    policy, controller = CarRacingPolicy(bundle), Controller.load(pretrained() / f"{bundle.manifest.name}.npz")
+    if controller.bundle != bundle.sha256:
+        raise ControllerError(f"the shipped controller {bundle.manifest.name} is not of {bundle.path}")
+    policy.begin(controller.parameters)
     return lambda _step, picture, _random: policy.act(picture)
