@@ -37,8 +37,9 @@ def encoding(kind: type[Any]) -> str:
 
 def encode(message: Message) -> bytes:
     """Msgpack of a message; our own messages are checked too, so that no peer has to drop them."""
-    _checker(type(message))(_plain(message))
-    payload: bytes = msgpack.packb({"v": PROTOCOL_VERSION, **_plain(message)})
+    plain = _plain(message)
+    _checker(type(message))(plain)
+    payload: bytes = msgpack.packb({"v": PROTOCOL_VERSION, **plain})
     if len(payload) > MAX_MESSAGE:
         raise MalformedError("oversize")
     return payload

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Not state: options and callbacks come from the constructor; the clock, logger and archives change no sample.
+# Not state: options and callbacks come from the constructor; the clock, the logger, archives and the last population,
+# which is large, change no sample.
 _SKIPPED = frozenset({
     "opts", "inopts", "_es_opts", "logger", "timer", "timer2", "_tell2_args", "sent_solutions", "archive", "randn",
-    "ary", "pop_sorted", "repaired_solutions", "_injected_solutions_archive", "_stopdict", "callbackstop", "boundary_handler", "gp",
-    "_parameters", "params", "more_to_write", "best",
+    "repaired_solutions", "_injected_solutions_archive", "_stopdict", "callbackstop", "boundary_handler", "gp",
+    "_parameters", "params", "more_to_write", "best", "ary", "pop_sorted",
 })  # fmt: skip
 _SCALARS = (bool, int, float, str, type(None), np.bool_, np.integer, np.floating)
 _MAX_DEPTH = 6

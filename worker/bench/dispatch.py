@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from importlib import import_module
 from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
@@ -197,12 +198,10 @@ def pool_peer() -> Iterator[Mapper]:
 @contextmanager
 def dask_peer() -> Iterator[Mapper]:
     """A local Dask cluster."""
-    from distributed import Client as DaskClient
-    from distributed import LocalCluster
-
+    dask: Any = import_module("distributed")
     with (
-        LocalCluster(n_workers=SLOTS, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
-        DaskClient(cluster) as client,
+        dask.LocalCluster(n_workers=SLOTS, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        dask.Client(cluster) as client,
     ):
         yield lambda work, count: client.gather(client.map(work, range(count), pure=False))
 
@@ -210,8 +209,7 @@ def dask_peer() -> Iterator[Mapper]:
 @contextmanager
 def ray_peer() -> Iterator[Mapper]:
     """A local Ray."""
-    import ray
-
+    ray: Any = import_module("ray")
     ray.init(num_cpus=SLOTS, include_dashboard=False, log_to_driver=False)
     try:
         yield lambda work, count: ray.get([ray.remote(work).remote(index) for index in range(count)])
