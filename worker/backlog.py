@@ -20,7 +20,7 @@ class Backlog:
         self._spec = spec
         self.begin()
         self._jobs: OrderedDict[bytes, Job] = OrderedDict()
-        self._vectors: OrderedDict[bytes, dict[int, bytes]] = OrderedDict()  # identity -> offset -> bytes
+        self._vectors: OrderedDict[bytes, bytes | dict[int, bytes]] = OrderedDict()  # identity -> whole, or by offset
 
     def begin(self) -> None:
         """A new coordinator's life: its batches count from 1 again."""
@@ -57,18 +57,31 @@ class Backlog:
         self._trim()
         return refused
 
-    def next(self) -> tuple[Job, bytes] | None:
-        """The first job whose vector is whole, with the vector."""
-        for digest, job in self._jobs.items():
-            parts = sorted(self._vectors.get(job.vector, {}).items())
-            vector = b"".join(data for _, data in parts)
-            if hashlib.sha256(vector).digest() == job.vector:
+    def take(self, count: int) -> list[tuple[Job, bytes]]:
+        """The first jobs whose vectors are whole, with them; at most `count`."""
+        taken: list[tuple[Job, bytes]] = []
+        for digest, job in list(self._jobs.items()):
+            if len(taken) == count:
+                break
+            if (vector := self._whole(job.vector)) is not None:
+                taken.append((job, vector))
                 del self._jobs[digest]
-                return job, vector
-        return None
+        return taken
+
+    def _whole(self, identity: bytes) -> bytes | None:
+        vector = self._vectors.get(identity)
+        if isinstance(vector, bytes):
+            return vector
+        joined = b"".join(data for _, data in sorted((vector or {}).items()))
+        if hashlib.sha256(joined).digest() != identity:
+            return None
+        self._vectors[identity] = joined
+        return joined
 
     def _add_part(self, part: VectorPart) -> None:
-        self._vectors.setdefault(part.id, {})[part.offset] = part.data
+        parts = self._vectors.setdefault(part.id, {})
+        if not isinstance(parts, bytes):
+            parts[part.offset] = part.data
         self._vectors.move_to_end(part.id)
 
     def _trim(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,16 @@ class Scorer:
     ) -> Score:
         """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode."""
         return rollout(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
+
+    def score_all(
+        self, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]], on_step: Callable[[int], None]
+    ) -> list[Score]:
+        """A turn's jobs, as `score` does; `on_step` hears of all steps made so far."""
+        scores: list[Score] = []
+        for job in jobs:
+            before = sum(each.steps for each in scores)
+            scores.append(self.score(*job, lambda done, before=before: on_step(before + done)))  # type: ignore[misc]
+        return scores
 
     @property
     def drawn_by(self) -> str:

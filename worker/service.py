@@ -89,6 +89,7 @@ class Worker:
                 Slot(number, admission.spec, bundle.path, self._events, self._config.slot_memory << 20)
                 for number in range(self._slot_count)
             ]
+            self._width = find_task(admission.spec.task).width
             self._backlog = Backlog(admission.spec)
             self._outbox = Outbox(admission.intervals.repeat)
             self._coordinators, self._parted = set(), False
@@ -164,7 +165,7 @@ class Worker:
                 slot.check(now, gap)
             if (self._stops or now >= self._leave_at) and drain_until is None:
                 drain_until = now + self._config.drain_timeout
-                self._backlog.clear()
+                self._hand_back()
                 log.info("draining: running episodes finish, queued jobs go back")
             self._fill_slots()
             for results in self._outbox.due(now):
@@ -175,11 +176,18 @@ class Worker:
             if self._must_rejoin(now):
                 self._rejoin(session, now)
 
+    def _hand_back(self) -> None:
+        """Begin nothing more; the next beat shows what is no longer here."""
+        self._backlog.clear()
+        for slot in self._slots:
+            for job in slot.waiting:
+                slot.abandon(job.digest)
+
     def _left(self, drain_until: float | None) -> bool:
         if self._stops > 1:
             return True
         if drain_until is not None:
-            busy = any(slot.job is not None for slot in self._slots) or len(self._outbox)
+            busy = any(slot.running for slot in self._slots) or len(self._outbox)
             return not busy or monotonic() > drain_until
         alone = self._alone_since
         leaves = self._config.exit_when_done or self._config.any
@@ -224,32 +232,33 @@ class Worker:
             self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
         self._outbox.settle(verdict.digest for verdict in batch.verdicts)
         for slot in self._slots:
-            if slot.job is not None and slot.job.digest in batch.cancels:
-                slot.abandon()
+            for digest in batch.cancels:
+                slot.abandon(digest)
 
     def _take_slot_event(self, event: SlotEvent) -> None:
         self._quiet_since = monotonic()
         if event.ready is not None:
             self._beat_at = 0.0  # new capacity is told at once
-        result = self._slots[event.slot].handle(event)
-        if result is not None:
+        results = self._slots[event.slot].handle(event)
+        for result in results:
             self._finished += 1
             self._steps_finished += result.steps
             self._outbox.add(result)
+        if results:
             self._fill_slots()  # before the other slots' events are looked at
 
     def _capacity(self) -> int:
-        width = find_task(self._admission.spec.task).width
-        return min(sum(slot.ready for slot in self._slots) * width, MAX_LEASES // 2)
+        return min(sum(slot.ready for slot in self._slots) * self._width, MAX_LEASES // 2)
 
     def _fill_slots(self) -> None:
         if self._stops or monotonic() >= self._leave_at:
             return
-        if len(self._outbox) > 4 * len(self._slots):
-            return
-        for slot in self._slots:
-            if slot.ready and slot.job is None and (work := self._backlog.next()) is not None:
-                slot.submit(*work)
+        room = 4 * len(self._slots) * self._width - len(self._outbox)
+        idle = [slot for slot in self._slots if slot.idle and room >= 0]
+        ahead = [slot for slot in self._slots if slot.takes_more and room > 0]
+        for slot in idle + ahead:
+            if work := self._backlog.take(self._width):
+                slot.submit(work)
 
     def _send_results(self, session: zenoh.Session, results: tuple[Result, ...]) -> None:
         run = self._admission
@@ -259,8 +268,13 @@ class Worker:
         session.put(keys.result(run.run, self.identity), encode(batch), encoding=encoding(ResultBatch))
 
     def _send_beat(self, session: zenoh.Session, now: float, capacity: int) -> None:
-        running = [slot for slot in self._slots if slot.job is not None]
-        steps = self._steps_finished + sum(slot.steps for slot in running)
+        running = [
+            Running(job.digest[:TAG_BYTES], slot.steps // len(slot.running))
+            for slot in self._slots
+            for job in slot.running
+        ]
+        queued = self._backlog.queued + [job.digest for slot in self._slots for job in slot.waiting]
+        steps = self._steps_finished + sum(slot.steps for slot in self._slots)
         (then, before), self._counted = self._counted, (now, steps)
         if now > then:
             self._rate += SMOOTHING * (max(steps - before, 0) / (now - then) - self._rate)
@@ -271,8 +285,8 @@ class Worker:
             seen=self._backlog.seen,
             capacity=capacity,
             slots=len(self._slots),
-            queued=_tags(self._backlog.queued),
-            running=tuple(Running(slot.job.digest[:TAG_BYTES], slot.steps) for slot in running if slot.job),
+            queued=_tags(queued),
+            running=tuple(running[:MAX_LEASES]),
             unacked=_tags(self._outbox.digests),
             load=os.getloadavg()[0],
             steps_per_second=self._rate,
@@ -290,7 +304,7 @@ class Worker:
             return False
         if self._parted or self._admission.nonce not in self._coordinators:
             return True
-        idle = any(slot.ready for slot in self._slots) and all(slot.job is None for slot in self._slots)
+        idle = any(slot.ready for slot in self._slots) and not any(slot.running for slot in self._slots)
         silent = now - self._quiet_since > SILENT_BEATS * self._admission.intervals.beat
         return silent and (idle or len(self._outbox) > 0)
 

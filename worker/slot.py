@@ -11,9 +11,10 @@ import os
 import queue
 import signal
 import threading
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -28,7 +29,12 @@ from common.threads import pin_thread_pools
 
 log = logging.getLogger(__name__)
 FAILED_STARTS = 3
+SHORT = 0.25  # seconds: after turns below it the next one already waits in the child
+SMALL = 64 * 1024  # bytes of vectors that a pipe takes while its child is busy
 _PR_SET_PDEATHSIG = 1
+
+Work = tuple[Job, bytes]
+"""A job and its vector's bytes."""
 
 
 @dataclass(frozen=True)
@@ -39,24 +45,40 @@ class Ready:
 
 
 @dataclass(frozen=True)
-class Abandoned:
-    """A child's word that it gave a job up, as it was told to."""
+class Done:
+    """A child's word that a turn is over: a result of each of its jobs, or none where it was told to give up."""
+
+    turn: int
+    results: tuple[Result, ...]
 
 
 @dataclass(frozen=True)
 class SlotEvent:
-    """What a slot tells its worker: ready, a result, a job given up, or that the child is gone."""
+    """What a slot tells its worker: ready, a turn done, or that the child is gone."""
 
     slot: int
     life: int
     ready: Ready | None = None
-    result: Result | None = None
-    abandoned: bool = False
+    done: Done | None = None
     gone: str | None = None
 
 
+@dataclass
+class Turn:
+    """Jobs that a child scores together: one, or as many as its task's width."""
+
+    number: int
+    work: Sequence[Work]
+    unwanted: set[bytes] = field(default_factory=set)
+
+    @property
+    def jobs(self) -> list[Job]:
+        """Its jobs."""
+        return [job for job, _ in self.work]
+
+
 class Slot:
-    """The parent's side of one child."""
+    """The parent's side of one child, which has one turn in its hands and at most one more waiting."""
 
     def __init__(
         self,
@@ -68,72 +90,92 @@ class Slot:
     ) -> None:
         """`memory_limit` in bytes; 0: none."""
         self.number = number
-        self.job: Job | None = None
         self.ready = False
         self.drawn_by = "-"
         self._spec = spec
         self._bundle = bundle
         self._events = events
         self._memory_limit = memory_limit
+        self._turns: deque[Turn] = deque()
+        self._short = False  # the last turn was
         self._progress = (0, 0.0)  # steps, and when they were last seen to grow
         self._life = 0
         self._failed_starts = 0
         self._start()
 
     @property
+    def running(self) -> list[Job]:
+        """Jobs of the turn in the child's hands."""
+        return self._turns[0].jobs if self._turns else []
+
+    @property
+    def waiting(self) -> list[Job]:
+        """Jobs that the child has not begun."""
+        return [job for turn in list(self._turns)[1:] for job in turn.jobs]
+
+    @property
+    def idle(self) -> bool:
+        """Ready, with nothing to do."""
+        return self.ready and not self._turns
+
+    @property
+    def takes_more(self) -> bool:
+        """Whether a turn may wait in the child, so that it need not wait for us between short ones."""
+        return self.ready and self._short and len(self._turns) == 1
+
+    @property
     def steps(self) -> int:
-        """Environment steps of the running job so far."""
-        return int(self._steps.value) if self.job is not None else 0
+        """Environment steps of the running turn so far, over all of its jobs."""
+        return int(self._steps.value) if self._turns else 0
 
     @property
     def pid(self) -> int:
         """The child's process id."""
         return self._process.pid or 0
 
-    def submit(self, job: Job, vector: bytes) -> None:
-        """Give an idle child a job; a child that is gone is noticed by its reader."""
-        self.job = job
-        self._steps.value = 0
-        self._progress = (0, monotonic())
-        self._turn += 1
-        try:
-            self._pipe.send((self._turn, job, vector))
-        except OSError:
-            log.debug("slot %d is gone", self.number)
+    def submit(self, work: Sequence[Work]) -> None:
+        """Give the child a turn; a child that is gone is noticed by its reader."""
+        self._sent += 1
+        turn = Turn(self._sent, work)
+        self._turns.append(turn)
+        if len(self._turns) == 1:
+            self._begin()
+        self._send(turn)
 
     def check(self, now: float, gap: float) -> None:
-        """Kill a child whose job makes no step; `gap` is how long this host itself stood still before `now`."""
-        if self.job is None:
+        """Kill a child whose turn makes no step; `gap` is how long this host itself stood still before `now`."""
+        if not self._turns:
             return
         steps, since = self._progress
         since += gap
+        stall = max(job.stall for job in self.running)
         if self.steps != steps:
             since = now
-        elif now - since > self.job.stall > 0:
-            self._ended_for = f"no step for {self.job.stall:g} s"
+        elif now - since > stall > 0:
+            self._ended_for = f"no step for {stall:g} s"
             self._process.kill()
         self._progress = (self.steps, since)
 
-    def abandon(self) -> None:
-        """Let the child give up its job at its next step, without a result; it may be done before."""
-        self._abandoned.value = self._turn
+    def abandon(self, digest: bytes) -> None:
+        """A job is not wanted any more; a turn without a wanted one ends at its next step, if it is not over before."""
+        for turn in self._turns:
+            digests = {job.digest for job in turn.jobs}
+            turn.unwanted |= {digest} & digests
+            if turn.unwanted == digests:
+                self._abandoned[turn.number % 2] = turn.number
 
-    def handle(self, event: SlotEvent) -> Result | None:
-        """Take one of this slot's events; the result of its job, if that has ended."""
+    def handle(self, event: SlotEvent) -> tuple[Result, ...]:
+        """Take one of this slot's events; the results of its turn, if that has ended."""
         if event.life != self._life:
-            return None
+            return ()
         if event.ready is not None:
             self.ready, self.drawn_by = True, event.ready.drawn_by
             self._failed_starts = 0
-        elif event.result is not None:
-            self.job = None
-            self._replace_if_swollen()
-            return event.result
-        elif event.abandoned:
-            self.job = None
+        elif event.done is not None:
+            return self._end_turn(event.done)
         elif event.gone is not None:
             return self._replace(event.gone)
-        return None
+        return ()
 
     def stop(self) -> None:
         """End the child."""
@@ -142,7 +184,25 @@ class Slot:
         self._process.join()
         self._pipe.close()
 
-    def _replace(self, why: str) -> Result | None:
+    def _begin(self) -> None:
+        self._progress = (0, monotonic())
+
+    def _send(self, turn: Turn) -> None:
+        try:
+            self._pipe.send((turn.number, turn.work))
+        except OSError:
+            log.debug("slot %d is gone", self.number)
+
+    def _end_turn(self, done: Done) -> tuple[Result, ...]:
+        turn = self._turns.popleft()
+        size = sum(len(vector) for _, vector in turn.work)
+        self._short = size <= SMALL and bool(done.results) and sum(each.seconds for each in done.results) < SHORT
+        self._begin()
+        if not self._turns:
+            self._replace_if_swollen()
+        return done.results
+
+    def _replace(self, why: str) -> tuple[Result, ...]:
         self._process.join()
         code = self._process.exitcode or 0
         reason = self._ended_for or (f"signal {-code}" if code < 0 else why)
@@ -150,29 +210,30 @@ class Slot:
         if self._failed_starts >= FAILED_STARTS:
             raise DreamfleetError(f"a slot cannot start: {reason}; `dreamfleet doctor` looks for the cause")
         log.warning("slot %d ended (%s); starting another", self.number, reason)
-        job, self.job, self.ready = self.job, None, False
-        steps = int(self._steps.value)
+        steps = self.steps
+        lost = self._turns.popleft().jobs if self._turns else []
         self._start()
-        if job is None:
-            return None
-        return Result(job.digest, None, steps, 0.0, f"slot crashed ({reason})", None)
+        return tuple(
+            Result(job.digest, None, steps // len(lost), 0.0, f"slot crashed ({reason})", None) for job in lost
+        )
 
     def _replace_if_swollen(self) -> None:
         held = _memory_of(self.pid) if self._memory_limit else 0
         if held > self._memory_limit:
             log.warning("slot %d holds %d MiB; starting another", self.number, held >> 20)
             self.stop()
-            self.ready = False
             self._start()
 
     def _start(self) -> None:
+        """A new child; what waited in the last one's pipe goes to it."""
+        self.ready = self._short = False
         self._ended_for = ""
         pin_thread_pools()
         context = get_context("spawn")
         self._life += 1
-        self._turn = 0  # of this child: its jobs, counted
+        self._sent = 0  # turns given to this child
         self._steps: Any = context.Value("Q", 0, lock=False)
-        self._abandoned: Any = context.Value("Q", 0, lock=False)  # the turn to give up
+        self._abandoned: Any = context.Array("Q", 2, lock=False)  # turns to give up: an even one, an odd one
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
             target=serve_jobs,
@@ -183,6 +244,9 @@ class Slot:
             self._process.start()
         theirs.close()
         threading.Thread(target=self._read, args=(self._pipe, self._life), daemon=True).start()
+        waiting, self._turns = self._turns, deque()
+        for turn in waiting:
+            self.submit([work for work in turn.work if work[0].digest not in turn.unwanted] or turn.work)
 
     def _read(self, pipe: Connection[Any, Any], life: int) -> None:
         """In a thread of its own: pass on what the child says, until it is gone."""
@@ -196,15 +260,13 @@ class Slot:
                 why = said
             elif isinstance(said, Ready):
                 self._events.put(("slot", SlotEvent(self.number, life, ready=said)))
-            elif isinstance(said, Abandoned):
-                self._events.put(("slot", SlotEvent(self.number, life, abandoned=True)))
             else:
-                self._events.put(("slot", SlotEvent(self.number, life, result=said)))
+                self._events.put(("slot", SlotEvent(self.number, life, done=said)))
         self._events.put(("slot", SlotEvent(self.number, life, gone=why)))
 
 
 class AbandonedError(Exception):
-    """The running job is not wanted any more."""
+    """The running turn is not wanted any more."""
 
 
 def serve_jobs(
@@ -225,22 +287,23 @@ def serve_jobs(
         raise SystemExit(1) from error
     pipe.send(Ready(scorer.drawn_by))
 
-    turn = 0
-
-    def count(done: int) -> None:
-        steps.value = done
-        if abandoned.value == turn:
-            raise AbandonedError
-
     while True:
         try:
-            turn, job, vector = pipe.recv()
+            turn, work = pipe.recv()
         except EOFError:
             return
+
+        def count(made: int) -> None:
+            steps.value = made
+            if abandoned[turn % 2] == turn:  # noqa: B023 - called within this round
+                raise AbandonedError
+
         try:
-            pipe.send(_score(scorer, job, vector, count))
+            count(0)
+            results = _score(scorer, work, count)
         except AbandonedError:
-            pipe.send(Abandoned())
+            results = ()
+        pipe.send(Done(turn, results))
 
 
 @contextmanager
@@ -254,7 +317,8 @@ def _signals_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _score(scorer: Any, job: Job, vector: bytes, count: Any) -> Result:
+def _score(scorer: Any, work: Sequence[Work], count: Callable[[int], None]) -> tuple[Result, ...]:
+    """A result of each job; whatever a task raises is the jobs' error, not the slot's end."""
     started = perf_counter()
     made = 0
 
@@ -263,13 +327,23 @@ def _score(scorer: Any, job: Job, vector: bytes, count: Any) -> Result:
         made = done
         count(done)
 
+    jobs = [job for job, _ in work]
     try:
-        score = scorer.score(job.kind, np.frombuffer(vector, dtype="<f4"), job.seeds[0], on_step)
+        scores = scorer.score_all(
+            [(job.kind, np.frombuffer(vector, dtype="<f4"), job.seeds[0]) for job, vector in work], on_step
+        )
     except AbandonedError:
         raise
-    except Exception as error:  # whatever a task raises is this job's error, not the slot's end
-        return Result(job.digest, None, made, perf_counter() - started, _one_line(error), None)
-    return Result(job.digest, score.fitness, score.steps, perf_counter() - started, None, None)
+    except Exception as error:
+        spent = perf_counter() - started
+        return tuple(
+            Result(job.digest, None, made // len(jobs), spent / len(jobs), _one_line(error), None) for job in jobs
+        )
+    spent = (perf_counter() - started) / len(jobs)
+    return tuple(
+        Result(job.digest, score.fitness, score.steps, spent, None, None)
+        for job, score in zip(jobs, scores, strict=True)
+    )
 
 
 def _memory_of(pid: int) -> int:

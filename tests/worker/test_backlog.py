@@ -15,16 +15,16 @@ def batch(number, jobs=(), vectors=(WHOLE,), cancels=()):
 def test_jobs_come_out_in_order_with_their_vector():
     backlog = Backlog(SPEC)
     backlog.take_in(batch(1, (job(0), job(1))))
-    assert [backlog.next(), backlog.next(), backlog.next()] == [(job(0), VECTOR), (job(1), VECTOR), None]
+    assert [backlog.take(1), backlog.take(5), backlog.take(1)] == [[(job(0), VECTOR)], [(job(1), VECTOR)], []]
 
 
 def test_a_batch_that_comes_twice_counts_once():
     backlog = Backlog(SPEC)
     for _ in range(2):
         backlog.take_in(batch(1, (job(0),)))
-    assert backlog.next() is not None
+    assert backlog.take(1)
     backlog.take_in(batch(1, (job(0),)))
-    assert backlog.next() is None
+    assert not backlog.take(1)
 
 
 def test_seen_is_the_last_number_without_a_gap():
@@ -40,29 +40,29 @@ def test_a_vector_may_be_spread_over_batches_that_come_in_any_order():
     backlog = Backlog(SPEC)
     first, second = (dataclasses.replace(WHOLE, offset=at, data=VECTOR[at : at + 32]) for at in (0, 32))
     backlog.take_in(batch(2, (job(0),), (second,)))
-    assert backlog.next() is None
+    assert not backlog.take(1)
     backlog.take_in(batch(1, (), (first,)))
-    assert backlog.next() == (job(0), VECTOR)
+    assert backlog.take(1) == [(job(0), VECTOR)]
 
 
 def test_a_cancelled_job_is_not_started():
     backlog = Backlog(SPEC)
     backlog.take_in(batch(1, (job(0), job(1)), cancels=()))
     backlog.take_in(batch(2, cancels=(job(0).digest,)))
-    assert backlog.next() == (job(1), VECTOR)
+    assert backlog.take(1) == [(job(1), VECTOR)]
 
 
 def test_a_job_whose_digest_is_of_something_else_is_refused():
     backlog = Backlog(SPEC)
     wrong = dataclasses.replace(job(0), seeds=(5,))
     assert backlog.take_in(batch(1, (wrong,))) == [(wrong, "the job's digest is not of its content")]
-    assert backlog.next() is None
+    assert not backlog.take(1)
 
 
 def test_a_damaged_vector_is_never_scored():
     backlog = Backlog(SPEC)
     backlog.take_in(batch(1, (job(0),), (dataclasses.replace(WHOLE, data=VECTOR[::-1]),)))
-    assert backlog.next() is None
+    assert not backlog.take(1)
 
 
 def test_vectors_that_no_job_needs_are_let_go():
@@ -79,6 +79,6 @@ def test_a_new_life_of_the_coordinator_counts_from_one_again():
     backlog.take_in(batch(1, (job(0),)))
     backlog.begin()
     backlog.clear()
-    assert backlog.next() is None
+    assert not backlog.take(1)
     backlog.take_in(batch(1, (job(1),)))
-    assert backlog.next() == (job(1), VECTOR)
+    assert backlog.take(1) == [(job(1), VECTOR)]

@@ -37,12 +37,13 @@ class Harness:
 
     def result(self):
         while True:
-            if (result := self.slot.handle(self.events.get(timeout=TIMEOUT)[1])) is not None:
+            if results := self.slot.handle(self.events.get(timeout=TIMEOUT)[1]):
+                (result,) = results
                 return result
 
     def score(self, episode=0):
         self.wait_ready()
-        self.slot.submit(job(episode, spec=self.spec), VECTOR)
+        self.slot.submit([(job(episode, spec=self.spec), VECTOR)])
         return self.result()
 
 
@@ -91,7 +92,7 @@ def test_a_crash_costs_one_job_and_another_child_takes_its_place(harness):
 def test_a_killed_child_is_replaced_alone(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
-    slot.slot.submit(job(0, spec=slot.spec), VECTOR)
+    slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
     os.kill(slot.slot.pid, signal.SIGKILL)
     assert "signal 9" in slot.result().error
     assert slot.score().fitness is not None
@@ -101,23 +102,64 @@ def test_a_job_that_is_given_up_ends_without_a_result_and_the_child_lives_on(har
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
     pid = slot.slot.pid
-    slot.slot.submit(job(0, spec=slot.spec), VECTOR)
-    slot.slot.abandon()
-    while slot.slot.job is not None:
-        assert slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1]) is None
+    slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
+    slot.slot.abandon(job(0, spec=slot.spec).digest)
+    while slot.slot.running:
+        assert slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1]) == ()
     assert slot.score(1).fitness is not None
     assert slot.slot.pid == pid
+
+
+def test_after_short_turns_the_next_one_waits_in_the_child(harness):
+    slot = harness(tasks.TOY)
+    slot.wait_ready()
+    assert not slot.slot.takes_more
+    slot.score()
+    for number in (1, 2):
+        slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
+        assert slot.slot.takes_more == (number == 1)
+    assert [each.digest for each in slot.slot.waiting] == [job(2, spec=slot.spec).digest]
+    assert [slot.result().digest for _ in range(2)] == [job(number, spec=slot.spec).digest for number in (1, 2)]
+
+
+def test_a_crash_leaves_what_waits_to_the_next_child(harness):
+    slot = harness(tasks.SLOW_TOY)
+    slot.wait_ready()
+    for number in (0, 1):
+        slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    crashed, scored = slot.result(), slot.result()
+    assert (crashed.digest, crashed.fitness) == (job(0, spec=slot.spec).digest, None)
+    assert scored.digest == job(1, spec=slot.spec).digest
+    assert scored.fitness is not None
+
+
+def test_of_a_turn_of_several_jobs_all_must_be_given_up_to_end_it(harness):
+    slot = harness(tasks.SLOW_TOY)
+    slot.wait_ready()
+    jobs = [job(number, spec=slot.spec) for number in range(2)]
+    slot.slot.submit([(each, VECTOR) for each in jobs])
+    slot.slot.abandon(jobs[0].digest)
+    results = ()
+    while not results:
+        results = slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1])
+    assert [each.digest for each in results] == [each.digest for each in jobs]
+    slot.slot.submit([(each, VECTOR) for each in jobs])
+    for each in jobs:
+        slot.slot.abandon(each.digest)
+    while slot.slot.running:
+        assert slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1]) == ()
 
 
 def test_a_hung_job_is_killed_and_its_child_replaced(harness):
     slot = harness(tasks.HANGING)
     slot.wait_ready()
     stalling = replace(job(0, spec=slot.spec), stall=5.0)
-    slot.slot.submit(stalling, VECTOR)
+    slot.slot.submit([(stalling, VECTOR)])
     now = monotonic()
     slot.slot.check(now + 4.0, 0.0)
     slot.slot.check(now + 8.0, 4.0)  # the host stood still for four of the eight seconds
-    assert slot.slot.job is not None
+    assert slot.slot.running
     slot.slot.check(now + 9.5, 0.0)
     result = slot.result()
     assert (result.fitness, result.error) == (None, "slot crashed (no step for 5 s)")
@@ -167,7 +209,7 @@ def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
         "    events = queue.SimpleQueue()\n"
         "    slot = Slot(0, spec(tasks.HANGING), pathlib.Path(sys.argv[1]), events)\n"
         "    slot.handle(events.get()[1])\n"
-        "    slot.submit(job(spec=spec(tasks.HANGING)), VECTOR)\n"
+        "    slot.submit([(job(spec=spec(tasks.HANGING)), VECTOR)])\n"
         "    print(slot.pid, slot.ready, flush=True)\n"
         "    events.get()\n"
     )

@@ -13,7 +13,7 @@ from common import keys
 from common.codec import Inbox, encode, encoding
 from common.errors import ConnectionFailedError
 from common.fingerprint import fingerprint
-from common.messages import TAG_BYTES, Beat, JobBatch, Result, ResultBatch
+from common.messages import MAX_LEASES, TAG_BYTES, Beat, JobBatch, Result, ResultBatch
 from common.session import Network, enqueue_into, open_session
 from worker.admission import Admission, ask, make_request
 from worker.backlog import Backlog
@@ -40,8 +40,7 @@ class Simulated:
         """Finish every job of a batch."""
         self.backlog.take_in(batch)
         self.outbox.settle(verdict.digest for verdict in batch.verdicts)
-        while (work := self.backlog.next()) is not None:
-            job, _ = work
+        for job, _ in self.backlog.take(MAX_LEASES):
             self.outbox.add(Result(job.digest, float(job.seeds[0] % 1000), 1, 0.0, None, None))
 
     def beat(self) -> Beat:
