@@ -39,6 +39,7 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._results: list[tuple[Any, ...]] = []  # accepted since the last commit
         with _translated(path):
             self._connection = sqlite3.connect(path, timeout=5)
             try:
@@ -78,6 +79,9 @@ class Journal:
 
     def commit(self) -> None:
         """Make everything written so far durable."""
+        results, self._results = self._results, []
+        if results:
+            self._execute_many("INSERT INTO result VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", results)
         with _translated(self.path):
             self._connection.commit()
 
@@ -128,11 +132,10 @@ class Journal:
 
     def add_result(self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int) -> None:
         """Write an accepted result."""
-        self._execute(
-            "INSERT INTO result VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        self._results.append((
             job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], result.fitness,
             result.steps, result.seconds, worker, fingerprint, incarnation,
-        )  # fmt: skip
+        ))  # fmt: skip
 
     def schedule_evaluation(self, evaluation: Evaluation) -> None:
         """Write that the mean of a generation is to be evaluated."""
