@@ -320,4 +320,4 @@ class Fleet:
 
     def _evaluation_slots(self) -> int:
         """Evaluations of a mean fill the tail of a generation and never more than a quarter of the slots."""
-        return max(1, sum(member.capacity for member in self.members.values() if member.present) // 4)
+        return max(1, sum(member.slots for member in self.members.values() if member.present) // 4)

@@ -58,14 +58,16 @@ class Backlog:
         return refused
 
     def take(self, count: int) -> list[tuple[Job, bytes]]:
-        """The first jobs whose vectors are whole, with them; at most `count`."""
+        """The first jobs whose vectors are whole, with them: at most `count` to be scored, or one of another kind."""
         taken: list[tuple[Job, bytes]] = []
         for digest, job in list(self._jobs.items()):
-            if len(taken) == count:
+            if len(taken) == count or (taken and job.kind != "score"):
                 break
             if (vector := self._whole(job.vector)) is not None:
                 taken.append((job, vector))
                 del self._jobs[digest]
+                if job.kind != "score":
+                    break
         return taken
 
     def _whole(self, identity: bytes) -> bytes | None:
