@@ -11,7 +11,7 @@ import math
 import types
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -83,12 +83,6 @@ def decode_json(kind: type[T], payload: bytes) -> T:
     return document
 
 
-def to_plain(document: Any) -> dict[str, Any]:
-    """A dataclass in its plain form, which `from_plain` reads."""
-    plain: dict[str, Any] = _plain(document)
-    return plain
-
-
 def from_plain(kind: type[T], plain: Any) -> T:
     """A dataclass from its plain form, checked; `MalformedError` if it does not fit."""
     checked: T = _checker(kind)(plain)
@@ -119,30 +113,17 @@ class Inbox:
 
 
 def _plain(value: Any) -> Any:
-    """Nested dataclasses as dictionaries, without `dataclasses.asdict`'s deep copies of every vector.
-
-    A field that is absent by default is left out while it is: earlier versions then read the message too.
-    """
+    """Nested dataclasses as dictionaries, without `dataclasses.asdict`'s deep copies of every vector."""
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
-    names = _field_names(type(value))
-    if not names:
-        return value
-    plain = {name: _plain(getattr(value, name)) for name in names}
-    for name in _absent_by_default(type(value)):
-        if plain[name] is None:
-            del plain[name]
-    return plain
+    kind: Any = type(value)
+    names = _field_names(kind)
+    return {name: _plain(getattr(value, name)) for name in names} if names else value
 
 
 @cache
 def _field_names(kind: Any) -> tuple[str, ...]:
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()
-
-
-@cache
-def _absent_by_default(kind: Any) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(kind) if field.default is None)
 
 
 def _checker(hint: Any) -> Check:
@@ -192,16 +173,13 @@ def _dataclass_checker(kind: type[Any]) -> Check:
     hints = get_type_hints(kind, include_extras=True)
     checks = {field.name: _checker(hints[field.name]) for field in fields(kind)}
     names = frozenset(checks)
-    required = frozenset(
-        field.name for field in fields(kind) if field.default is MISSING and field.default_factory is MISSING
-    )
 
     def build(value: Any) -> Any:
         if not isinstance(value, dict):
             raise MalformedError("wrong type")
-        if value.keys() != names and not required <= value.keys() <= names:
+        if value.keys() != names:
             raise MalformedError("wrong fields")
-        return kind(**{name: check(value[name]) for name, check in checks.items() if name in value})
+        return kind(**{name: check(value[name]) for name, check in checks.items()})
 
     return build
 

@@ -55,7 +55,6 @@ class TaskSpec:
     bundle: Annotated[str, Length(64, 64)]  # SHA-256 of the bundle's file, hexadecimal
     horizon: Annotated[int, Between(1, 10**6)]  # an episode's steps at most, when scored for the strategy
     patience: Annotated[int, Between(0, 10**6)]  # steps without reward before a scored episode is cut; 0: never
-    temperature: Annotated[float, Between(0.01, 100.0)] | None = None  # of a dream's sampling
 
     def digest(self, kind: Kind, vector: bytes, seeds: tuple[int, ...]) -> bytes:
         """A job's identity: SHA-256 over its kind, this specification, the parameters' hash and the seeds."""
@@ -65,7 +64,7 @@ class TaskSpec:
 
 @cache
 def _spec_text(spec: TaskSpec) -> str:
-    return json.dumps({name: value for name, value in asdict(spec).items() if value is not None}, sort_keys=True)
+    return json.dumps(asdict(spec), sort_keys=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -50,7 +50,7 @@ class RunSettings:
     def from_json(cls, text: str) -> RunSettings:
         """Read what `to_json` wrote; `JournalError` if it is damaged."""
         try:
-            return from_plain(cls, json.loads(text))
+            return from_plain(cls, {"racing": False, **json.loads(text)})
         except (ValueError, TypeError, MalformedError) as error:
             raise JournalError(f"the journal's settings are damaged: {error}") from error
 

@@ -19,7 +19,7 @@ from typing import Any
 import zenoh
 
 from common import keys
-from common.codec import Inbox, encode, encode_json, encoding, to_plain
+from common.codec import Inbox, encode, encode_json, encoding
 from common.errors import RefusedError
 from common.fingerprint import package_version
 from common.messages import (
@@ -213,7 +213,7 @@ class Service:
             nonce=self._nonce,
             why=why,
             remedy=remedy,
-            spec={} if why else to_plain(self._run.settings.task),
+            spec={} if why else asdict(self._run.settings.task),
             intervals={} if why else asdict(self._intervals),
         )
 
