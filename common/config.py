@@ -21,9 +21,9 @@ T = TypeVar("T")
 Table = Mapping[str, Any]
 
 
-def option(default: Any, text: str) -> Any:
-    """A field with its default and the text that `--help` shows."""
-    return field(default=default, metadata={"help": text})
+def option(default: Any, text: str, *, alias: str = "") -> Any:
+    """A field with its default and the text that `--help` shows; `alias` is a second flag for it."""
+    return field(default=default, metadata={"help": text, "alias": alias})
 
 
 def add_flags(parser: argparse.ArgumentParser, *sections: type[Any]) -> None:
@@ -32,7 +32,8 @@ def add_flags(parser: argparse.ArgumentParser, *sections: type[Any]) -> None:
         group = parser.add_argument_group(section.__name__.removesuffix("Config").lower())
         hints = get_type_hints(section)
         for each in fields(section):
-            group.add_argument(_flag(each), **_flag_options(each, hints[each.name]))
+            aliases = [alias] if (alias := each.metadata.get("alias")) else []
+            group.add_argument(_flag(each), *aliases, **_flag_options(each, hints[each.name]))
 
 
 def load(

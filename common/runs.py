@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sqlite3
 from collections.abc import Iterator
@@ -93,6 +94,11 @@ class StoredEvaluation:
     episodes: int
     mean: float
     std: float
+
+    @property
+    def error(self) -> float:
+        """Standard error of the mean."""
+        return self.std / math.sqrt(self.episodes)
 
 
 class RunFolder:

@@ -26,8 +26,11 @@ class RunConfig:
     racing: bool = option(False, "let only the better half of the candidates drive the second half of the episodes")
     horizon: int = option(1000, "steps of a scored episode at most")
     patience: int = option(0, "cut a scored episode after so many steps without reward; 0: never")
+    temperature: float = option(1.0, "of a dream's sampling; above 1 it is harder, and harder to exploit")
     seed: int = option(1, "makes the run: population and tracks follow from it")
-    evaluate_every: int = option(25, "evaluate the mean every so many generations; 0: never")
+    evaluate_every: int = option(
+        25, "drive the mean in reality every so many generations; 0: never", alias="--reality-check"
+    )
     evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation tracks")
 
     def __post_init__(self) -> None:
@@ -71,9 +74,10 @@ class LimitsConfig:
     steps: int = option(0, "stop after so many environment steps")
     minutes: float = option(0.0, "stop after so many minutes of generations")
     target: float | None = option(None, "stop when an evaluated mean reaches this score")
+    parted: int = option(0, "stop when so many evaluations in a row fell clearly behind the best one before them")
 
     def __post_init__(self) -> None:
-        for name in ("generations", "steps", "minutes"):
+        for name in ("generations", "steps", "minutes", "parted"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise UsageError(f"--{name} must not be negative")
 
@@ -96,5 +100,9 @@ class NetworkConfig:
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"population": 64, "episodes": 16, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 1024},
     "article": {"population": 32, "episodes": 4, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 100},
+    "dream": {
+        "task": "dream", "population": 64, "episodes": 16, "sigma0": 0.1, "covariance": "diagonal", "horizon": 400,
+        "temperature": 1.25, "evaluate_every": 5, "evaluation_episodes": 16,
+    },
     "frugal": {"population": 32, "episodes": 2, "sigma0": 0.1, "covariance": "diagonal", "patience": 100},
 }

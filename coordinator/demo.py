@@ -1,6 +1,7 @@
 """The demonstration: a coordinator and one worker a core on this machine, as anybody would start them by hand.
 
-Spawns console commands and watches over Zenoh; imports neither the run nor the worker.
+Two runs: one in the dream, and one in reality from the dream's best mean. Spawns console commands and watches over
+Zenoh; imports neither the run nor the worker.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,26 +28,40 @@ from common.table import run_panel
 REFRESH = 0.5
 START_SECONDS = 30.0
 PLOT, VIDEO = "fitness.png", "drive.mp4"
+CHECK_EVERY, CHECK_TRACKS = 5, 8  # generations between looks at reality, and tracks of each
 
 
 @dataclass(frozen=True)
 class DemoConfig:
     """How long and how large; the defaults suit two cores."""
 
-    minutes: float = option(4.0, "evolve for so long")
-    population: int = option(32, "candidates a generation")
-    episodes: int = option(2, "episodes a candidate")
-    horizon: int = option(1000, "steps of an episode at most")
-    patience: int = option(100, "cut an episode after so many steps without reward")
-    sigma0: float = option(0.1, "first step size")
-    seed: int = option(1, "makes the run")
-    tracks: int = option(16, "unseen tracks that the mean is judged on")
+    dream_minutes: float = option(1.5, "dream for so long first; 0: not at all")
+    minutes: float = option(3.0, "then evolve in reality for so long; 0: not at all")
+    temperature: float = option(1.25, "of the dream")
+    population: int = option(32, "candidates a generation in reality")
+    episodes: int = option(2, "episodes a candidate in reality")
+    horizon: int = option(1000, "steps of an episode at most in reality")
+    patience: int = option(100, "cut an episode after so many steps without reward in reality")
+    sigma0: float = option(0.1, "first step size; half of it after a dream")
+    seed: int = option(1, "makes the runs")
+    tracks: int = option(16, "unseen tracks that the outcome is judged on")
     workers: int = option(0, "worker processes; 0: one a core")
     port: int = option(7447, "port of the embedded router")
 
     def __post_init__(self) -> None:
-        if self.minutes <= 0 or self.tracks < 1 or self.workers < 0:
-            raise UsageError("--minutes must be positive, --tracks at least 1, --workers at least 0")
+        if min(self.minutes, self.dream_minutes) < 0 or self.tracks < 1 or self.workers < 0:
+            raise UsageError("--minutes and --workers must not be negative, --tracks at least 1")
+        if not self.minutes and not self.dream_minutes:
+            raise UsageError("--minutes and --dream-minutes cannot both be 0: nothing would evolve")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One of the demonstration's runs."""
+
+    run: str
+    what: str
+    flags: Mapping[str, object]
 
 
 class Demo:
@@ -54,48 +69,43 @@ class Demo:
 
     def __init__(self, config: DemoConfig, name: str, runs_dir: Path) -> None:
         self._config = config
-        self._name = name
         self._runs_dir = runs_dir
-        self._folder = runs_dir / name
+        self._stages = stages(config, name, runs_dir)
+        self._folder = runs_dir / self._stages[-1].run
         self._endpoint = f"tcp/127.0.0.1:{config.port}"
         self._console = Console()
 
     def play(self) -> None:
         """Evolve, judge, draw, record, and say what to try next."""
-        self._evolve()
-        self._say("judging the evolved mean on unseen tracks, whole episodes, in gymnasium's own environment")
+        for stage in self._stages:
+            self._evolve(stage)
+        self._say("judging the outcome on unseen tracks, whole episodes, in gymnasium's own environment")
         controller = str(self._folder / CONTROLLER)
         self._call("evaluate", "--controller", controller, "--episodes", str(self._config.tracks))
-        self._plot()
-        self._say("recording a drive")
+        for stage in self._stages:
+            self._plot(stage)
+        self._say("recording a drive, and beside it what the model dreams")
         self._call("record", "--controller", controller, "--out", str(self._folder / VIDEO), "--steps", "1000")
         self._farewell()
 
-    def _evolve(self) -> None:
-        config = self._config
-        workers = config.workers or len(os.sched_getaffinity(0))
-        self._say(f"evolving for {config.minutes:g} minutes: a coordinator and {workers} workers on this machine")
+    def _evolve(self, stage: Stage) -> None:
+        workers = self._config.workers or len(os.sched_getaffinity(0))
+        self._say(f"{stage.what}: a coordinator and {workers} workers on this machine")
+        self._logs = self._runs_dir / stage.run
         with ExitStack() as stack:
-            coordinator = self._spawn(stack, "coordinator", *self._run_arguments())
+            flags = {"run": stage.run, "runs-dir": self._runs_dir, "listen": self._endpoint, **stage.flags}
+            arguments = [text for name, value in flags.items() for text in (f"--{name}", str(value))]
+            coordinator = self._spawn(stack, "coordinator", *arguments)
             client = self._connect(coordinator)
             with client:
                 for number in range(workers):
                     self._spawn(
-                        stack, "worker", "--connect", self._endpoint, "--run", self._name,
+                        stack, "worker", "--connect", self._endpoint, "--run", stage.run,
                         "--name", f"core-{number}", "--slots", "1",
                     )  # fmt: skip
-                self._watch(client, coordinator)
+                self._watch(client, coordinator, stage.run)
             if coordinator.wait() != 0:
                 raise DreamfleetError(f"the coordinator failed; its words are in {self._log('coordinator')}")
-
-    def _run_arguments(self) -> list[str]:
-        config = self._config
-        flags = {
-            "run": self._name, "runs-dir": self._runs_dir, "listen": self._endpoint, "population": config.population,
-            "episodes": config.episodes, "horizon": config.horizon, "patience": config.patience,
-            "sigma0": config.sigma0, "seed": config.seed, "minutes": config.minutes, "evaluate-every": 0,
-        }  # fmt: skip
-        return [text for name, value in flags.items() for text in (f"--{name}", str(value))]
 
     def _connect(self, coordinator: subprocess.Popen[bytes]) -> Client:
         deadline = time.monotonic() + START_SECONDS
@@ -108,13 +118,13 @@ class Demo:
                 if time.monotonic() > deadline:
                     raise
 
-    def _watch(self, client: Client, coordinator: subprocess.Popen[bytes]) -> None:
+    def _watch(self, client: Client, coordinator: subprocess.Popen[bytes], run: str) -> None:
         with Live(console=self._console, refresh_per_second=4) as live:
             while coordinator.poll() is None:
                 try:
-                    status = client.status(self._name)
-                    workers = list(client.pages("workers", self._name))
-                    live.update(run_panel(status, workers, list(client.pages("history", self._name))))
+                    status = client.status(run)
+                    workers = list(client.pages("workers", run))
+                    live.update(run_panel(status, workers, list(client.pages("history", run))))
                 except (ConnectionFailedError, IndexError):
                     pass  # it is starting, or has just ended
                 try:
@@ -125,7 +135,7 @@ class Demo:
     def _spawn(self, stack: ExitStack, verb: str, *arguments: str) -> subprocess.Popen[bytes]:
         """Start a verb whose words go to a log in the run's folder; it ends when the stack does."""
         name = arguments[arguments.index("--name") + 1] if "--name" in arguments else verb
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self._logs.mkdir(parents=True, exist_ok=True)
         log = stack.enter_context(self._log(name).open("wb"))
         process = subprocess.Popen(  # noqa: S603 - our own interpreter and our own arguments
             _command(verb, *arguments), stdout=log, stderr=log, start_new_session=True
@@ -138,12 +148,13 @@ class Demo:
         if result.returncode != 0:
             raise DreamfleetError(f"dreamfleet {verb} failed")
 
-    def _plot(self) -> None:
+    def _plot(self, stage: Stage) -> None:
         from coordinator.plot import plot_fitness
 
-        with open_run(self._runs_dir, self._name) as run:
-            plot_fitness(run, self._folder / PLOT)
-        self._console.print(f"{self._folder / PLOT}: fitness over generations")
+        path = self._runs_dir / stage.run / PLOT
+        with open_run(self._runs_dir, stage.run) as run:
+            plot_fitness(run, path)
+        self._console.print(f"{path}: fitness over generations")
 
     def _farewell(self) -> None:
         controller = self._folder / CONTROLLER
@@ -151,7 +162,7 @@ class Demo:
             f"\n[bold]In {self._folder}[/]: the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
         )
         for command in (
-            f"dreamfleet replay {self._name} --candidate 0/0",
+            f"dreamfleet replay {self._stages[-1].run} --candidate 0/0",
             f"dreamfleet evaluate --controller {controller} --episodes 100",
             f"dreamfleet coordinator --run mine --preset frugal --listen {self._endpoint}   "
             "# and, on any host: dreamfleet worker --connect tcp/HOST:PORT",
@@ -162,11 +173,35 @@ class Demo:
         self._console.print(f"[bold]{text}[/]")
 
     def _log(self, name: str) -> Path:
-        return self._folder / f"{name}.log"
+        return self._logs / f"{name}.log"
 
     def _last_words(self, name: str) -> str:
         lines = self._log(name).read_text(errors="replace").strip().splitlines()
         return lines[-1].removeprefix("dreamfleet: ") if lines else f"the {name} ended without a word"
+
+
+def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
+    """The demonstration's runs, in order."""
+    found = []
+    reality: dict[str, object] = {
+        "population": config.population, "episodes": config.episodes, "horizon": config.horizon,
+        "patience": config.patience, "sigma0": config.sigma0, "seed": config.seed, "minutes": config.minutes,
+        "evaluate-every": 0,
+    }  # fmt: skip
+    if config.dream_minutes:
+        dream = f"{name}-dream"
+        flags = {
+            "preset": "dream", "temperature": config.temperature, "sigma0": config.sigma0, "seed": config.seed,
+            "minutes": config.dream_minutes, "reality-check": CHECK_EVERY, "evaluation-episodes": CHECK_TRACKS,
+        }  # fmt: skip
+        found.append(Stage(dream, f"evolving in the dream for {config.dream_minutes:g} minutes", flags))
+        reality |= {
+            "init": runs_dir / dream / CONTROLLER, "sigma0": config.sigma0 / 2,
+            "evaluate-every": CHECK_EVERY, "evaluation-episodes": CHECK_TRACKS,
+        }  # fmt: skip
+    if config.minutes:
+        found.append(Stage(name, f"evolving in reality for {config.minutes:g} minutes", reality))
+    return tuple(found)
 
 
 def _command(verb: str, *arguments: str) -> Sequence[str]:

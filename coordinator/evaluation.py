@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from common.messages import TaskSpec
+from common.runs import StoredEvaluation
 from common.seeds import validation_seeds
 from coordinator.jobs import Work, make_work
 
@@ -20,3 +23,15 @@ class Evaluation:
     def work(self, spec: TaskSpec) -> list[Work]:
         """Its jobs."""
         return make_work(spec, "evaluate", self.generation, 0, self.vector, validation_seeds(self.episodes))
+
+
+def parted(evaluations: Sequence[StoredEvaluation], count: int) -> bool:
+    """Whether the last `count` evaluations each lie two standard errors of the difference below the best before them.
+
+    That is how a dream that is being exploited looks: fitness in the dream goes on rising, reality falls.
+    """
+    before, last = evaluations[:-count], evaluations[-count:]
+    if not before:
+        return False
+    best = max(before, key=lambda each: each.mean)
+    return all(best.mean - each.mean > 2 * math.hypot(best.error, each.error) for each in last)

@@ -12,6 +12,8 @@ import numpy as np
 
 from common.runs import RunFolder
 
+DREAM = "dream"
+
 
 def plot_fitness(run: RunFolder, path: Path) -> None:
     """Write a PNG: each generation's mean, spread and best; evaluations of the mean where there are any."""
@@ -20,19 +22,28 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     mean = np.array([each.mean for each in history])
     std = np.array([each.std for each in history])
     figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
+    dreamt = settings.task.task == DREAM
     axes.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label="± 1 standard deviation")
     axes.plot(number, mean, color="tab:blue", label="mean of the population")
     axes.plot(number, [each.best for each in history], color="tab:orange", linewidth=1, label="best candidate")
+    handles = axes.get_legend_handles_labels()
     if evaluations:
-        axes.errorbar(
+        real = axes.twinx() if dreamt else axes
+        episodes = f"{settings.evaluation_episodes} whole episodes"
+        real.errorbar(
             [each.generation for each in evaluations], [each.mean for each in evaluations],
-            [each.std / np.sqrt(each.episodes) for each in evaluations], fmt="o", color="tab:green", capsize=3,
-            label=f"evaluated mean, {settings.evaluation_episodes} whole episodes (± standard error)",
+            [each.error for each in evaluations], fmt="o-" if dreamt else "o", color="tab:green", capsize=3,
+            label=f"evaluated mean{' in reality' if dreamt else ''}, {episodes} (± standard error)",
         )  # fmt: skip
+        if dreamt:
+            real.set_ylabel(f"score in reality, {episodes}", color="tab:green")
+            handles = tuple(a + b for a, b in zip(handles, real.get_legend_handles_labels(), strict=True))
+        else:
+            handles = axes.get_legend_handles_labels()
     task, size = settings.task, f"{settings.population} candidates x {settings.episodes} episodes"
-    axes.set(xlabel="generation", ylabel=f"fitness over {task.horizon} steps")
+    axes.set(xlabel="generation", ylabel=f"fitness over {task.horizon} {'dreamt ' * dreamt}steps")
     axes.set_title(f"{run.name}: {task.task}, {size}, seed {settings.seed}", fontsize=11)
     axes.grid(alpha=0.3)
-    axes.legend(loc="best", fontsize=9)
+    axes.legend(*handles, loc="best", fontsize=9)
     figure.savefig(path, dpi=120)
     plt.close(figure)

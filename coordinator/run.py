@@ -15,7 +15,7 @@ from common.messages import HelloRequest, Result, ResultBatch
 from common.runs import CONTROLLER, RunSettings, StoredEvaluation, StoredGeneration
 from common.seeds import training_seed
 from coordinator.config import LimitsConfig
-from coordinator.evaluation import Evaluation
+from coordinator.evaluation import Evaluation, parted
 from coordinator.evolution import Evolution, EvolutionConfig
 from coordinator.fleet import Fleet
 from coordinator.generation import Generation
@@ -272,6 +272,8 @@ class Run:
         best = self.best
         if limits.target is not None and best is not None and best.mean >= limits.target:
             return f"the mean of generation {best.generation} reached {best.mean:.1f}"
+        if best is not None and limits.parted and parted(self.evaluations, limits.parted):
+            return f"the evaluated mean fell behind generation {best.generation}'s"
         return None
 
     def _end(self, reason: str) -> None:

@@ -1,0 +1,70 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from common.errors import BundleError, UsageError
+from common.messages import TaskSpec
+from tests.support.bundles import write_random_bundle
+from worker.dream.environment import CarRacingDream
+from worker.dream.scoring import Dreamer
+from worker.rollout import Course, rollout
+from worker.tasks.dream import DreamPolicy
+
+HORIZON = 20
+
+
+@pytest.fixture(scope="module")
+def dreaming(random_bundle):
+    return Dreamer(random_bundle, spec(random_bundle))
+
+
+def spec(bundle, **changes):
+    return dataclasses.replace(TaskSpec("dream", bundle.sha256, HORIZON, 0, temperature=1.3), **changes)
+
+
+def candidates(bundle, count):
+    random = np.random.default_rng(4)
+    return [random.normal(0, 0.3, bundle.controller_shape.size).astype(np.float32) for _ in range(count)]
+
+
+def test_a_fitness_is_the_same_bits_alone_in_any_batch_and_in_any_order(dreaming, random_bundle):
+    dreams = [(vector, seed) for vector in candidates(random_bundle, 20) for seed in (1, 2, 3)]
+    together = dreaming.score(dreams)
+    assert len({score.fitness for score in together}) == len(dreams)
+    assert dreaming.score(dreams[::-1])[::-1] == together
+    assert [dreaming.score([dream])[0] for dream in dreams[:7]] == together[:7]
+    assert dreaming.score(dreams[11:16]) == together[11:16]
+
+
+def test_the_environment_dreams_the_same_bits(dreaming, random_bundle):
+    environment = CarRacingDream(random_bundle, temperature=1.3, horizon=HORIZON)
+    for vector, seed in zip(candidates(random_bundle, 3), (5, 6, 7), strict=True):
+        (batched,) = dreaming.score([(vector, seed)])
+        assert rollout(environment, DreamPolicy(random_bundle), vector, Course(seed, HORIZON)) == batched
+
+
+def test_steps_are_told_as_they_are_made(dreaming, random_bundle):
+    told = []
+    dreaming.score([(vector, 1) for vector in candidates(random_bundle, 3)], told.append)
+    assert told == [3 * step for step in range(1, HORIZON + 1)]
+
+
+def test_another_temperature_is_another_dream(dreaming, random_bundle):
+    dreams = [(candidates(random_bundle, 1)[0], 1)]
+    colder = Dreamer(random_bundle, spec(random_bundle, temperature=0.5))
+    assert colder.score(dreams) != dreaming.score(dreams)
+
+
+def test_a_vector_that_is_no_controller_is_refused(dreaming, random_bundle):
+    (vector,) = candidates(random_bundle, 1)
+    vector[3] = np.nan
+    for wrong in (vector, vector[:-1]):
+        with pytest.raises(UsageError, match="finite parameters"):
+            dreaming.score([(wrong, 1)])
+
+
+def test_a_bundle_without_beginnings_is_refused(tmp_path, random_bundle):
+    empty = write_random_bundle(tmp_path / "empty.zip", initial=np.zeros((0, 2, 32), np.float32))
+    with pytest.raises(BundleError, match="a dream begins at recorded latents"):
+        Dreamer(empty, spec(empty))

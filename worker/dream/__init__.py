@@ -1,0 +1,20 @@
+"""CarRacing as the MDN-RNN dreams it: a place to evolve in, and environments for whoever wants to look.
+
+Importing this registers `dreamfleet/CarRacingDream-v0`, also for `gymnasium.make_vec`.
+
+>>> import gymnasium, worker.dream
+>>> environment = gymnasium.make("dreamfleet/CarRacingDream-v0")
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+ENVIRONMENT = "dreamfleet/CarRacingDream-v0"
+
+gymnasium.register(
+    id=ENVIRONMENT,
+    entry_point="worker.dream.environment:CarRacingDream",
+    vector_entry_point="worker.dream.environment:CarRacingDreams",
+    kwargs={"bundle": "tiny"},
+)

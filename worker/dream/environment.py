@@ -1,0 +1,147 @@
+"""The dream as gymnasium environments, one and many: they observe latents, and are rendered by the decoder."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from common.bundle import Bundle, find_bundle
+from worker.dream.noise import Draw, Noise
+from worker.dream.world import DreamWorld
+from worker.worldmodel.inference import Decoder
+
+Floats = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+FRAMES_PER_SECOND = 50  # CarRacing's
+
+
+def action_space() -> spaces.Box:
+    """CarRacing's: steering, gas, brake."""
+    return spaces.Box(np.array([-1, 0, 0], np.float32), np.array([1, 1, 1], np.float32))
+
+
+def open_bundle(bundle: Bundle | str) -> Bundle:
+    """A bundle, or the one of that name or file."""
+    return find_bundle(bundle) if isinstance(bundle, str) else bundle
+
+
+class CarRacingDream(gymnasium.Env[Floats, Floats]):
+    """One dream: observes the latent `(latent,)`, takes CarRacing's actions `(3,)`.
+
+    An episode is a pure function of its seed and actions. It ends where the model's done head says so, and is
+    truncated after `horizon` steps.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012 - gymnasium's name
+
+    def __init__(
+        self, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int = 1000,
+        render_mode: str | None = None,
+    ) -> None:  # fmt: skip
+        self._bundle = open_bundle(bundle)
+        self._world = DreamWorld(self._bundle, temperature)
+        self._horizon = horizon
+        self.render_mode = render_mode
+        self._decoder = Decoder(self._bundle) if render_mode else None
+        self.observation_space = spaces.Box(-np.inf, np.inf, (self._world.latent_size,), np.float32)
+        self.action_space = action_space()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        """Begin a dream; without a seed, one after the last."""
+        super().reset(seed=seed, options=options)
+        dream = int(self.np_random.integers(2**31)) if seed is None else seed
+        self._noise = Noise(dream, self._world.latent_size)
+        self._latent = self._noise.begin(self._world.initial)[None]
+        self._state = self._world.begin(1)
+        self._steps = 0
+        return self._latent[0], {}
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        """Dream one step under `action` `(3,)`."""
+        given = np.asarray(action, dtype=np.float32).reshape(1, 3)
+        if not np.isfinite(given).all():
+            raise ValueError("an action must be three finite numbers")
+        uniform, normal = self._noise.next()
+        moment = self._world.imagine(self._latent, given, self._state, Draw(uniform[None], normal[None]))
+        self._latent, self._state = moment.latent, moment.state
+        self._steps += 1
+        truncated = self._steps >= self._horizon
+        return self._latent[0], float(moment.reward[0]), bool(moment.done[0]), truncated, {}
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The picture `(64, 64, 3)` that the decoder makes of the latent."""
+        return None if self._decoder is None else self._decoder.decode(self._latent)[0]
+
+
+class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
+    """Many dreams in one batch; one that has ended begins anew at the next step, as gymnasium's vector environments do.
+
+    Dream i of `reset(seed=s)` is the single environment's of seed `s + i`.
+    """
+
+    metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - gymnasium's name
+
+    def __init__(
+        self, num_envs: int, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int = 1000,
+        render_mode: str | None = None,
+    ) -> None:  # fmt: skip
+        self._bundle = open_bundle(bundle)
+        self._world = DreamWorld(self._bundle, temperature)
+        self._horizon = horizon
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self._decoder = Decoder(self._bundle) if render_mode else None
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (self._world.latent_size,), np.float32)
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin every dream; `seed` is the first one's, or a list of all."""
+        super().reset(seed=seed if isinstance(seed, int) else None, options=options)
+        seeds = list(seed) if isinstance(seed, (list, tuple)) else [None] * self.num_envs
+        if isinstance(seed, int):
+            seeds = [seed + index for index in range(self.num_envs)]
+        self._latent = np.zeros((self.num_envs, self._world.latent_size), dtype=np.float32)
+        self._state = self._world.begin(self.num_envs)
+        self._noise: list[Noise] = [Noise(0, 1)] * self.num_envs
+        self._steps = np.zeros(self.num_envs, dtype=np.int64)
+        self._over = np.zeros(self.num_envs, dtype=bool)
+        for index, each in enumerate(seeds):
+            self._begin(index, each)
+        return self._latent.copy(), {}
+
+    def step(
+        self, actions: Floats
+    ) -> tuple[Floats, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Dream one step under `actions` `(num_envs, 3)`."""
+        draws = [noise.next() for noise in self._noise]
+        draw = Draw(np.stack([uniform for uniform, _ in draws]), np.stack([normal for _, normal in draws]))
+        given = np.asarray(actions, dtype=np.float32)
+        moment = self._world.imagine(self._latent, given, self._state, draw)
+        self._latent, self._state = moment.latent.copy(), moment.state.copy()
+        self._steps += 1
+        reward, done, truncated = moment.reward.copy(), moment.done.copy(), self._steps >= self._horizon
+        for index in np.flatnonzero(self._over):
+            self._begin(int(index), None)
+            reward[index], done[index], truncated[index] = 0.0, False, False
+        self._over = done | truncated
+        return self._latent.copy(), reward, done, truncated, {}
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+        """Each dream's picture `(64, 64, 3)`."""
+        return None if self._decoder is None else tuple(self._decoder.decode(self._latent))
+
+    def _begin(self, index: int, seed: int | None) -> None:
+        dream = int(self.np_random.integers(2**31)) if seed is None else seed
+        self._noise[index] = Noise(dream, self._world.latent_size)
+        self._latent[index] = self._noise[index].begin(self._world.initial)
+        self._state[index] = 0
+        self._steps[index] = 0

@@ -1,0 +1,68 @@
+"""The dream as a task: candidates are scored in it, many at once; what is reported is driven in reality."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from common.bundle import Bundle
+from common.messages import TaskSpec
+from worker.dream.scoring import Dreamer
+from worker.tasks.car_racing import CarRacing
+from worker.worldmodel.inference import DreamStep
+
+WIDTH = 256  # rows of a batch: larger ones are no faster
+Floats = NDArray[np.float32]
+
+
+class Dream:
+    """The task `dream`."""
+
+    name = "dream"
+    width = WIDTH
+
+    def __init__(self) -> None:
+        self.reality = CarRacing()
+
+    def make_environment(self) -> gymnasium.Env[Any, Any]:
+        """CarRacing with the native picture: evaluations are driven, not dreamt."""
+        return self.reality.make_environment()
+
+    def make_judge(self) -> gymnasium.Env[Any, Any]:
+        """The unmodified CarRacing of gymnasium."""
+        return self.reality.make_judge()
+
+    def make_policy(self, bundle: Bundle) -> Any:
+        """The policy that drives."""
+        return self.reality.make_policy(bundle)
+
+    def make_batch(self, bundle: Bundle, spec: TaskSpec) -> Dreamer:
+        """What scores candidates."""
+        self.reality.check(bundle)
+        return Dreamer(bundle, spec)
+
+
+class DreamPolicy:
+    """A controller inside a dream environment: it observes the latent, and remembers as the dream does."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._step = DreamStep(bundle)
+        self._state = self._step.zero_state(1)
+        self._parameters = np.zeros((1, self._step.shape.size), dtype=np.float32)
+
+    def begin(self, parameters: Floats) -> None:
+        """Begin an episode with this controller's flat vector."""
+        self._step.shape.check(parameters)
+        self._parameters = parameters.astype(np.float32).reshape(1, -1)
+        self._state = self._step.zero_state(1)
+
+    def act(self, observation: Floats) -> Floats:
+        """Steering, gas and brake `(3,)` for one latent."""
+        latent = observation[None]
+        action = self._step.act(latent, self._parameters, self._state)
+        self._state = self._step.advance(latent, action, self._state)
+        chosen: Floats = action[0]
+        return chosen
