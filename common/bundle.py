@@ -12,20 +12,23 @@ import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
 from common.codec import MalformedError, from_plain
 from common.controller import ControllerShape
-from common.errors import BundleError
+from common.errors import BundleError, ControllerError
+from common.fields import OPTIONAL, written
 from common.files import write_aside
 from common.messages import Between, Word
 
 FORMAT = 1
 MANIFEST = "manifest.json"
 ENCODER, DECODER, POLICY, INITIAL = "encoder.onnx", "decoder.onnx", "policy.onnx", "initial_latents.npy"
+DREAM = "dream.onnx"  # a step of the dream; bundles from before it have none
+LINEAR, LAYERED = "controller-linear.onnx", "controller-hidden.onnx"  # controllers of any size, a row each
 WEIGHTS = "weights.safetensors"  # only in bundles that training goes on from
 REQUIRED = (ENCODER, DECODER, POLICY, INITIAL)
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -46,15 +49,18 @@ class Manifest:
     parts: dict[str, Any] = field(default_factory=dict)  # name -> SHA-256; filled in as the bundle is written
     provenance: dict[str, Any] = field(default_factory=dict)
     format: int = FORMAT
+    # The configurations of `vae` and `mdnrnn`; empty in bundles from before they were kept: the paper's.
+    models: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)
 
 
 class Bundle:
-    """A verified bundle."""
+    """A verified bundle, under the controllers that a run evolves."""
 
-    def __init__(self, path: Path, sha256: str, manifest: Manifest) -> None:
+    def __init__(self, path: Path, sha256: str, manifest: Manifest, shape: ControllerShape | None = None) -> None:
         self.path = path
         self.sha256 = sha256
         self.manifest = manifest
+        self._shape = shape
 
     @classmethod
     def open(cls, path: Path) -> Bundle:
@@ -73,9 +79,35 @@ class Bundle:
         return cls(path, sha256, manifest)
 
     @property
+    def default_shape(self) -> ControllerShape:
+        """A linear controller on latent and hidden state: what the policy's one graph holds."""
+        return self.shape_of("zh")
+
+    @property
     def controller_shape(self) -> ControllerShape:
-        """What a linear controller on latent and hidden state looks like."""
-        return ControllerShape(self.manifest.latent + self.manifest.hidden, self.manifest.actions)
+        """The controllers that this bundle is under: `default_shape` unless `under` said otherwise."""
+        return self._shape or self.default_shape
+
+    def shape_of(self, features: str, hidden: int = 0) -> ControllerShape:
+        """Controllers that see `z` or `zh` (latent, or latent and hidden state), through `hidden` units; 0: linear."""
+        width = self.manifest.latent + (self.manifest.hidden if features == "zh" else 0)
+        return ControllerShape(width, self.manifest.actions, hidden)
+
+    def under(self, shape: ControllerShape | None) -> Bundle:
+        """This bundle under controllers of another shape; `ControllerError` if it cannot be, `None`: the default."""
+        if shape is None or shape == self.default_shape:
+            return Bundle(self.path, self.sha256, self.manifest)
+        if shape not in (self.shape_of("z", shape.hidden), self.shape_of("zh", shape.hidden)):
+            raise ControllerError(
+                f"a controller of {shape.size} parameters does not fit {self.path.name}, which needs "
+                f"{self.default_shape.size}, or other inputs: latent {self.manifest.latent}, hidden "
+                f"{self.manifest.hidden}, {self.manifest.actions} actions"
+            )
+        if not {DREAM, LINEAR, LAYERED} <= self.manifest.parts.keys():
+            raise BundleError(
+                f"{self.path.name} is from before other controllers than the linear one on z and h: build it again"
+            )
+        return Bundle(self.path, self.sha256, self.manifest, shape)
 
     def read(self, name: str) -> bytes:
         """One part's bytes; `BundleError` if the bundle has no such part."""
@@ -88,7 +120,7 @@ class Bundle:
 def write_bundle(path: Path, manifest: Manifest, parts: Mapping[str, bytes]) -> Bundle:
     """Write a bundle whole or not at all, and open it."""
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(parts.items())}
-    text = json.dumps({**asdict(manifest), "parts": hashes}, indent=1, sort_keys=True)
+    text = json.dumps({**written(manifest), "parts": hashes}, indent=1, sort_keys=True)
     with write_aside(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in [(MANIFEST, text.encode()), *sorted(parts.items())]:
             archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgpack
 
+from common.fields import optionals
 from common.keys import PROTOCOL_VERSION
 from common.messages import MAX_MESSAGE, Between, Length, Message
 
@@ -118,7 +119,13 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     kind: Any = type(value)
     names = _field_names(kind)
-    return {name: _plain(getattr(value, name)) for name in names} if names else value
+    if not names:
+        return value
+    plain = {name: _plain(getattr(value, name)) for name in names}
+    for name, default in optionals(kind).items():
+        if getattr(value, name) == default:
+            del plain[name]
+    return plain
 
 
 @cache
@@ -173,13 +180,15 @@ def _dataclass_checker(kind: type[Any]) -> Check:
     hints = get_type_hints(kind, include_extras=True)
     checks = {field.name: _checker(hints[field.name]) for field in fields(kind)}
     names = frozenset(checks)
+    document: Any = kind  # mypy takes no class for hashable
+    required = names - optionals(document).keys()
 
     def build(value: Any) -> Any:
         if not isinstance(value, dict):
             raise MalformedError("wrong type")
-        if value.keys() != names:
+        if not required <= value.keys() <= names:
             raise MalformedError("wrong fields")
-        return kind(**{name: check(value[name]) for name, check in checks.items()})
+        return kind(**{name: check(value[name]) for name, check in checks.items() if name in value})
 
     return build
 

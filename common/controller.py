@@ -1,6 +1,7 @@
 """The evolved controller: its shape, how a flat vector packs it, and the formula in NumPy.
 
-A single linear layer (Ha & Schmidhuber 2018, section 2.3): a = W [z; h] + b, squashed to CarRacing's ranges.
+A single linear layer (Ha & Schmidhuber 2018, section 2.3): a = W [z; h] + b, squashed to CarRacing's ranges; its
+ablations see z alone, or have a layer of tanh units between.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import ControllerError
+from common.fields import OPTIONAL, written
 from common.files import write_aside
 
 FORMAT = 1
@@ -24,26 +26,45 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class ControllerShape:
-    """What a flat parameter vector means: a linear map from `features` inputs to `actions` outputs, with bias."""
+    """What a flat parameter vector means: `features` inputs to `actions` outputs, with biases.
+
+    Linear, or through one layer of `hidden` tanh units (Ha & Schmidhuber 2018, table 2).
+    """
 
     features: int
     actions: int = 3
+    hidden: int = field(default=0, metadata=OPTIONAL)
+
+    @property
+    def layers(self) -> tuple[tuple[int, int], ...]:
+        """Outputs and inputs of each layer, first to last."""
+        if self.hidden:
+            return (self.hidden, self.features), (self.actions, self.hidden)
+        return ((self.actions, self.features),)
 
     @property
     def size(self) -> int:
-        """Length of the flat vector: the weights row by row, then the biases."""
-        return self.actions * (self.features + 1)
+        """Length of the flat vector: layer after layer its weights row by row, then its biases."""
+        return sum(outputs * (inputs + 1) for outputs, inputs in self.layers)
 
-    def unpack(self, parameters: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Split `(..., size)` into weights `(..., actions, features)` and biases `(..., actions)`."""
-        if parameters.shape[-1] != self.size:
+    def check(self, parameters: NDArray[np.float32]) -> None:
+        """`ControllerError` unless the last axis of `parameters` is `size` long."""
+        if parameters.shape[-1:] != (self.size,):
+            sizes = " + ".join(f"{outputs} x ({inputs} + 1 bias)" for outputs, inputs in self.layers)
             raise ControllerError(
-                f"a controller of {parameters.shape[-1]} parameters does not fit: this world model needs {self.size} "
-                f"({self.actions} actions x ({self.features} features + 1 bias))"
+                f"a controller of {parameters.shape[-1]} parameters does not fit: this run needs {self.size} ({sizes})"
             )
-        split = self.actions * self.features
-        weights = parameters[..., :split].reshape(*parameters.shape[:-1], self.actions, self.features)
-        return weights, parameters[..., split:]
+
+    def unpack(self, parameters: NDArray[np.float32]) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """Split `(..., size)` into each layer's weights `(..., outputs, inputs)` and biases `(..., outputs)`."""
+        self.check(parameters)
+        layers, start = [], 0
+        for outputs, inputs in self.layers:
+            middle, end = start + outputs * inputs, start + outputs * (inputs + 1)
+            weights = parameters[..., start:middle].reshape(*parameters.shape[:-1], outputs, inputs)
+            layers.append((weights, parameters[..., middle:end]))
+            start = end
+        return layers
 
 
 def act(shape: ControllerShape, parameters: NDArray[np.float32], features: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -51,9 +72,10 @@ def act(shape: ControllerShape, parameters: NDArray[np.float32], features: NDArr
 
     Source: hardmaru/WorldModelsExperiments, carracing: tanh; gas (tanh + 1) / 2; brake clip(tanh, 0, 1).
     """
-    weights, biases = shape.unpack(parameters)
-    squashed = np.tanh(weights @ features + biases)
-    steer, gas, brake = squashed
+    value = features
+    for weights, biases in shape.unpack(parameters):
+        value = np.tanh(weights @ value + biases)
+    steer, gas, brake = value
     return np.array([steer, (gas + 1) / 2, np.clip(brake, 0, 1)], dtype=np.float32)
 
 
@@ -83,7 +105,7 @@ class Controller:
 
     def save(self, path: Path) -> None:
         """Write an `.npz` that `load` reads; whole or not at all."""
-        about = {"format": FORMAT, "shape": asdict(self.shape), "task": self.task, "bundle": self.bundle}
+        about = {"format": FORMAT, "shape": written(self.shape), "task": self.task, "bundle": self.bundle}
         text = json.dumps({**about, "provenance": self.provenance}, sort_keys=True)
         with write_aside(path) as file:
             np.savez(file, parameters=self.parameters, about=np.array(text))

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Annotated, Any, ClassVar, Literal
+
+from common.controller import ControllerShape
+from common.fields import OPTIONAL, written
 
 MAX_MESSAGE = 48 * 1024
 MAX_PART = 40 * 1024  # room for the envelope around a part's bytes
@@ -55,6 +58,7 @@ class TaskSpec:
     bundle: Annotated[str, Length(64, 64)]  # SHA-256 of the bundle's file, hexadecimal
     horizon: Annotated[int, Between(1, 10**6)]  # an episode's steps at most, when scored for the strategy
     patience: Annotated[int, Between(0, 10**6)]  # steps without reward before a scored episode is cut; 0: never
+    controller: ControllerShape | None = field(default=None, metadata=OPTIONAL)  # `None`: linear on z and h
 
     def digest(self, kind: Kind, vector: bytes, seeds: tuple[int, ...]) -> bytes:
         """A job's identity: SHA-256 over its kind, this specification, the parameters' hash and the seeds."""
@@ -64,7 +68,7 @@ class TaskSpec:
 
 @cache
 def _spec_text(spec: TaskSpec) -> str:
-    return json.dumps(asdict(spec), sort_keys=True)
+    return json.dumps(written(spec), sort_keys=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,6 +19,7 @@ from common import schema
 from common.codec import MalformedError, from_plain
 from common.controller import ControllerShape
 from common.errors import JournalError, UsageError
+from common.fields import OPTIONAL, written
 from common.keys import check_run_name
 from common.messages import Between, Count, TaskSpec
 
@@ -41,17 +42,19 @@ class RunSettings:
     seed: Count
     evaluate_every: Count  # generations; 0: never
     evaluation_episodes: Annotated[int, Between(1, 10**4)]
-    racing: bool = False  # only the better half of the candidates drives the second half of the episodes
+    # Only the better half of the candidates drives the second half of the episodes.
+    racing: bool = field(default=False, metadata=OPTIONAL)
+    features: Literal["zh", "z"] = field(default="zh", metadata=OPTIONAL)  # what the controller sees
 
     def to_json(self) -> str:
         """The text kept in the journal."""
-        return json.dumps(asdict(self), sort_keys=True)
+        return json.dumps(written(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> RunSettings:
         """Read what `to_json` wrote; `JournalError` if it is damaged."""
         try:
-            return from_plain(cls, {"racing": False, **json.loads(text)})
+            return from_plain(cls, json.loads(text))
         except (ValueError, TypeError, MalformedError) as error:
             raise JournalError(f"the journal's settings are damaged: {error}") from error
 

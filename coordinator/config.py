@@ -19,6 +19,9 @@ class RunConfig:
 
     task: str = option("car-racing", "what candidates are scored in; a worker must know it")
     bundle: str = option("tiny", "the frozen world model: a shipped name or a file")
+    controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
+    hidden_units: int = option(8, "units of a hidden controller's layer")
+    features: Literal["zh", "z"] = option("zh", "what the controller sees: latent and hidden state, or latent alone")
     population: int = option(32, "candidates a generation")
     episodes: int = option(2, "episodes a candidate, on the same fresh tracks for all")
     sigma0: float = option(0.1, "first step size")
@@ -34,7 +37,15 @@ class RunConfig:
     evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation tracks")
 
     def __post_init__(self) -> None:
-        bounds = {"population": 2, "episodes": 1, "horizon": 1, "patience": 0, "seed": 0, "evaluate_every": 0}
+        bounds = {
+            "population": 2,
+            "episodes": 1,
+            "horizon": 1,
+            "patience": 0,
+            "seed": 0,
+            "evaluate_every": 0,
+            "hidden_units": 1,
+        }
         for name, least in {**bounds, "evaluation_episodes": 1}.items():
             if getattr(self, name) < least:
                 raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
@@ -45,9 +56,11 @@ class RunConfig:
 
     def settings(self, bundle: Bundle) -> RunSettings:
         """What the journal keeps: the bundle by its hash."""
+        shape = bundle.shape_of(self.features, self.hidden_units if self.controller == "hidden" else 0)
+        named = None if shape == bundle.default_shape else bundle.under(shape).controller_shape
         return RunSettings(
-            task=TaskSpec(self.task, bundle.sha256, self.horizon, self.patience),
-            controller=bundle.controller_shape,
+            task=TaskSpec(self.task, bundle.sha256, self.horizon, self.patience, named),
+            controller=shape,
             population=self.population,
             episodes=self.episodes,
             sigma0=self.sigma0,
@@ -56,13 +69,15 @@ class RunConfig:
             evaluate_every=self.evaluate_every,
             evaluation_episodes=self.evaluation_episodes,
             racing=self.racing,
+            features=self.features,
         )
 
 
 def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:
     """The settings of a run as they would be configured; `bundle` is where its copy of the world model lies."""
     frozen = {each.name: getattr(run, each.name) for each in fields(RunConfig) if hasattr(run, each.name)}
-    spec = run.task
+    spec, hidden = run.task, run.controller.hidden
+    frozen |= {"controller": "hidden", "hidden_units": hidden} if hidden else {"controller": "linear"}
     return {**frozen, "task": spec.task, "horizon": spec.horizon, "patience": spec.patience, "bundle": str(bundle)}
 
 

@@ -66,9 +66,10 @@ def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle]:
     """What the run is, and its verified bundle."""
     if request.config is not None:
         bundle = find_bundle(request.config.bundle)
+        settings = request.config.settings(bundle)
         if request.start is not None:
-            request.start.check(request.config.task, bundle)
-        return request.config.settings(bundle), bundle
+            request.start.check(request.config.task, bundle, settings.controller)
+        return settings, bundle
     with open_run(request.runs_dir, request.name) as stored:
         settings = stored.settings
     bundle = Bundle.open(folder / BUNDLE)

@@ -21,6 +21,7 @@ import zenoh
 from common import keys
 from common.codec import Inbox, encode, encode_json, encoding
 from common.errors import RefusedError
+from common.fields import written
 from common.fingerprint import package_version
 from common.messages import (
     MAX_PART,
@@ -213,7 +214,7 @@ class Service:
             nonce=self._nonce,
             why=why,
             remedy=remedy,
-            spec={} if why else asdict(self._run.settings.task),
+            spec={} if why else written(self._run.settings.task),
             intervals={} if why else asdict(self._intervals),
         )
 

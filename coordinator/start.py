@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.bundle import Bundle
+from common.controller import ControllerShape
 from common.errors import ControllerError, DreamfleetError
 from common.runs import RunFolder, open_run
 from common.shelf import find_controller
@@ -24,14 +25,19 @@ class Start:
     bundle: str  # SHA-256
     source: str
 
-    def check(self, task: str, bundle: Bundle) -> None:
-        """Refuse parameters that mean nothing to this task and world model."""
+    def check(self, task: str, bundle: Bundle, shape: ControllerShape) -> None:
+        """Refuse parameters that mean nothing to this task, world model and controller."""
         if self.task != task:
             raise ControllerError(f"{self.source} drives in {self.task!r}, this run scores in {task!r}")
         if self.bundle != bundle.sha256:
             raise ControllerError(
                 f"{self.source} belongs to the world model {self.bundle[:12]}, not to {bundle.path.name} "
                 f"({bundle.sha256[:12]}): give its own with --bundle"
+            )
+        if len(self.mean) != shape.size:
+            raise ControllerError(
+                f"{self.source} has {len(self.mean)} parameters, this run's controllers {shape.size}: give its own "
+                "--controller, --hidden-units and --features"
             )
 
 

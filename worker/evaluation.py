@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from common.bundle import Bundle, BundleStore, default_cache, find_bundle
 from common.controller import Controller
-from common.errors import BundleError, ControllerError, DreamfleetError
+from common.errors import BundleError, DreamfleetError
 from common.messages import TaskSpec
 from common.threads import pin_thread_pools
 from worker.scoring import Scorer
@@ -54,18 +54,13 @@ def bundle_for(controller: Controller, named: str | None, beside: Path | None = 
                 f"the controller's world model {controller.bundle[:12]}... is not here: name it with --bundle FILE"
             )
         bundle = found
-    if bundle.controller_shape != controller.shape:
-        raise ControllerError(
-            f"a controller of {controller.shape.size} parameters does not fit {bundle.path.name}, which needs "
-            f"{bundle.controller_shape.size}"
-        )
-    return bundle
+    return bundle.under(controller.shape)
 
 
 def evaluate(controller: Controller, bundle: Bundle, seeds: tuple[int, ...], jobs: int) -> Iterator[tuple[int, float]]:
     """Drive one whole episode a seed in `jobs` processes; yields (seed, score) as each ends."""
     pin_thread_pools()
-    spec = TaskSpec(controller.task, bundle.sha256, horizon=1000, patience=0)
+    spec = TaskSpec(controller.task, bundle.sha256, horizon=1000, patience=0, controller=bundle.controller_shape)
     pool = ProcessPoolExecutor(min(jobs, len(seeds)), get_context("spawn"), _start_process)
     try:
         drives = [pool.submit(_drive, spec, bundle.path, controller.parameters, seed) for seed in seeds]

@@ -69,6 +69,7 @@ def record(
             frame = canvas.draw(Moment(track, observation, decoded, action, step, score))
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
             observation, reward, terminated, truncated, _ = environment.step(action)
+            policy.reward(float(reward))
             score, step, ended = score + float(reward), step + 1, terminated or truncated
             on_step(step)
         container.mux(stream.encode())

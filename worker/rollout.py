@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.tasks.api import Policy
+from worker.tasks.api import Policy, Rewarded
 
 IDLE_COST = 0.1  # CarRacing's own cost of a step
 
@@ -49,10 +49,13 @@ def rollout(
         raise ValueError("the controller's parameters hold NaN or infinity")
     observation, _ = environment.reset(seed=course.seed)
     policy.begin(parameters)
+    rewarded = policy if isinstance(policy, Rewarded) else None
     fitness, idle, steps, ended = 0.0, 0, 0, False
     while steps < course.horizon and not ended:
         observation, reward, terminated, truncated, _ = environment.step(policy.act(observation))
         fitness += float(reward)
+        if rewarded is not None:
+            rewarded.reward(float(reward))
         steps += 1
         on_step(steps)
         ended = terminated or truncated

@@ -22,7 +22,7 @@ class Scorer:
         task = find_task(spec.task)
         self._spec = spec
         self._environment = task.make_judge() if judge else task.make_environment()
-        self._policy = task.make_policy(bundle)
+        self._policy = task.make_policy(bundle.under(spec.controller))
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None

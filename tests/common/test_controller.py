@@ -35,9 +35,20 @@ def test_zero_parameters_drive_straight_on_at_half_gas():
 
 
 def test_weights_come_row_by_row_then_biases():
-    weights, biases = SHAPE.unpack(np.arange(15, dtype=np.float32))
+    ((weights, biases),) = SHAPE.unpack(np.arange(15, dtype=np.float32))
     assert np.array_equal(weights[1], [4, 5, 6, 7])
     assert np.array_equal(biases, [12, 13, 14])
+
+
+def test_a_hidden_layer_lies_between():
+    shape = ControllerShape(features=2, hidden=4)
+    assert shape.size == 4 * 3 + 3 * 5
+    parameters = np.random.default_rng(0).normal(size=27).astype(np.float32)
+    (inner, shift), (outer, bias) = shape.unpack(parameters)
+    assert (inner.shape, shift.shape, outer.shape, bias.shape) == ((4, 2), (4,), (3, 4), (3,))
+    squashed = np.tanh(outer @ np.tanh(inner @ np.ones(2, np.float32) + shift) + bias)
+    expected = [squashed[0], (squashed[1] + 1) / 2, max(squashed[2], 0)]
+    np.testing.assert_allclose(act(shape, parameters, np.ones(2, np.float32)), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("parameters", [np.zeros(14), np.full(15, np.nan), np.full(15, np.inf)])

@@ -1,24 +1,28 @@
-"""A world model with random weights: everything but knowledge."""
+"""World models with random weights: everything but knowledge."""
 
 import numpy as np
 import torch
 
 from common.bundle import write_bundle
 from worker.training.assemble import graphs, manifest
-from worker.worldmodel.mdnrnn import MDNRNN, MDNRNNConfig
-from worker.worldmodel.vae import VAE, VAEConfig
+from worker.worldmodel.mdnrnn import MDNRNN, REWARDED
+from worker.worldmodel.vae import PAPER, VAE
 
 
-def random_models(seed=0):
+def random_models(seed=0, vae=PAPER, rnn=REWARDED):
     torch.manual_seed(seed)
-    return VAE(VAEConfig()), MDNRNN(MDNRNNConfig())
+    models = VAE(vae), MDNRNN(rnn)
+    for name, values in models[0].state_dict().items():
+        if "running" in name:  # as if it had been trained
+            values.uniform_(0.5, 1.5)
+    return models[0].eval(), models[1].eval()
 
 
 def weights(model):
     return {name: tensor.detach().numpy() for name, tensor in model.state_dict().items()}
 
 
-def write_random_bundle(path, seed=0):
-    vae, rnn = random_models(seed)
-    initial = np.random.default_rng(seed).normal(size=(4, 2, 32)).astype(np.float32)
-    return write_bundle(path, manifest("random", {"seed": seed}), graphs(weights(vae), weights(rnn), initial))
+def write_random_bundle(path, seed=0, vae=PAPER, rnn=REWARDED):
+    models = [weights(each) for each in random_models(seed, vae, rnn)]
+    initial = np.random.default_rng(seed).normal(size=(4, 2, vae.latent)).astype(np.float32)
+    return write_bundle(path, manifest("random", {"seed": seed}, vae, rnn), graphs(*models, initial, vae, rnn))

@@ -17,8 +17,9 @@ def inputs():
     return (
         random.integers(0, 256, (ROWS, 64, 64, 3), dtype=np.uint8),
         random.normal(0, 0.1, (ROWS, 867)).astype(np.float32),
-        random.uniform(-0.9, 0.9, (ROWS, 256)).astype(np.float32),
-        random.normal(0, 1, (ROWS, 256)).astype(np.float32),
+        np.concatenate([random.uniform(-0.9, 0.9, (ROWS, 256)), random.normal(0, 1, (ROWS, 256))], axis=1).astype(
+            np.float32
+        ),
     )
 
 
@@ -43,7 +44,7 @@ def test_a_rows_bits_do_not_depend_on_its_neighbours(random_bundle, inputs):
 def test_the_graph_acts_as_the_controllers_formula(random_bundle, inputs):
     step = PolicyStep(random_bundle).step(*inputs)
     for row in range(ROWS):
-        features = np.concatenate([step.latent[row], inputs[2][row]])
+        features = np.concatenate([step.latent[row], inputs[2][row, :256]])
         expected = act(random_bundle.controller_shape, inputs[1][row], features)
         np.testing.assert_allclose(step.action[row], expected, atol=2e-6)
     assert step.action[:, 1:].min() >= 0
@@ -57,12 +58,14 @@ def test_the_graphs_compute_what_torch_does(random_bundle, inputs):
     with torch.no_grad():
         mu, logvar = vae.encode(pixels)
         steps = torch.from_numpy(np.concatenate([step.latent, step.action], axis=1))[:, None]
-        state = tuple(torch.from_numpy(each)[None] for each in inputs[2:])
+        state = tuple(
+            torch.from_numpy(each)[None]
+            for each in np.ascontiguousarray(inputs[2].reshape(ROWS, 2, 256).transpose(1, 0, 2))
+        )
         _, (hidden, cell) = rnn.lstm(steps, state)
         decoded = vae.decode(mu).permute(0, 2, 3, 1).numpy() * 255
     np.testing.assert_allclose(step.latent, mu.numpy(), atol=1e-5)
-    np.testing.assert_allclose(step.hidden, hidden[0].numpy(), atol=1e-5)
-    np.testing.assert_allclose(step.cell, cell[0].numpy(), atol=1e-5)
+    np.testing.assert_allclose(step.state, np.concatenate([hidden[0], cell[0]], axis=1), atol=1e-5)
     for one, other in zip(Encoder(random_bundle).encode(inputs[0]), (mu, logvar), strict=True):
         np.testing.assert_allclose(one, other.numpy(), atol=1e-5)
     np.testing.assert_allclose(Decoder(random_bundle).decode(mu.numpy()), decoded, atol=1.0)

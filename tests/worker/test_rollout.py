@@ -35,6 +35,20 @@ class Still:
         return np.zeros(1)
 
 
+class Listening(Still):
+    def begin(self, parameters):
+        self.heard = []
+
+    def reward(self, value):
+        self.heard.append(value)
+
+
+def test_a_policy_that_listens_hears_every_reward():
+    policy = Listening()
+    rollout(Scripted([1.0, 2.0, 3.5]), policy, PARAMETERS, Course(1, 100))
+    assert policy.heard == [1.0, 2.0, 3.5]
+
+
 def test_fitness_is_the_sum_of_rewards_until_the_end():
     assert rollout(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 100)) == (
         rollout(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 3))

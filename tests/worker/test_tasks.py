@@ -4,7 +4,9 @@ import pytest
 
 from common.bundle import Manifest, write_bundle
 from common.errors import BundleError, ControllerError, UsageError
+from common.messages import TaskSpec
 from tests.support import tasks
+from worker.scoring import Scorer
 from worker.tasks.api import find_task, known_tasks
 from worker.tasks.preprocessing import picture
 
@@ -57,6 +59,15 @@ def test_an_episode_begins_from_nothing_whatever_was_driven_before(random_bundle
         episodes.append(np.stack([policy.act(each) for each in (*pictures, pictures[0])]))
     assert (episodes[0] == episodes[1]).all()
     assert (episodes[0][0] != episodes[0][-1]).any(), "the state changes what the same picture leads to"
+
+
+def test_a_job_is_scored_under_the_controller_that_its_run_names(random_bundle):
+    shape = random_bundle.shape_of("z", 4)
+    scorer = Scorer(TaskSpec("car-racing", random_bundle.sha256, 5, 0, shape), random_bundle)
+    assert scorer.score("score", np.zeros(shape.size, np.float32), 3).steps == 5
+    with pytest.raises(ControllerError, match="867 parameters"):
+        scorer.score("score", np.zeros(867, np.float32), 3)
+    scorer.close()
 
 
 def test_a_controller_of_another_size_is_refused(random_bundle):

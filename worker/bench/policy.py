@@ -16,11 +16,11 @@ def bench_policy(bundle: Bundle) -> dict[str, float | str | None]:
     policy, random = PolicyStep(bundle), np.random.default_rng(0)
     picture = random.integers(0, 256, (1, *bundle.manifest.picture), dtype=np.uint8)
     parameters = random.normal(0, 0.1, (1, policy.shape.size)).astype(np.float32)
-    hidden, cell = policy.zero_state(1)
+    state = policy.zero_state(1)
     matrix = random.normal(size=(MATRIX, MATRIX)).astype(np.float32)
     product = np.empty_like(matrix)
     cases: dict[str, Measured] = {
-        "step": lambda: policy.step(picture, parameters, hidden, cell),
+        "step": lambda: policy.step(picture, parameters, state),
         "product": lambda: np.matmul(matrix, matrix, out=product),
     }
     note = ""
@@ -46,8 +46,12 @@ def bench_policy(bundle: Bundle) -> dict[str, float | str | None]:
 def flops(bundle: Bundle) -> int:
     """Floating-point operations of one policy step, two a multiply-add of its matrix products."""
     manifest = bundle.manifest
-    sides, channels = (31, 14, 6, 2), (manifest.picture[2], 32, 64, 128, 256)
-    convolutions = sum(side**2 * 16 * channels[i] * channels[i + 1] for i, side in enumerate(sides))
+    vae = manifest.models.get("vae", {"padding": "valid", "channels": (32, 64, 128, 256)})
+    side, before, total = manifest.picture[0], manifest.picture[2], 0
+    for channels in vae["channels"]:
+        side = side // 2 if vae["padding"] == "same" else side // 2 - 1
+        total += side**2 * 16 * before * channels
+        before = channels
     features = manifest.latent + manifest.hidden
     lstm = 4 * manifest.hidden * (features + manifest.actions)
-    return 2 * (convolutions + 4 * channels[-1] * manifest.latent + lstm + manifest.actions * features)
+    return 2 * (total + side**2 * before * manifest.latent + lstm + manifest.actions * features)

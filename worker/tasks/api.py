@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
@@ -28,6 +28,14 @@ class Policy(Protocol):
 
     def act(self, observation: Any) -> Any:
         """The environment's next action."""
+
+
+@runtime_checkable
+class Rewarded(Protocol):
+    """A policy that also wants to know what its actions bring; a policy need not."""
+
+    def reward(self, value: float) -> None:
+        """The reward of the last action, before the next one is asked for."""
 
 
 class Task(Protocol):

@@ -12,17 +12,36 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from common.bundle import DECODER, ENCODER, INITIAL, POLICY, WEIGHTS, Bundle, Manifest, write_bundle
+from common.bundle import (
+    DECODER,
+    DREAM,
+    ENCODER,
+    INITIAL,
+    LAYERED,
+    LINEAR,
+    POLICY,
+    WEIGHTS,
+    Bundle,
+    Manifest,
+    write_bundle,
+)
 from common.errors import DatasetError
 from common.fingerprint import package_version
-from worker.tasks.preprocessing import PREPROCESSING, SIZE
+from worker.tasks.preprocessing import PREPROCESSING
 from worker.training import train_mdnrnn, train_vae
-from worker.training.checkpoint import load_weights
+from worker.training.checkpoint import load_config, load_weights
 from worker.training.dataset import episodes, load, split
 from worker.training.encode import ENCODED, encoder_of
-from worker.worldmodel.export import Weights, export_decoder, export_encoder, export_policy
-from worker.worldmodel.mdnrnn import MDNRNNConfig
-from worker.worldmodel.vae import VAEConfig
+from worker.worldmodel.export import (
+    Weights,
+    export_controller,
+    export_decoder,
+    export_dream,
+    export_encoder,
+    export_policy,
+)
+from worker.worldmodel.mdnrnn import REWARDED, MDNRNNConfig
+from worker.worldmodel.vae import PAPER, VAEConfig
 
 QUALITY = "quality.json"
 INITIAL_LATENTS = 256
@@ -39,6 +58,10 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundl
     """Build the bundle of a data folder whose models are trained."""
     vae = load_weights(folder / train_vae.CHECKPOINT)
     rnn = load_weights(folder / train_mdnrnn.CHECKPOINT)
+    configs = (
+        load_config(folder / train_vae.CHECKPOINT, VAEConfig),
+        load_config(folder / train_mdnrnn.CHECKPOINT, MDNRNNConfig),
+    )
     if train_mdnrnn.vae_of(folder) != encoder_of(folder):
         raise DatasetError(f"the MDN-RNN in {folder} was trained on another VAE: train it again before you bundle")
     quality = folder / QUALITY
@@ -49,37 +72,47 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundl
         "quality": json.loads(quality.read_text()) if quality.exists() else {},
         "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
     }
-    parts = graphs(vae, rnn, initial_latents(folder))
+    parts = graphs(vae, rnn, initial_latents(folder), *configs)
     if with_weights:
         tensors = {f"vae.{key}": value for key, value in vae.items()} | {f"mdnrnn.{k}": v for k, v in rnn.items()}
         parts[WEIGHTS] = save(
-            tensors, {"vae": json.dumps(asdict(VAEConfig())), "mdnrnn": json.dumps(asdict(MDNRNNConfig()))}
+            tensors, {"vae": json.dumps(asdict(configs[0])), "mdnrnn": json.dumps(asdict(configs[1]))}
         )
-    return write_bundle(out, manifest(name, provenance), parts)
+    return write_bundle(out, manifest(name, provenance, *configs), parts)
 
 
-def manifest(name: str, provenance: dict[str, Any]) -> Manifest:
-    """The manifest of today's models."""
+def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED) -> Manifest:
+    """The manifest of these models."""
     return Manifest(
         name=name,
         task="car-racing",
         preprocessing=PREPROCESSING,
-        picture=(SIZE, SIZE, 3),
-        latent=VAEConfig().latent,
-        hidden=MDNRNNConfig().hidden,
-        actions=MDNRNNConfig().actions,
+        picture=(vae.picture, vae.picture, 3),
+        latent=vae.latent,
+        hidden=rnn.hidden,
+        actions=rnn.actions,
         provenance=provenance,
+        models={"vae": asdict(vae), "mdnrnn": asdict(rnn)},
     )
 
 
-def graphs(vae: Weights, rnn: Weights, initial: NDArray[np.float32]) -> dict[str, bytes]:
-    """The parts that every bundle has."""
+def graphs(
+    vae: Weights,
+    rnn: Weights,
+    initial: NDArray[np.float32],
+    vae_config: VAEConfig = PAPER,
+    rnn_config: MDNRNNConfig = REWARDED,
+) -> dict[str, bytes]:
+    """The parts of a new bundle."""
     buffer = io.BytesIO()
     np.save(buffer, initial)
     return {
-        ENCODER: export_encoder(vae, VAEConfig()),
-        DECODER: export_decoder(vae, VAEConfig()),
-        POLICY: export_policy(vae, rnn, VAEConfig(), MDNRNNConfig()),
+        ENCODER: export_encoder(vae, vae_config),
+        DECODER: export_decoder(vae, vae_config),
+        POLICY: export_policy(vae, rnn, vae_config, rnn_config),
+        DREAM: export_dream(rnn, rnn_config),
+        LINEAR: export_controller(hidden=False),
+        LAYERED: export_controller(hidden=True),
         INITIAL: buffer.getvalue(),
     }
 

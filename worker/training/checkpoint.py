@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -12,16 +14,20 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from common.errors import DatasetError
+from common.codec import MalformedError, from_plain
+from common.errors import DatasetError, UsageError
 from common.files import write_aside
+
+T = TypeVar("T")
 
 
 def save_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam, progress: dict[str, Any]) -> None:
-    """Write a checkpoint whole or not at all; `progress` is anything that JSON holds."""
+    """Write a checkpoint whole or not at all; `progress` is anything that JSON holds, the model has a `config`."""
     tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
-    data = save({name: tensor.contiguous() for name, tensor in tensors.items()}, {"progress": json.dumps(progress)})
+    about = {"progress": json.dumps(progress), "config": json.dumps(asdict(model.config))}  # type: ignore[call-overload]
+    data = save({name: tensor.contiguous() for name, tensor in tensors.items()}, about)
     with write_aside(path) as file:
         file.write(data)
 
@@ -30,6 +36,7 @@ def load_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
     """Put a checkpoint back and return its progress; `None` if there is none yet."""
     if not path.exists():
         return None
+    _check_config(path, model.config)
     try:
         with safe_open(path, "pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
@@ -43,6 +50,45 @@ def load_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
     if optimiser is not None:
         _restore_adam(optimiser, {name: tensor for name, tensor in tensors.items() if name.startswith("adam.")})
     return progress
+
+
+def load_config(path: Path, kind: type[T]) -> T:
+    """The configuration of a checkpoint's model; one from before they were kept has the defaults."""
+    about = _about(path)
+    try:
+        return from_plain(kind, json.loads(about["config"])) if "config" in about else kind()
+    except (ValueError, MalformedError, UsageError) as error:
+        raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
+
+
+def load_progress(path: Path) -> dict[str, Any]:
+    """How far a checkpoint has come."""
+    try:
+        progress: dict[str, Any] = json.loads(_about(path)["progress"])
+    except (ValueError, KeyError) as error:
+        raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
+    return progress
+
+
+def _about(path: Path) -> Mapping[str, str]:
+    if not path.exists():
+        raise DatasetError(f"no {path}: train it first with `dreamfleet train {path.stem}`")
+    try:
+        with safe_open(path, "np") as file:
+            return file.metadata() or {}
+    except (OSError, SafetensorError) as error:
+        raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
+
+
+def _check_config(path: Path, config: Any) -> None:
+    """`DatasetError` names what a checkpoint's model has otherwise."""
+    stored, wanted = asdict(load_config(path, type(config))), asdict(config)
+    differing = [f"{name} {stored[name]}, not {value}" for name, value in wanted.items() if stored[name] != value]
+    if differing:
+        raise DatasetError(
+            f"checkpoint {path} is of another model: {'; '.join(differing)}; give it the same flags, or delete it to "
+            "begin anew"
+        )
 
 
 def load_weights(path: Path) -> dict[str, NDArray[np.float32]]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from common.bundle import hash_file
 from common.errors import DatasetError
 from common.files import write_aside
-from worker.training.checkpoint import load_checkpoint
+from worker.training.checkpoint import load_checkpoint, load_config
 from worker.training.dataset import episodes, load, load_pictures
 from worker.training.train_vae import CHECKPOINT, as_tensor
 from worker.worldmodel.vae import VAE, VAEConfig
@@ -22,9 +22,10 @@ ENCODED = "encoded"
 
 def encode(folder: Path) -> Iterator[int]:
     """Encode the episodes that are not encoded yet, and all when the VAE is another; yields the frames of each."""
-    model = VAE(VAEConfig())
-    if load_checkpoint(folder / CHECKPOINT, model, None) is None:
+    if not (folder / CHECKPOINT).exists():
         raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
+    model = VAE(load_config(folder / CHECKPOINT, VAEConfig))
+    load_checkpoint(folder / CHECKPOINT, model, None)
     model.eval()
     vae = hash_file(folder / CHECKPOINT)
     for path in episodes(folder):
@@ -32,13 +33,13 @@ def encode(folder: Path) -> Iterator[int]:
         if target.exists() and str(load(target, "vae")["vae"]) == vae:
             continue
         pictures = load_pictures(path)
-        drive = load(path, "action", "reward")
+        drive = load(path, "action", "reward", "ended")
         mu, logvar = _latents(model, pictures)
         mirrored_mu, mirrored_logvar = _latents(model, np.ascontiguousarray(pictures[:, :, ::-1]))
         with write_aside(target) as file:
             np.savez(
                 file, mu=mu, logvar=logvar, mirrored_mu=mirrored_mu, mirrored_logvar=mirrored_logvar,
-                action=drive["action"], reward=drive["reward"], vae=np.array(vae),
+                action=drive["action"], reward=drive["reward"], ended=drive["ended"], vae=np.array(vae),
             )  # fmt: skip
         yield len(pictures)
 

@@ -13,7 +13,7 @@ from common.progress import append_curve
 from worker.training.checkpoint import load_checkpoint, save_checkpoint
 from worker.training.dataset import episodes, load_pictures, picture_batches, split
 from worker.training.presets import TrainConfig
-from worker.worldmodel.vae import VAE, VAEConfig
+from worker.worldmodel.vae import PAPER, VAE, VAEConfig
 
 CHECKPOINT = "vae.safetensors"
 SAVE_EVERY = 200
@@ -23,11 +23,11 @@ ACTIVE_NATS = 0.1  # a picture, on average over the held-out ones, above which a
 Report = Callable[[int, str], None]
 
 
-def train_vae(folder: Path, config: TrainConfig, report: Report) -> dict[str, float]:
+def train_vae(folder: Path, config: TrainConfig, report: Report, layers: VAEConfig = PAPER) -> dict[str, float]:
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes."""
     train, held_out = split(episodes(folder))
     torch.manual_seed(config.seed)
-    model = VAE(VAEConfig())
+    model = VAE(layers)
     optimiser = torch.optim.Adam(model.parameters(), lr=config.rate)
     progress = load_checkpoint(folder / CHECKPOINT, model, optimiser) or {"update": 0, "pool": 0}
     update: int = progress["update"]

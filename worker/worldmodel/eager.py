@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from common.bundle import Bundle
+from common.codec import from_plain
 from worker.worldmodel.vae import VAE, VAEConfig
 
 
@@ -18,8 +19,9 @@ def make_torch_step(bundle: Bundle, picture: NDArray[np.uint8], parameters: NDAr
     """A call that makes one step of the bundle's sizes at batch 1, on one thread; the weights' values do not matter."""
     torch.set_num_threads(1)
     manifest = bundle.manifest
-    vae, cell = VAE(VAEConfig(latent=manifest.latent)), nn.LSTMCell(manifest.latent + manifest.actions, manifest.hidden)
-    weights, biases = (torch.from_numpy(each[0]) for each in bundle.controller_shape.unpack(parameters))
+    config = from_plain(VAEConfig, manifest.models["vae"]) if manifest.models else VAEConfig(latent=manifest.latent)
+    vae, cell = VAE(config).eval(), nn.LSTMCell(manifest.latent + manifest.actions, manifest.hidden)
+    weights, biases = (torch.from_numpy(each[0]) for each in bundle.default_shape.unpack(parameters)[0])
     state = (torch.zeros(1, manifest.hidden), torch.zeros(1, manifest.hidden))
 
     def step() -> Any:

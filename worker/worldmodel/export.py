@@ -6,165 +6,135 @@ initializers, and nothing gathers, loops or reshapes by a traced batch size.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto
 
+from worker.worldmodel.graph import GraphBuilder
 from worker.worldmodel.mdnrnn import MDNRNNConfig
-from worker.worldmodel.vae import VAEConfig
+from worker.worldmodel.recurrent import Recurrent, Weights, export_dream
+from worker.worldmodel.vae import LEAK, VAEConfig
 
-Weights = Mapping[str, NDArray[np.float32]]
-OPSET = 17
-IR_VERSION = 8
-SIZE = 64
-
-
-class GraphBuilder:
-    """Collects nodes and constants; each method returns the name of what it made."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._nodes: list[onnx.NodeProto] = []
-        self._constants: list[onnx.TensorProto] = []
-        self._inputs: list[onnx.ValueInfoProto] = []
-        self._outputs: list[onnx.ValueInfoProto] = []
-
-    def take(self, name: str, kind: int, *shape: int) -> str:
-        """An input of `kind` and shape `(N, *shape)`."""
-        self._inputs.append(helper.make_tensor_value_info(name, kind, ["N", *shape]))
-        return name
-
-    def give(self, value: str, name: str, kind: int, *shape: int) -> None:
-        """An output of `kind` and shape `(N, *shape)`."""
-        for node in self._nodes:  # renamed where it is made and used: an Identity node would cost a copy
-            for names in (node.input, node.output):
-                names[:] = [name if each == value else each for each in names]
-        self._outputs.append(helper.make_tensor_value_info(name, kind, ["N", *shape]))
-
-    def constant(self, array: NDArray[Any]) -> str:
-        """A weight."""
-        name = f"c{len(self._constants)}"
-        self._constants.append(numpy_helper.from_array(np.ascontiguousarray(array), name))
-        return name
-
-    def node(self, operator: str, *inputs: str, outputs: int = 1, **attributes: Any) -> Any:
-        """One operator; a tuple of names where it has several outputs."""
-        names = [f"n{len(self._nodes)}_{index}" for index in range(outputs)]
-        self._nodes.append(helper.make_node(operator, list(inputs), names, **attributes))
-        return names[0] if outputs == 1 else tuple(names)
-
-    def shape(self, *sizes: int) -> str:
-        """A shape to reshape to."""
-        return self.constant(np.array(sizes, dtype=np.int64))
-
-    def build(self) -> bytes:
-        """The checked model."""
-        graph = helper.make_graph(self._nodes, self._name, self._inputs, self._outputs, self._constants)
-        opsets = [helper.make_opsetid("", OPSET)]
-        model = helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="dreamfleet")
-        onnx.checker.check_model(model, full_check=True)
-        data: bytes = model.SerializeToString(deterministic=True)
-        return data
+__all__ = ["Weights", "export_controller", "export_decoder", "export_dream", "export_encoder", "export_policy"]
+EPSILON = 1e-5  # of torch's batch normalisation
 
 
 def export_encoder(vae: Weights, config: VAEConfig) -> bytes:
-    """`picture` (N, 64, 64, 3) uint8 to `mu` and `logvar` (N, latent)."""
+    """`picture` (N, side, side, 3) uint8 to `mu` and `logvar` (N, latent)."""
     graph = GraphBuilder("encoder")
-    flat = _encode(graph, graph.take("picture", TensorProto.UINT8, SIZE, SIZE, 3), vae, config)
+    flat = _encode(graph, graph.take("picture", TensorProto.UINT8, config.picture, config.picture, 3), vae, config)
     for name in ("mu", "logvar"):
         graph.give(_linear(graph, flat, vae, name), name, TensorProto.FLOAT, config.latent)
     return graph.build()
 
 
 def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
-    """`latent` (N, latent) to `picture` (N, 64, 64, 3) uint8; weights in half precision, sums in single."""
+    """`latent` (N, latent) to `picture` (N, side, side, 3) uint8; weights in half precision, sums in single."""
     graph = GraphBuilder("decoder")
-    half = {name: array.astype(np.float16) for name, array in vae.items()}
-
-    def weight(name: str) -> str:
-        return str(graph.node("Cast", graph.constant(half[name]), to=TensorProto.FLOAT))
-
     latent = graph.take("latent", TensorProto.FLOAT, config.latent)
-    value = graph.node("Gemm", latent, weight("dense.weight"), weight("dense.bias"), transB=1)
-    value = graph.node("Reshape", value, graph.shape(-1, 4 * config.channels[-1], 1, 1))
-    for layer in (0, 2, 4, 6):
-        kernel, bias = weight(f"decoder.{layer}.weight"), weight(f"decoder.{layer}.bias")
-        value = graph.node("ConvTranspose", value, kernel, bias, strides=[2, 2])
-        value = graph.node("Sigmoid" if layer == 6 else "Relu", value)
+    kernel, bias = graph.weight(vae["dense.weight"]), graph.weight(vae["dense.bias"])
+    value = graph.node("Gemm", latent, kernel, bias, transB=1)
+    side, last = config.decoder_sides[0], len(config.channels) - 1
+    value = graph.node("Reshape", value, graph.shape(-1, config.decoder_channels[0], side, side))
+    for layer in range(last + 1):
+        weights, offsets = _folded(vae, "decoder", layer, config)
+        value = graph.node("ConvTranspose", value, graph.weight(weights), graph.weight(offsets), **_window(config))
+        value = graph.node("Sigmoid", value) if layer == last else _activate(graph, value, config)
     value = graph.node("Mul", value, graph.constant(np.array(255, np.float32)))
     value = graph.node("Cast", graph.node("Round", value), to=TensorProto.UINT8)
     value = graph.node("Transpose", value, perm=[0, 2, 3, 1])
-    graph.give(value, "picture", TensorProto.UINT8, SIZE, SIZE, 3)
+    graph.give(value, "picture", TensorProto.UINT8, config.picture, config.picture, 3)
     return graph.build()
 
 
 def export_policy(vae: Weights, rnn: Weights, vae_config: VAEConfig, rnn_config: MDNRNNConfig) -> bytes:
-    """One step: picture, controllers and state to action and next state.
+    """One step: picture, controllers and state to action, next state and latent.
 
-    The controller acts on (z_t, h_t), then the LSTM advances on (z_t, a_t). `parameters` (N, size) holds a controller
-    a row, packed as `common.controller.ControllerShape` says; z is the encoder's mean.
+    The controller acts on (z_t, h_t), then the MDN-RNN advances on (z_t, a_t). `parameters` (N, size) holds a linear
+    controller a row, packed as `common.controller.ControllerShape` says; z is the encoder's mean, h the first columns
+    of `state` (N, state).
     """
-    graph = GraphBuilder("policy")
-    hidden_size, actions = rnn_config.hidden, rnn_config.actions
-    size = actions * (rnn_config.latent + hidden_size + 1)
-    picture = graph.take("picture", TensorProto.UINT8, SIZE, SIZE, 3)
+    graph, actions = GraphBuilder("policy"), rnn_config.actions
+    size = actions * (rnn_config.latent + rnn_config.hidden + 1)
+    picture = graph.take("picture", TensorProto.UINT8, vae_config.picture, vae_config.picture, 3)
     parameters = graph.take("parameters", TensorProto.FLOAT, size)
-    hidden = graph.take("hidden", TensorProto.FLOAT, hidden_size)
-    cell = graph.take("cell", TensorProto.FLOAT, hidden_size)
+    recurrent = Recurrent(graph, graph.take("state", TensorProto.FLOAT, rnn_config.state), rnn, rnn_config)
     latent = _linear(graph, _encode(graph, picture, vae, vae_config), vae, "mu")
-    action = _act(graph, parameters, graph.node("Concat", latent, hidden, axis=1), rnn_config)
-    next_hidden, next_cell = _advance(graph, [latent, action, hidden], cell, rnn, hidden_size)
+    weights, biases = graph.split(parameters, size - actions, actions)
+    weights = graph.node("Reshape", weights, graph.shape(-1, actions, rnn_config.latent + rnn_config.hidden))
+    action = _squash(graph, _layer(graph, graph.join(latent, recurrent.hidden), weights, biases))
+    recurrent.advance(latent, action)
     graph.give(action, "action", TensorProto.FLOAT, actions)
-    graph.give(next_hidden, "next_hidden", TensorProto.FLOAT, hidden_size)
-    graph.give(next_cell, "next_cell", TensorProto.FLOAT, hidden_size)
+    graph.give(recurrent.next_state(), "next_state", TensorProto.FLOAT, rnn_config.state)
     graph.give(latent, "latent", TensorProto.FLOAT, rnn_config.latent)
+    return graph.build()
+
+
+def export_controller(*, hidden: bool) -> bytes:
+    """Controllers of any size, one a row: `features` (N, F) to `action` (N, A).
+
+    `weights0` (N, A, F) and `biases0` (N, A); with a layer of K units `weights0` (N, K, F), `biases0` (N, K), then
+    `weights1` (N, A, K), `biases1` (N, A).
+    """
+    graph, kind = GraphBuilder("controller"), TensorProto.FLOAT
+    value, sizes = graph.take("features", kind, "F"), ["F", "K", "A"] if hidden else ["F", "A"]
+    for index, (before, after) in enumerate(pairwise(sizes)):
+        weights = graph.take(f"weights{index}", kind, after, before)
+        value = _layer(graph, value, weights, graph.take(f"biases{index}", kind, after))
+    graph.give(_squash(graph, value), "action", kind, 3)
     return graph.build()
 
 
 def _encode(graph: GraphBuilder, picture: str, vae: Weights, config: VAEConfig) -> str:
     """Convolutions over the picture; its scale of 1/255 is folded into the first."""
     value = graph.node("Cast", graph.node("Transpose", picture, perm=[0, 3, 1, 2]), to=TensorProto.FLOAT)
-    for layer in (0, 2, 4, 6):
-        kernel = vae[f"encoder.{layer}.weight"]
+    for layer in range(len(config.channels)):
+        kernel, bias = _folded(vae, "encoder", layer, config)
         kernel = (kernel.astype(np.float64) / 255).astype(np.float32) if layer == 0 else kernel
-        bias = graph.constant(vae[f"encoder.{layer}.bias"])
-        value = graph.node("Relu", graph.node("Conv", value, graph.constant(kernel), bias, strides=[2, 2]))
-    return str(graph.node("Reshape", value, graph.shape(-1, 4 * config.channels[-1])))
+        value = graph.node("Conv", value, graph.constant(kernel), graph.constant(bias), **_window(config))
+        value = _activate(graph, value, config)
+    return str(graph.node("Reshape", value, graph.shape(-1, config.flat)))
+
+
+def _window(config: VAEConfig) -> dict[str, Any]:
+    return {"strides": [2, 2]} | ({"pads": [1, 1, 1, 1]} if config.padding == "same" else {})
+
+
+def _activate(graph: GraphBuilder, value: str, config: VAEConfig) -> str:
+    if config.activation == "relu":
+        return str(graph.node("Relu", value))
+    return str(graph.node("LeakyRelu", value, alpha=LEAK))
+
+
+def _folded(vae: Weights, part: str, layer: int, config: VAEConfig) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Kernel and bias of a layer, its batch normalisation folded into them."""
+    index = layer * config.modules_a_layer
+    kernel, bias = vae[f"{part}.{index}.weight"], vae[f"{part}.{index}.bias"]
+    norm = f"{part}.{index + 1}"
+    if f"{norm}.running_var" not in vae:
+        return kernel, bias
+    scale = vae[f"{norm}.weight"] / np.sqrt(vae[f"{norm}.running_var"] + EPSILON)
+    outputs = 0 if part == "encoder" else 1  # the axis of a kernel's outputs: torch turns it round in the decoder
+    kernel = kernel * np.expand_dims(scale, [axis for axis in range(4) if axis != outputs])
+    return kernel, (bias - vae[f"{norm}.running_mean"]) * scale + vae[f"{norm}.bias"]
 
 
 def _linear(graph: GraphBuilder, value: str, weights: Weights, name: str) -> str:
-    kernel = graph.constant(weights[f"{name}.weight"].T)
-    return str(graph.node("Gemm", value, kernel, graph.constant(weights[f"{name}.bias"])))
+    return graph.linear(value, weights[f"{name}.weight"].T, weights[f"{name}.bias"])
 
 
-def _act(graph: GraphBuilder, parameters: str, features: str, config: MDNRNNConfig) -> str:
-    """The controller of each row on its own features: tanh; gas (tanh + 1) / 2; brake clip(tanh, 0, 1)."""
-    actions, size = config.actions, config.latent + config.hidden
-    split = graph.shape(actions * size, actions)
-    weights, biases = graph.node("Split", parameters, split, outputs=2, axis=1)
-    weights = graph.node("Reshape", weights, graph.shape(-1, actions, size))
+def _layer(graph: GraphBuilder, features: str, weights: str, biases: str) -> str:
+    """Tanh of each row's own weights on its own features."""
     product = graph.node("MatMul", weights, graph.node("Unsqueeze", features, graph.shape(2)))
-    squashed = graph.node("Tanh", graph.node("Add", graph.node("Squeeze", product, graph.shape(2)), biases))
+    return str(graph.node("Tanh", graph.node("Add", graph.node("Squeeze", product, graph.shape(2)), biases)))
+
+
+def _squash(graph: GraphBuilder, squashed: str) -> str:
+    """To CarRacing's ranges: steering as it is; gas (tanh + 1) / 2; brake clip(tanh, 0, 1)."""
     scale, shift = np.array([1, 0.5, 1], np.float32), np.array([0, 0.5, 0], np.float32)
     low = np.array([-1, 0, 0], np.float32)
     moved = graph.node("Add", graph.node("Mul", squashed, graph.constant(scale)), graph.constant(shift))
     return str(graph.node("Max", moved, graph.constant(low)))
-
-
-def _advance(graph: GraphBuilder, inputs: Sequence[str], cell: str, rnn: Weights, hidden_size: int) -> tuple[str, str]:
-    """One LSTM step as one matrix product; torch's gates i, f, g, o become i, f, o, g for one Sigmoid of three."""
-    order = np.concatenate([np.arange(hidden_size) + gate * hidden_size for gate in (0, 1, 3, 2)])
-    kernel = np.concatenate([rnn["lstm.weight_ih_l0"], rnn["lstm.weight_hh_l0"]], axis=1)[order].T
-    bias = (rnn["lstm.bias_ih_l0"] + rnn["lstm.bias_hh_l0"])[order]
-    gates = graph.node("Gemm", graph.node("Concat", *inputs, axis=1), graph.constant(kernel), graph.constant(bias))
-    squashed, candidate = graph.node("Split", gates, graph.shape(3 * hidden_size, hidden_size), outputs=2, axis=1)
-    opened = graph.node("Sigmoid", squashed)
-    enter, forget, leave = graph.node("Split", opened, graph.shape(*[hidden_size] * 3), outputs=3, axis=1)
-    kept = graph.node("Mul", forget, cell)
-    next_cell = graph.node("Add", kept, graph.node("Mul", enter, graph.node("Tanh", candidate)))
-    next_hidden = graph.node("Mul", leave, graph.node("Tanh", next_cell))
-    return next_hidden, next_cell

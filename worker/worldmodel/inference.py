@@ -8,7 +8,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from common.bundle import DECODER, ENCODER, POLICY, Bundle
+from common.bundle import DECODER, DREAM, ENCODER, LAYERED, LINEAR, POLICY, Bundle
 from common.errors import BundleError
 
 Floats = NDArray[np.float32]
@@ -29,31 +29,167 @@ def open_part(bundle: Bundle, name: str) -> onnxruntime.InferenceSession:
 
 
 class Step(NamedTuple):
-    """What one policy step gives, a row an episode."""
+    """What one policy step gives, a row an episode; `state` is for the next step, its first columns are h."""
 
     action: Floats
-    hidden: Floats
-    cell: Floats
+    state: Floats
     latent: Floats
 
 
 class PolicyStep:
-    """Encoder, controller and LSTM in one graph."""
+    """Encoder, controller and MDN-RNN: one graph under the default controllers, three under others."""
 
     def __init__(self, bundle: Bundle) -> None:
-        self._run = open_part(bundle, POLICY).run
         self.shape = bundle.controller_shape
         self.hidden_size = bundle.manifest.hidden
+        self._reward = RewardLabel(bundle)
+        self._whole = self.shape == bundle.default_shape
+        if self._whole:
+            session = open_part(bundle, POLICY)
+            sizes = {each.name: each.shape for each in session.get_inputs()}
+            self._joined = "state" in sizes  # bundles from before it have `hidden` and `cell`
+            self.state_size = sizes["state"][1] if self._joined else 2 * self.hidden_size
+            self._run = session.run
+        else:
+            self._encoder, self._controllers = Encoder(bundle), Controllers(bundle)
+            self._memory = DreamStep(bundle)
+            self.state_size = self._memory.state_size
 
-    def step(self, picture: Pictures, parameters: Floats, hidden: Floats, cell: Floats) -> Step:
-        """Act and advance: `picture` (N, 64, 64, 3), `parameters` (N, size), `hidden` and `cell` (N, hidden)."""
-        feed = {"picture": picture, "parameters": parameters, "hidden": hidden, "cell": cell}
-        return Step(*self._run(["action", "next_hidden", "next_cell", "latent"], feed))
+    def step(self, picture: Pictures, parameters: Floats, state: Floats) -> Step:
+        """Act and advance: `picture` (N, side, side, 3), `parameters` (N, size), `state` (N, state_size)."""
+        if not self._whole:
+            latent, _ = self._encoder.encode(picture)
+            action = self._controllers.act(parameters, latent, state)
+            return Step(action, self._memory.advance(latent, action, state), latent)
+        feed = {"picture": picture, "parameters": parameters}
+        if self._joined:
+            return Step(*self._run(["action", "next_state", "latent"], {**feed, "state": state}))
+        feed |= {"hidden": state[:, : self.hidden_size], "cell": state[:, self.hidden_size :]}
+        action, hidden, cell, latent = self._run(["action", "next_hidden", "next_cell", "latent"], feed)
+        return Step(action, np.concatenate([hidden, cell], axis=1), latent)
 
-    def zero_state(self, rows: int) -> tuple[Floats, Floats]:
-        """Hidden and cell state before the first step."""
-        state = np.zeros((rows, self.hidden_size), dtype=np.float32)
-        return state, state.copy()
+    def zero_state(self, rows: int) -> Floats:
+        """The state before the first step."""
+        return np.zeros((rows, self.state_size), dtype=np.float32)
+
+    def remember(self, state: Floats, rewards: NDArray[np.float64]) -> None:
+        """Write the rewards (N,) that followed the last step into `state`, where the model looks at them."""
+        self._reward.write(state, rewards)
+
+
+class RewardLabel:
+    """Where the previous reward lies in a state, and what the model sees of it."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        model = bundle.manifest.models.get("mdnrnn", {})
+        self._column = 2 * bundle.manifest.hidden if model.get("previous_reward") else None
+        self._kind = model.get("reward")
+
+    def write(self, state: Floats, rewards: NDArray[np.float64]) -> None:
+        """Label `rewards` (N,) of steps that did not end their episodes, as the reward head does."""
+        if self._column is None:
+            return
+        labels = rewards if self._kind == "value" else (rewards > 0) == (self._kind == "positive")
+        state[:, self._column] = labels
+
+
+class Controllers:
+    """Controllers of the bundle's shape, a row each, apart from the policy's graph."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.shape = bundle.controller_shape
+        self._hidden = bundle.manifest.hidden if self.shape.features > bundle.manifest.latent else 0
+        self._run = open_part(bundle, LAYERED if self.shape.hidden else LINEAR).run
+        self._parameters = np.zeros((0, self.shape.size), dtype=np.float32)
+        self._feed: dict[str, Floats] = {}
+
+    def act(self, parameters: Floats, latent: Floats, state: Floats) -> Floats:
+        """`action` (N, actions) of `parameters` (N, size); these are unpacked once, so do not change them in place."""
+        if parameters is not self._parameters:
+            layers = enumerate(self.shape.unpack(parameters))
+            named = [(f"{kind}{index}", each) for index, pair in layers for kind, each in zip(NAMES, pair, strict=True)]
+            self._feed = {name: np.ascontiguousarray(each) for name, each in named}
+            self._parameters = parameters
+        features = np.concatenate([latent, state[:, : self._hidden]], axis=1) if self._hidden else latent
+        (action,) = self._run(["action"], {**self._feed, "features": features})
+        return np.asarray(action, dtype=np.float32)
+
+
+NAMES = ("weights", "biases")
+
+
+class Dream(NamedTuple):
+    """What one step of the dream gives, a row a dreamer.
+
+    `reward` is the probability that the reward head's label is true, or the value; `done` a probability; (N,), zero
+    without such a head.
+    """
+
+    action: Floats
+    latent: Floats
+    state: Floats
+    reward: Floats
+    done: Floats
+
+
+class DreamStep:
+    """Controller and MDN-RNN, which dreams the next latent."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        session = open_part(bundle, DREAM)
+        sizes = {each.name: each.shape for each in session.get_inputs()}
+        self._run = session.run
+        self._names = [each.name for each in session.get_outputs()]
+        self._controllers = Controllers(bundle)
+        self._only = onnxruntime.RunOptions()
+        self._only.only_execute_path_to_fetches = True
+        self._idle: dict[str, Floats] = {}
+        self.shape = bundle.controller_shape
+        self.hidden_size = bundle.manifest.hidden
+        self.state_size: int = sizes["state"][1]
+        self.latent_size: int = sizes["latent"][1]
+        self.takes_mask = "mask" in sizes
+
+    def step(
+        self, latent: Floats, parameters: Floats, state: Floats, uniform: Floats, normal: Floats,
+        temperature: float, mask: Floats | None = None,
+    ) -> Dream:  # fmt: skip
+        """Act on `latent` (N, latent) and `state` (N, state_size) by `parameters` (N, size), and dream on.
+
+        `uniform` in [0, 1) and `normal` (N, latent) are chance; `mask` (N, hidden) is the dropout, for models that were
+        trained with it: 0 or 1 / (1 - rate), and none keeps all.
+        """
+        action = self._controllers.act(parameters, latent, state)
+        return self.imagine(latent, action, state, uniform, normal, temperature, mask)
+
+    def imagine(
+        self, latent: Floats, action: Floats, state: Floats, uniform: Floats, normal: Floats,
+        temperature: float, mask: Floats | None = None,
+    ) -> Dream:  # fmt: skip
+        """Dream on under these actions `(N, actions)`."""
+        feed = {"latent": latent, "action": action, "state": state, "uniform": uniform, "normal": normal}
+        feed["temperature"] = np.array([temperature], dtype=np.float32)
+        if self.takes_mask:
+            feed["mask"] = np.ones((len(latent), self.hidden_size), np.float32) if mask is None else mask
+        given = dict(zip(self._names, self._run(self._names, feed), strict=True))
+        none = np.zeros(len(latent), dtype=np.float32)
+        told = given.get("reward", none), given.get("done", none)
+        return Dream(action, given["next_latent"], given["next_state"], *told)
+
+    def advance(self, latent: Floats, action: Floats, state: Floats) -> Floats:
+        """The next state alone, as in reality, where the next latent is seen and not dreamt."""
+        if len(self._idle.get("uniform", "")) != len(latent):
+            zeros = np.zeros((len(latent), self.latent_size), dtype=np.float32)
+            self._idle = {"uniform": zeros, "normal": zeros, "temperature": np.ones(1, np.float32)}
+            if self.takes_mask:
+                self._idle["mask"] = np.ones((len(latent), self.hidden_size), np.float32)
+        feed = {**self._idle, "latent": latent, "action": action, "state": state}
+        (after,) = self._run(["next_state"], feed, self._only)
+        return np.asarray(after, dtype=np.float32)
+
+    def zero_state(self, rows: int) -> Floats:
+        """The state before the first step."""
+        return np.zeros((rows, self.state_size), dtype=np.float32)
 
 
 class Encoder:
@@ -63,7 +199,7 @@ class Encoder:
         self._run = open_part(bundle, ENCODER).run
 
     def encode(self, picture: Pictures) -> tuple[Floats, Floats]:
-        """`mu` and `logvar` (N, latent) of `picture` (N, 64, 64, 3)."""
+        """`mu` and `logvar` (N, latent) of `picture` (N, side, side, 3)."""
         mu, logvar = self._run(["mu", "logvar"], {"picture": picture})
         return mu, logvar
 
@@ -75,7 +211,7 @@ class Decoder:
         self._run = open_part(bundle, DECODER).run
 
     def decode(self, latent: Floats) -> Pictures:
-        """`picture` (N, 64, 64, 3) of `latent` (N, latent)."""
+        """`picture` (N, side, side, 3) of `latent` (N, latent)."""
         (picture,) = self._run(["picture"], {"latent": latent})
         result: Any = picture
         return np.asarray(result, dtype=np.uint8)

@@ -1,55 +1,182 @@
-"""The MDN-RNN: an LSTM that predicts the next latents as mixtures of Gaussians, and whether a reward comes.
+"""The MDN-RNN: an LSTM that predicts the next latents as mixtures of Gaussians, and what comes with them.
 
-Mixtures per latent dimension as in hardmaru/WorldModelsExperiments; the reward head as in the reward-predicting models
-of its successors: the logit of a positive reward.
+Mixtures a latent dimension as in hardmaru/WorldModelsExperiments. Heads of its successors: the reward in three forms,
+and whether the episode ends (the paper's Doom). Attention over past inputs as miketynes/AttentiveWorldModels describes
+it; in that code the softmax runs over the batch and the state stays zero, so that it never attended.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from common.errors import UsageError
+
+Reward = Literal["none", "positive", "notebook", "value"]
+
 
 @dataclass(frozen=True)
 class MDNRNNConfig:
-    """Sizes: `latent` + `actions` inputs, an LSTM of `hidden` units, `mixtures` Gaussians a latent dimension."""
+    """Inputs, an LSTM of `hidden` units, `mixtures` Gaussians a latent dimension, heads.
+
+    The reward head: the logit of a positive reward; the `notebook`'s, of a reward that is not positive while the
+    episode goes on; or the reward's value.
+    """
 
     latent: int = 32
     actions: int = 3
     hidden: int = 256
     mixtures: int = 5
+    reward: Reward = "positive"
+    done: bool = False
+    previous_reward: bool = False  # what the reward head told of the step before is an input
+    dropout: float = 0.0  # of the LSTM's output before the heads
+    window: int = 0  # inputs that attention looks at, the current one among them; 0: none
+    attention_units: int = 64
+
+    def __post_init__(self) -> None:
+        if min(self.latent, self.actions, self.hidden, self.mixtures, self.attention_units) < 1 or self.window < 0:
+            raise UsageError("an MDN-RNN's sizes must be at least 1, its window at least 0")
+        if not 0 <= self.dropout < 1:
+            raise UsageError(f"--dropout must be from 0 to below 1, not {self.dropout}")
+        if self.previous_reward and self.reward == "none":
+            raise UsageError("the previous reward as an input needs a reward head: in the dream nothing else tells it")
+
+    @property
+    def inputs(self) -> int:
+        """Latents, actions and the previous reward."""
+        return self.latent + self.actions + self.previous_reward
+
+    @property
+    def lstm_inputs(self) -> int:
+        """`inputs`, and beside them what attention makes of the window."""
+        return self.inputs + (self.latent + self.actions if self.window else 0)
+
+    @property
+    def rewarded(self) -> bool:
+        """Whether there is a reward head."""
+        return self.reward != "none"
+
+    @property
+    def outputs(self) -> int:
+        """Of the heads: log weights, means, log deviations `(3, latent, mixtures)`, reward, done."""
+        return 3 * self.mixtures * self.latent + self.rewarded + self.done
+
+    @property
+    def state(self) -> int:
+        """Of a step: hidden, cell, previous reward, window of latents and actions (oldest first)."""
+        return 2 * self.hidden + self.previous_reward + self.window * (self.latent + self.actions)
+
+
+REWARDED = MDNRNNConfig()
+PAPER = MDNRNNConfig(reward="none")
+ARTICLE = MDNRNNConfig(previous_reward=True)
+NOTEBOOK = MDNRNNConfig(reward="notebook", previous_reward=True)
+ATTENTIVE = MDNRNNConfig(window=8)
 
 
 class Prediction(NamedTuple):
-    """Of the next latents: log weights, means, log deviations `(..., latent, mixtures)`; reward logit `(...)`."""
+    """Of the next latents: log weights, means, log deviations `(..., latent, mixtures)`.
+
+    `reward` (logit or value) and `done` (logit) `(...)`; zero without such a head.
+    """
 
     log_weights: Tensor
     means: Tensor
     log_deviations: Tensor
     reward: Tensor
+    done: Tensor
 
 
 class MDNRNN(nn.Module):
-    """Latents and actions `(N, T, latent + actions)` to a prediction for each step."""
+    """Latents, actions and previous reward `(N, T, inputs)` to a prediction for each step.
+
+    Attention: score_i = v tanh(W1 x_i + W2 h) over the last `window` inputs x = (z, a), the current one included and
+    zeros before the first; a softmax over these steps; the weighted inputs enter the LSTM beside the current input, so
+    that the plain model is the special case of zero weights on them.
+    """
 
     def __init__(self, config: MDNRNNConfig) -> None:
         super().__init__()
         self.config = config
-        self.lstm = nn.LSTM(config.latent + config.actions, config.hidden, batch_first=True)
-        self.heads = nn.Linear(config.hidden, 3 * config.mixtures * config.latent + 1)
+        self.lstm = nn.LSTM(config.lstm_inputs, config.hidden, batch_first=True)
+        with torch.no_grad():  # one bias, as in the sources; torch has two that add
+            self._second_bias.zero_()
+        self._second_bias.requires_grad_(False)
+        self.heads = nn.Linear(config.hidden, config.outputs)
+        if config.window:
+            self.keys = nn.Linear(config.latent + config.actions, config.attention_units)
+            self.query = nn.Linear(config.hidden, config.attention_units, bias=False)
+            self.score = nn.Linear(config.attention_units, 1, bias=False)
+
+    @property
+    def _second_bias(self) -> Tensor:
+        return self.lstm.get_parameter("bias_hh_l0")
 
     def forward(self, inputs: Tensor) -> Prediction:
         """Predict from a zero state at the first step on."""
-        hidden, _ = self.lstm(inputs)
-        out = self.heads(hidden)
-        shape = (*out.shape[:-1], self.config.latent, self.config.mixtures)
-        weights, means, deviations = (part.reshape(shape) for part in out[..., :-1].chunk(3, dim=-1))
-        return Prediction(functional.log_softmax(weights, dim=-1), means, deviations, out[..., -1])
+        hidden: Tensor = self._attentive(inputs) if self.config.window else self.lstm(inputs)[0]
+        return self.predict(hidden)
+
+    def predict(self, hidden: Tensor) -> Prediction:
+        """The heads on hidden states `(..., hidden)`."""
+        config = self.config
+        out = self.heads(functional.dropout(hidden, config.dropout, self.training))
+        ends = 3 * config.mixtures * config.latent
+        shape = (*out.shape[:-1], config.latent, config.mixtures)
+        weights, means, deviations = (part.reshape(shape) for part in out[..., :ends].chunk(3, dim=-1))
+        none = out.new_zeros(out.shape[:-1])
+        reward = out[..., ends] if config.rewarded else none
+        done = out[..., -1] if config.done else none
+        return Prediction(functional.log_softmax(weights, dim=-1), means, deviations, reward, done)
+
+    def advance(self, steps: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """One step on latents and actions `(N, latent + actions)` from a state `(N, state)`: hidden and next state.
+
+        The previous reward is the state's; the next state keeps it until the caller knows the next.
+        """
+        config = self.config
+        sizes = [config.hidden, config.hidden, int(config.previous_reward), config.window * steps.shape[1]]
+        hidden, cell, previous, window = torch.split(state, sizes, dim=1)
+        inputs = [steps, previous]
+        if config.window:
+            window = torch.cat([window[:, steps.shape[1] :], steps], dim=1)
+            seen = window.reshape(-1, config.window, steps.shape[1])
+            inputs.append(self._attend(seen, self.keys(seen), hidden))
+        hidden, cell = self._cell(torch.cat(inputs, dim=1), hidden, cell)
+        return hidden, torch.cat([hidden, cell, previous, window], dim=1)
+
+    def _attentive(self, inputs: Tensor) -> Tensor:
+        config = self.config
+        steps = functional.pad(inputs[..., : config.latent + config.actions], (0, 0, config.window - 1, 0))
+        keys = self.keys(steps)
+        hidden = cell = inputs.new_zeros(len(inputs), config.hidden)
+        outputs = []
+        for step in range(inputs.shape[1]):
+            seen = slice(step, step + config.window)
+            context = self._attend(steps[:, seen], keys[:, seen], hidden)
+            hidden, cell = self._cell(torch.cat([inputs[:, step], context], dim=1), hidden, cell)
+            outputs.append(hidden)
+        return torch.stack(outputs, dim=1)
+
+    def _attend(self, seen: Tensor, keys: Tensor, hidden: Tensor) -> Tensor:
+        """The inputs `seen` `(N, window, latent + actions)`, weighted over their steps."""
+        scores = self.score(torch.tanh(keys + self.query(hidden)[:, None]))
+        weighted: Tensor = (torch.softmax(scores, dim=1) * seen).sum(dim=1)
+        return weighted
+
+    def _cell(self, inputs: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+        weight: dict[str, Tensor] = dict(self.lstm.named_parameters())
+        gates = functional.linear(inputs, weight["weight_ih_l0"], weight["bias_ih_l0"])
+        gates = gates + functional.linear(hidden, weight["weight_hh_l0"], weight["bias_hh_l0"])
+        enter, forget, candidate, leave = gates.chunk(4, dim=1)
+        cell = torch.sigmoid(forget) * cell + torch.sigmoid(enter) * torch.tanh(candidate)
+        return torch.sigmoid(leave) * torch.tanh(cell), cell
 
 
 def latent_loss(prediction: Prediction, targets: Tensor, mask: Tensor) -> Tensor:
@@ -60,7 +187,22 @@ def latent_loss(prediction: Prediction, targets: Tensor, mask: Tensor) -> Tensor
     return -(likelihood * mask).sum() / mask.sum()
 
 
-def reward_loss(prediction: Prediction, rewards: Tensor, mask: Tensor) -> Tensor:
-    """Binary cross-entropy in nats of "this step's reward is positive"; `rewards` `(N, T)`."""
-    losses = functional.binary_cross_entropy_with_logits(prediction.reward, (rewards > 0).float(), reduction="none")
+def reward_labels(kind: Reward, rewards: Tensor, done: Tensor) -> Tensor:
+    """What the reward head shall tell `(N, T)`; `done` is 1 where a step ended its episode."""
+    if kind == "value":
+        return rewards
+    positive = (rewards > 0).float()
+    return positive if kind == "positive" else (1 - positive) * (1 - done)
+
+
+def reward_loss(kind: Reward, told: Tensor, labels: Tensor, mask: Tensor) -> Tensor:
+    """Mean squared error of a value, else binary cross-entropy in nats."""
+    if kind == "value":
+        return ((told - labels).square() * mask).sum() / mask.sum()
+    return binary_loss(told, labels, mask)
+
+
+def binary_loss(logits: Tensor, labels: Tensor, mask: Tensor) -> Tensor:
+    """Binary cross-entropy in nats a step."""
+    losses = functional.binary_cross_entropy_with_logits(logits, labels, reduction="none")
     return (losses * mask).sum() / mask.sum()

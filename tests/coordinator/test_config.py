@@ -1,0 +1,56 @@
+import json
+
+import numpy as np
+import pytest
+
+from common.errors import ControllerError, UsageError
+from common.fields import written
+from common.messages import TaskSpec
+from common.runs import RunSettings
+from coordinator.config import RunConfig, settings_of
+from coordinator.start import Start
+
+
+@pytest.mark.parametrize(
+    ("flags", "size"),
+    [
+        ({}, 867),
+        ({"features": "z"}, 99),
+        ({"controller": "hidden"}, 8 * 289 + 3 * 9),
+        ({"controller": "hidden", "hidden_units": 24, "features": "z"}, 867),  # as long as the linear one on z and h
+    ],
+)
+def test_a_runs_controller_is_as_configured_and_journalled(random_bundle, flags, size):
+    config = RunConfig(bundle=str(random_bundle.path), **flags)
+    settings = config.settings(random_bundle)
+    assert settings.controller.size == size
+    assert (settings.task.controller is None) == (not flags)
+    assert RunSettings.from_json(settings.to_json()) == settings
+    again = settings_of(settings, random_bundle.path)
+    assert RunConfig(**again).settings(random_bundle) == settings
+
+
+def test_a_default_controller_leaves_the_words_of_the_first_version(random_bundle):
+    text = json.loads(RunConfig().settings(random_bundle).to_json())
+    assert text["controller"] == {"features": 288, "actions": 3}
+    assert not {"features", "racing"} & text.keys()
+    assert "controller" not in text["task"]
+
+
+def test_jobs_of_other_controllers_have_other_digests(random_bundle):
+    plain = TaskSpec("car-racing", "ab" * 32, 10, 0)
+    other = TaskSpec("car-racing", "ab" * 32, 10, 0, random_bundle.shape_of("z", 24))
+    assert plain.digest("score", b"x", (1,)) != other.digest("score", b"x", (1,))
+    assert written(other)["controller"] == {"features": 32, "actions": 3, "hidden": 24}
+
+
+def test_a_start_of_another_length_is_refused(random_bundle):
+    start = Start(np.zeros(867), "car-racing", random_bundle.sha256, "run night")
+    start.check("car-racing", random_bundle, random_bundle.shape_of("zh"))
+    with pytest.raises(ControllerError, match="867 parameters, this run's controllers 99"):
+        start.check("car-racing", random_bundle, random_bundle.shape_of("z"))
+
+
+def test_a_hidden_layer_has_units():
+    with pytest.raises(UsageError, match="hidden-units"):
+        RunConfig(hidden_units=0)

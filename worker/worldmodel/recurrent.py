@@ -1,0 +1,145 @@
+"""The MDN-RNN's step as ONNX nodes: what the policy's graph and the dream's have in common, and the dream itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from onnx import TensorProto
+
+from worker.worldmodel.graph import GraphBuilder
+from worker.worldmodel.mdnrnn import MDNRNNConfig
+
+Weights = Mapping[str, NDArray[np.float32]]
+
+
+class Recurrent:
+    """The LSTM, and the attention before it, of a graph that has a `state` (N, S)."""
+
+    def __init__(self, graph: GraphBuilder, state: str, rnn: Weights, config: MDNRNNConfig) -> None:
+        self._graph, self._rnn, self._config = graph, rnn, config
+        self._step = config.latent + config.actions
+        parts = graph.split(
+            state, config.hidden, config.hidden, int(config.previous_reward), config.window * self._step
+        )
+        self.hidden, self._cell, self._previous, self._window = parts
+
+    def advance(self, latent: str, action: str) -> str:
+        """One step: `hidden` becomes the next."""
+        graph, step = self._graph, graph_step(self._graph, latent, action, self._config)
+        inputs = [latent, action, self._previous]
+        if self._config.window:
+            _, kept = graph.split(self._window, self._step, (self._config.window - 1) * self._step)
+            self._window = graph.join(kept, step)
+            inputs.append(self._attend())
+        self._lstm(graph.join(*inputs, self.hidden))
+        return self.hidden
+
+    def next_state(self, previous: str = "") -> str:
+        """The state behind `advance`, as `MDNRNNConfig.state` lays it out; `previous` is what the reward head tells."""
+        return self._graph.join(self.hidden, self._cell, previous or self._previous, self._window)
+
+    def _attend(self) -> str:
+        graph, rnn, window = self._graph, self._rnn, self._config.window
+        seen = graph.node("Reshape", self._window, graph.shape(-1, window, self._step))
+        keys = graph.node("MatMul", seen, graph.constant(rnn["keys.weight"].T))
+        keys = graph.node("Add", keys, graph.constant(rnn["keys.bias"]))
+        query = graph.node("Unsqueeze", graph.linear(self.hidden, rnn["query.weight"].T), graph.shape(1))
+        scores = graph.node("Tanh", graph.node("Add", keys, query))
+        scores = graph.node("MatMul", scores, graph.constant(rnn["score.weight"].T))
+        weighted = graph.node("Mul", graph.node("Softmax", scores, axis=1), seen)
+        return str(graph.node("ReduceSum", weighted, graph.shape(1), keepdims=0))
+
+    def _lstm(self, inputs: str) -> None:
+        """A matrix product a gate: of one for all, the cuts would copy more than the products save (5 % of a step)."""
+        graph, rnn, size = self._graph, self._rnn, self._config.hidden
+        kernel = np.concatenate([rnn["lstm.weight_ih_l0"], rnn["lstm.weight_hh_l0"]], axis=1)
+        bias = rnn["lstm.bias_ih_l0"] + rnn["lstm.bias_hh_l0"]
+        rows = [slice(gate * size, (gate + 1) * size) for gate in range(4)]
+        enter, forget, candidate, leave = (
+            graph.node(kind, graph.linear(inputs, kernel[gate].T, bias[gate]))
+            for kind, gate in zip(("Sigmoid", "Sigmoid", "Tanh", "Sigmoid"), rows, strict=True)
+        )
+        kept = graph.node("Mul", forget, self._cell)
+        self._cell = graph.node("Add", kept, graph.node("Mul", enter, candidate))
+        self.hidden = graph.node("Mul", leave, graph.node("Tanh", self._cell))
+
+
+def graph_step(graph: GraphBuilder, latent: str, action: str, config: MDNRNNConfig) -> str:
+    """What enters the window."""
+    return graph.join(latent, action) if config.window else ""
+
+
+def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
+    """A step of the dream: latent, action and state, and what chance gives, to the next ones.
+
+    Inputs `latent` (N, latent), `action` (N, actions), `state` (N, state), `uniform` and `normal` (N, latent),
+    `temperature` (1,), and with dropout `mask` (N, hidden), which the LSTM's output is multiplied by. Outputs
+    `next_latent`, `next_state`, and of heads that exist `reward` (probability or value) and `done` (N,).
+
+    Sampling (Ha & Schmidhuber 2018): log weights divided by the temperature, deviations times its root. The mixture is
+    the first whose cumulated weight exceeds `uniform`: `Where`s from the first to the last, no Gather.
+    """
+    graph, kind = GraphBuilder("dream"), TensorProto.FLOAT
+    latent, action = graph.take("latent", kind, config.latent), graph.take("action", kind, config.actions)
+    state = graph.take("state", kind, config.state)
+    uniform, normal = graph.take("uniform", kind, config.latent), graph.take("normal", kind, config.latent)
+    temperature = graph.take_one("temperature")
+    recurrent = Recurrent(graph, state, rnn, config)
+    hidden = recurrent.advance(latent, action)
+    if config.dropout:
+        hidden = graph.node("Mul", hidden, graph.take("mask", kind, config.hidden))
+    order = _by_mixture(config)
+    # Half precision: the bundle holds the LSTM twice already, and its size has a limit.
+    kernel, bias = graph.weight(rnn["heads.weight"][order].T), graph.constant(rnn["heads.bias"][order])
+    heads = graph.node("Gemm", hidden, kernel, bias)
+    columns = graph.split(heads, *[config.latent] * (3 * config.mixtures), int(config.rewarded), int(config.done))
+    *mixtures, reward, done = columns
+    mean, deviation = _choose(graph, mixtures, uniform, temperature)
+    noise = graph.node("Mul", normal, graph.node("Sqrt", temperature))
+    spread = graph.node("Mul", graph.node("Exp", deviation), noise)
+    graph.give(graph.node("Add", mean, spread), "next_latent", kind, config.latent)
+    told = _told(graph, reward, config) if config.previous_reward else ""
+    graph.give(recurrent.next_state(told), "next_state", kind, config.state)
+    for name, head in (("reward", reward), ("done", done)):
+        if head:
+            value = head if name == "reward" and config.reward == "value" else graph.node("Sigmoid", head)
+            graph.give(graph.node("Squeeze", value, graph.shape(1)), name, kind)
+    return graph.build()
+
+
+def _by_mixture(config: MDNRNNConfig) -> NDArray[Any]:
+    """The heads' rows by (kind, mixture, latent) instead of (kind, latent, mixture): mixtures are then slices."""
+    width = config.mixtures * config.latent
+    rows = np.arange(3 * width).reshape(3, config.latent, config.mixtures).transpose(0, 2, 1).ravel()
+    return np.concatenate([rows, np.arange(3 * width, config.outputs)])
+
+
+def _choose(graph: GraphBuilder, mixtures: Sequence[str], uniform: str, temperature: str) -> tuple[str, str]:
+    """Mean and log deviation (N, latent) of the mixture that `uniform` falls in; `mixtures` are the heads' columns."""
+    count = len(mixtures) // 3
+    logits, means, deviations = mixtures[:count], mixtures[count : 2 * count], mixtures[2 * count :]
+    if count == 1:
+        return means[0], deviations[0]
+    highest = graph.node("Max", *logits)
+    cumulated: list[str] = []
+    for each in logits:
+        weight = graph.node("Exp", graph.node("Div", graph.node("Sub", each, highest), temperature))
+        cumulated.append(graph.node("Add", cumulated[-1], weight) if cumulated else weight)
+    point = graph.node("Mul", uniform, cumulated[-1])
+    mean, deviation = means[0], deviations[0]
+    for index in range(1, count):
+        beyond = graph.node("GreaterOrEqual", point, cumulated[index - 1])
+        mean = graph.node("Where", beyond, means[index], mean)
+        deviation = graph.node("Where", beyond, deviations[index], deviation)
+    return mean, deviation
+
+
+def _told(graph: GraphBuilder, reward: str, config: MDNRNNConfig) -> str:
+    """What the next step's previous reward is in the dream: the value, or the likelier label."""
+    if config.reward == "value":
+        return reward
+    positive = graph.node("Greater", reward, graph.constant(np.array(0, np.float32)))
+    return str(graph.node("Cast", positive, to=TensorProto.FLOAT))
