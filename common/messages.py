@@ -59,6 +59,7 @@ class TaskSpec:
     horizon: Annotated[int, Between(1, 10**6)]  # an episode's steps at most, when scored for the strategy
     patience: Annotated[int, Between(0, 10**6)]  # steps without reward before a scored episode is cut; 0: never
     controller: ControllerShape | None = field(default=None, metadata=OPTIONAL)  # `None`: linear on z and h
+    temperature: Annotated[float, Between(1e-3, 1e3)] | None = field(default=None, metadata=OPTIONAL)  # of a dream
 
     def digest(self, kind: Kind, vector: bytes, seeds: tuple[int, ...]) -> bytes:
         """A job's identity: SHA-256 over its kind, this specification, the parameters' hash and the seeds."""

@@ -29,7 +29,7 @@ class RunConfig:
     racing: bool = option(False, "let only the better half of the candidates drive the second half of the episodes")
     horizon: int = option(1000, "steps of a scored episode at most")
     patience: int = option(0, "cut a scored episode after so many steps without reward; 0: never")
-    temperature: float = option(1.0, "of a dream's sampling; above 1 it is harder, and harder to exploit")
+    temperature: float | None = option(None, "of a dream's sampling; above 1 it is harder, and harder to exploit")
     seed: int = option(1, "makes the run: population and tracks follow from it")
     evaluate_every: int = option(
         25, "drive the mean in reality every so many generations; 0: never", alias="--reality-check"
@@ -51,15 +51,17 @@ class RunConfig:
                 raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
         if self.racing and self.episodes < 2:
             raise UsageError("--racing needs at least 2 episodes: there is no second half of one")
-        if not 0 < self.sigma0 < float("inf"):
-            raise UsageError(f"--sigma0 must be a positive number, not {self.sigma0}")
+        for name in ("sigma0", "temperature"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < float("inf"):
+                raise UsageError(f"--{name} must be a positive number, not {value}")
 
     def settings(self, bundle: Bundle) -> RunSettings:
         """What the journal keeps: the bundle by its hash."""
         shape = bundle.shape_of(self.features, self.hidden_units if self.controller == "hidden" else 0)
         named = None if shape == bundle.default_shape else bundle.under(shape).controller_shape
         return RunSettings(
-            task=TaskSpec(self.task, bundle.sha256, self.horizon, self.patience, named),
+            task=TaskSpec(self.task, bundle.sha256, self.horizon, self.patience, named, self.temperature),
             controller=shape,
             population=self.population,
             episodes=self.episodes,
@@ -78,7 +80,8 @@ def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:
     frozen = {each.name: getattr(run, each.name) for each in fields(RunConfig) if hasattr(run, each.name)}
     spec, hidden = run.task, run.controller.hidden
     frozen |= {"controller": "hidden", "hidden_units": hidden} if hidden else {"controller": "linear"}
-    return {**frozen, "task": spec.task, "horizon": spec.horizon, "patience": spec.patience, "bundle": str(bundle)}
+    frozen |= {name: getattr(spec, name) for name in ("task", "horizon", "patience", "temperature")}
+    return {**frozen, "bundle": str(bundle)}
 
 
 @dataclass(frozen=True)
@@ -116,8 +119,15 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"population": 64, "episodes": 16, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 1024},
     "article": {"population": 32, "episodes": 4, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 100},
     "dream": {
-        "task": "dream", "population": 64, "episodes": 16, "sigma0": 0.1, "covariance": "diagonal", "horizon": 400,
-        "temperature": 1.25, "evaluate_every": 5, "evaluation_episodes": 16,
+        "task": "dream",
+        "population": 64,
+        "episodes": 16,
+        "sigma0": 0.1,
+        "covariance": "diagonal",
+        "horizon": 400,
+        "temperature": 1.25,
+        "evaluate_every": 5,
+        "evaluation_episodes": 16,
     },
     "frugal": {"population": 32, "episodes": 2, "sigma0": 0.1, "covariance": "diagonal", "patience": 100},
 }

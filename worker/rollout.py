@@ -11,17 +11,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.tasks.api import Policy, Rewarded
+from worker.tasks.api import Policy, Rewarded, Score
 
 IDLE_COST = 0.1  # CarRacing's own cost of a step
-
-
-@dataclass(frozen=True)
-class Score:
-    """An episode's outcome: fitness, and environment steps made."""
-
-    fitness: float
-    steps: int
 
 
 @dataclass(frozen=True)

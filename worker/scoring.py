@@ -9,31 +9,37 @@ from numpy.typing import NDArray
 
 from common.bundle import Bundle
 from common.messages import Kind, TaskSpec
-from worker.rollout import Course, Score, rollout
-from worker.tasks.api import find_task
+from worker.rollout import Course, rollout
+from worker.tasks.api import Batched, Score, find_task
 
 FULL_EPISODE = 10**6  # steps: the environment's own limit ends it
 
 
 class Scorer:
-    """Scores one job at a time; a `judge` does so in the environment that reported scores come from."""
+    """Scores a slot's jobs; a `judge` does so in the environment that reported scores come from."""
 
     def __init__(self, spec: TaskSpec, bundle: Bundle, *, judge: bool = False) -> None:
         task = find_task(spec.task)
+        fitting = bundle.under(spec.controller)
         self._spec = spec
+        self._batch = task.make_batch(fitting, spec) if isinstance(task, Batched) and not judge else None
         self._environment = task.make_judge() if judge else task.make_environment()
-        self._policy = task.make_policy(bundle.under(spec.controller))
+        self._policy = task.make_policy(fitting)
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None
     ) -> Score:
         """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode."""
+        if kind == "score" and self._batch is not None:
+            return self._batch.score([(parameters, seed)], on_step)[0]
         return rollout(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
 
     def score_all(
         self, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]], on_step: Callable[[int], None]
     ) -> list[Score]:
         """A turn's jobs, as `score` does; `on_step` hears of all steps made so far."""
+        if self._batch is not None and all(kind == "score" for kind, _, _ in jobs):
+            return self._batch.score([(parameters, seed) for _, parameters, seed in jobs], on_step)
         scores: list[Score] = []
         for job in jobs:
             before = sum(each.steps for each in scores)

@@ -22,7 +22,8 @@ def weights(model):
     return {name: tensor.detach().numpy() for name, tensor in model.state_dict().items()}
 
 
-def write_random_bundle(path, seed=0, vae=PAPER, rnn=REWARDED):
+def write_random_bundle(path, seed=0, vae=PAPER, rnn=REWARDED, initial=None):
     models = [weights(each) for each in random_models(seed, vae, rnn)]
-    initial = np.random.default_rng(seed).normal(size=(4, 2, vae.latent)).astype(np.float32)
+    if initial is None:
+        initial = np.random.default_rng(seed).normal(size=(4, 2, vae.latent)).astype(np.float32)
     return write_bundle(path, manifest("random", {"seed": seed}, vae, rnn), graphs(*models, initial, vae, rnn))

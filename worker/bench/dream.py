@@ -10,7 +10,8 @@ from common.bundle import Bundle
 from common.messages import TaskSpec
 from worker.bench.blocks import Measured, alternate
 from worker.bench.policy import MATRIX
-from worker.dream.scoring import Dreamer, Dreamt
+from worker.dream.scoring import Dreamer
+from worker.tasks.api import Episode
 
 BATCHES = (1, 256, 1024)
 CANDIDATES = 64  # of a batch, where it has room for so many
@@ -31,7 +32,7 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
 
     def dream(batch: int) -> Measured:
         count = min(batch, CANDIDATES)
-        dreams: list[Dreamt] = [(vector, seed) for vector in vectors[:count] for seed in range(batch // count)]
+        dreams: list[Episode] = [(vector, seed) for vector in vectors[:count] for seed in range(batch // count)]
         return lambda: dreamer.score(dreams)
 
     cases: dict[str, Measured] = {str(batch): dream(batch) for batch in BATCHES}

@@ -20,9 +20,15 @@ Flags = NDArray[np.bool_]
 FRAMES_PER_SECOND = 50  # CarRacing's
 
 
-def action_space() -> spaces.Box:
+def action_space() -> Any:
     """CarRacing's: steering, gas, brake."""
     return spaces.Box(np.array([-1, 0, 0], np.float32), np.array([1, 1, 1], np.float32))
+
+
+def latent_space(size: int) -> Any:
+    """Any latent: a Gaussian has no bounds."""
+    most = float(np.finfo(np.float32).max)
+    return spaces.Box(-most, most, (size,), np.float32)
 
 
 def open_bundle(bundle: Bundle | str) -> Bundle:
@@ -48,7 +54,7 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         self._horizon = horizon
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
-        self.observation_space = spaces.Box(-np.inf, np.inf, (self._world.latent_size,), np.float32)
+        self.observation_space = latent_space(self._world.latent_size)
         self.action_space = action_space()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
@@ -73,7 +79,7 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         truncated = self._steps >= self._horizon
         return self._latent[0], float(moment.reward[0]), bool(moment.done[0]), truncated, {}
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """The picture `(64, 64, 3)` that the decoder makes of the latent."""
         return None if self._decoder is None else self._decoder.decode(self._latent)[0]
 
@@ -96,7 +102,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
-        self.single_observation_space = spaces.Box(-np.inf, np.inf, (self._world.latent_size,), np.float32)
+        self.single_observation_space = latent_space(self._world.latent_size)
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -106,7 +112,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin every dream; `seed` is the first one's, or a list of all."""
         super().reset(seed=seed if isinstance(seed, int) else None, options=options)
-        seeds = list(seed) if isinstance(seed, (list, tuple)) else [None] * self.num_envs
+        seeds: list[int | None] = list(seed) if isinstance(seed, (list, tuple)) else [None] * self.num_envs
         if isinstance(seed, int):
             seeds = [seed + index for index in range(self.num_envs)]
         self._latent = np.zeros((self.num_envs, self._world.latent_size), dtype=np.float32)
@@ -135,7 +141,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self._over = done | truncated
         return self._latent.copy(), reward, done, truncated, {}
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Each dream's picture `(64, 64, 3)`."""
         return None if self._decoder is None else tuple(self._decoder.decode(self._latent))
 

@@ -76,4 +76,5 @@ def read_initial(bundle: Bundle) -> Floats:
     shape = (2, bundle.manifest.latent)
     if initial.ndim != 3 or initial.shape[1:] != shape or not len(initial) or not np.isfinite(initial).all():
         raise BundleError(f"{bundle.path.name}: a dream begins at recorded latents, and it holds none that are whole")
-    return initial.astype(np.float32)
+    whole: Floats = initial.astype(np.float32)
+    return whole

@@ -6,6 +6,8 @@ and the real track satisfy the same protocol, so that no caller can tell them ap
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, Protocol, runtime_checkable
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 
 from common.bundle import Bundle
 from common.errors import UsageError
+from common.messages import TaskSpec
 
 GROUP = "dreamfleet.tasks"
 
@@ -38,6 +41,18 @@ class Rewarded(Protocol):
         """The reward of the last action, before the next one is asked for."""
 
 
+@dataclass(frozen=True)
+class Score:
+    """An episode's outcome: fitness, and environment steps made."""
+
+    fitness: float
+    steps: int
+
+
+Episode = tuple[NDArray[np.float32], int]
+"""A candidate's flat vector and the seed of its episode."""
+
+
 class Task(Protocol):
     """One thing to score in."""
 
@@ -52,6 +67,21 @@ class Task(Protocol):
 
     def make_policy(self, bundle: Bundle) -> Policy:
         """The policy of a bundle; `BundleError` if the bundle is of another task."""
+
+
+class Batch(Protocol):
+    """Scores many episodes together; each is the same bits alone."""
+
+    def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None]) -> list[Score]:
+        """The score of each; `on_step` hears of all steps made so far."""
+
+
+@runtime_checkable
+class Batched(Protocol):
+    """A task that scores candidates in batches, beside its environment, in which its means are evaluated."""
+
+    def make_batch(self, bundle: Bundle, spec: TaskSpec) -> Batch:
+        """What scores candidates; `BundleError` if the bundle has no such thing."""
 
 
 def known_tasks() -> tuple[str, ...]:

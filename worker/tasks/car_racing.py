@@ -34,13 +34,17 @@ class CarRacing:
 
     def make_policy(self, bundle: Bundle) -> CarRacingPolicy:
         """Encoder, controller and MDN-RNN of a bundle that was trained on this task's pictures."""
+        self.check(bundle)
+        return CarRacingPolicy(bundle)
+
+    def check(self, bundle: Bundle) -> None:
+        """`BundleError` unless the bundle was trained on this task's pictures."""
         manifest = bundle.manifest
         if (manifest.task, manifest.preprocessing) != (self.name, PREPROCESSING):
             raise BundleError(
                 f"bundle {manifest.name} is of task {manifest.task!r}, preprocessing {manifest.preprocessing!r}; "
                 f"{self.name} needs {PREPROCESSING!r}"
             )
-        return CarRacingPolicy(bundle)
 
 
 class PictureObservation(gymnasium.ObservationWrapper[NDArray[np.uint8], Any, NDArray[np.uint8]]):

@@ -12,7 +12,7 @@ from common.bundle import Bundle
 from common.messages import TaskSpec
 from worker.dream.scoring import Dreamer
 from worker.tasks.car_racing import CarRacing
-from worker.worldmodel.inference import DreamStep
+from worker.worldmodel.inference import Controllers, DreamStep
 
 WIDTH = 256  # rows of a batch: larger ones are no faster
 Floats = NDArray[np.float32]
@@ -49,7 +49,7 @@ class DreamPolicy:
     """A controller inside a dream environment: it observes the latent, and remembers as the dream does."""
 
     def __init__(self, bundle: Bundle) -> None:
-        self._step = DreamStep(bundle)
+        self._controllers, self._step = Controllers(bundle), DreamStep(bundle)
         self._state = self._step.zero_state(1)
         self._parameters = np.zeros((1, self._step.shape.size), dtype=np.float32)
 
@@ -62,7 +62,7 @@ class DreamPolicy:
     def act(self, observation: Floats) -> Floats:
         """Steering, gas and brake `(3,)` for one latent."""
         latent = observation[None]
-        action = self._step.act(latent, self._parameters, self._state)
+        action = self._controllers.act(self._parameters, latent, self._state)
         self._state = self._step.advance(latent, action, self._state)
         chosen: Floats = action[0]
         return chosen

@@ -1,4 +1,4 @@
-"""The policy step in torch, one operation at a time: what the ONNX graph is measured against."""
+"""A policy step and a dream step in torch, one operation at a time: what the ONNX graphs are measured against."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
+from torch.distributions import Categorical, Normal
 
 from common.bundle import Bundle
 from common.codec import from_plain
@@ -32,5 +33,35 @@ def make_torch_step(bundle: Bundle, picture: NDArray[np.uint8], parameters: NDAr
             steer, gas, brake = squashed.unbind(dim=1)
             action = torch.stack([steer, (gas + 1) / 2, brake.clamp(0, 1)], dim=1)
             return action, cell(torch.cat([latent, action], dim=1), state)
+
+    return step
+
+
+def make_torch_dream(bundle: Bundle, batch: int) -> Callable[[], Any]:
+    """A call that dreams one step of `batch` rows with torch's modules and distributions, on one thread."""
+    torch.set_num_threads(1)
+    manifest = bundle.manifest
+    mixtures = int(manifest.models["mdnrnn"]["mixtures"])
+    cell = nn.LSTMCell(manifest.latent + manifest.actions, manifest.hidden)
+    heads = nn.Linear(manifest.hidden, 3 * mixtures * manifest.latent + 1)
+    weights = torch.randn(batch, manifest.actions, manifest.latent + manifest.hidden)
+    biases, latent = torch.randn(batch, manifest.actions), torch.randn(batch, manifest.latent)
+    state = (torch.zeros(batch, manifest.hidden), torch.zeros(batch, manifest.hidden))
+    temperature = 1.25
+
+    def step() -> Any:
+        with torch.no_grad():
+            features = torch.cat([latent, state[0]], dim=1)
+            squashed = torch.tanh(torch.bmm(weights, features[:, :, None])[:, :, 0] + biases)
+            steer, gas, brake = squashed.unbind(dim=1)
+            action = torch.stack([steer, (gas + 1) / 2, brake.clamp(0, 1)], dim=1)
+            hidden, _ = after = cell(torch.cat([latent, action], dim=1), state)
+            out = heads(hidden)
+            shape = (batch, manifest.latent, mixtures)
+            logits, means, deviations = (part.reshape(shape) for part in out[:, :-1].chunk(3, dim=1))
+            chosen = Categorical(logits=logits / temperature).sample()[:, :, None]  # type: ignore[no-untyped-call]
+            mean, deviation = means.gather(2, chosen)[:, :, 0], deviations.gather(2, chosen)[:, :, 0]
+            dreamt = Normal(mean, deviation.exp() * temperature**0.5).sample()  # type: ignore[no-untyped-call]
+            return dreamt, after, torch.sigmoid(out[:, -1])
 
     return step
