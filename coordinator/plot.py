@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 
@@ -26,7 +27,7 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     axes.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label="± 1 standard deviation")
     axes.plot(number, mean, color="tab:blue", label="mean of the population")
     axes.plot(number, [each.best for each in history], color="tab:orange", linewidth=1, label="best candidate")
-    handles = axes.get_legend_handles_labels()
+    handles: tuple[Any, ...] = axes.get_legend_handles_labels()
     if evaluations:
         real = axes.twinx() if dreamt else axes
         episodes = f"{settings.evaluation_episodes} whole episodes"
