@@ -12,7 +12,8 @@ from torch import nn
 
 from common.bundle import Bundle
 from common.codec import from_plain
-from worker.worldmodel.vae import VAE, VAEConfig
+from worker.worldmodel.vae import VAE
+from worker.worldmodel.vae_config import VAEConfig
 
 
 def make_torch_step(bundle: Bundle, picture: NDArray[np.uint8], parameters: NDArray[np.float32]) -> Callable[[], Any]:
