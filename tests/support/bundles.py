@@ -5,8 +5,10 @@ import torch
 
 from common.bundle import write_bundle
 from worker.training.assemble import graphs, manifest
-from worker.worldmodel.mdnrnn import MDNRNN, REWARDED
-from worker.worldmodel.vae import PAPER, VAE
+from worker.worldmodel.mdnrnn import MDNRNN
+from worker.worldmodel.mdnrnn_config import REWARDED
+from worker.worldmodel.vae import VAE
+from worker.worldmodel.vae_config import PAPER
 
 
 def random_models(seed=0, vae=PAPER, rnn=REWARDED):

@@ -9,8 +9,8 @@ from common.controller import act
 from common.errors import BundleError
 from tests.support.bundles import random_models, write_random_bundle
 from worker.worldmodel.inference import DreamStep, PolicyStep
-from worker.worldmodel.mdnrnn import ARTICLE, ATTENTIVE, NOTEBOOK, PAPER, REWARDED, MDNRNNConfig
-from worker.worldmodel.vae import VAEConfig
+from worker.worldmodel.mdnrnn_config import ARTICLE, ATTENTIVE, NOTEBOOK, PAPER, REWARDED, MDNRNNConfig
+from worker.worldmodel.vae_config import VAEConfig
 
 ROWS = 256
 SMALL = {"latent": 4, "hidden": 8, "mixtures": 3, "attention_units": 6}

@@ -1,6 +1,7 @@
 import torch
 
-from worker.worldmodel.mdnrnn import MDNRNN, MDNRNNConfig, latent_loss
+from worker.worldmodel.mdnrnn import MDNRNN, latent_loss
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
 
 def test_padding_does_not_count():

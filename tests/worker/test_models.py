@@ -7,10 +7,13 @@ import torch
 from common.bundle import POLICY, find_bundle
 from common.errors import UsageError
 from tests.support.bundles import random_models, write_random_bundle
-from worker.worldmodel import mdnrnn, vae
+from worker.worldmodel import mdnrnn_config as mdnrnn
+from worker.worldmodel import vae_config as vae
 from worker.worldmodel.inference import Decoder, Encoder, PolicyStep, open_part
-from worker.worldmodel.mdnrnn import MDNRNN, MDNRNNConfig, reward_labels
-from worker.worldmodel.vae import VAE, VAEConfig
+from worker.worldmodel.mdnrnn import MDNRNN, reward_labels
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from worker.worldmodel.vae import VAE
+from worker.worldmodel.vae_config import VAEConfig
 
 TINY = {"latent": 4, "channels": (4, 4, 8, 8)}
 VAES = {

@@ -40,8 +40,8 @@ from worker.worldmodel.export import (
     export_encoder,
     export_policy,
 )
-from worker.worldmodel.mdnrnn import REWARDED, MDNRNNConfig
-from worker.worldmodel.vae import PAPER, VAEConfig
+from worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
+from worker.worldmodel.vae_config import PAPER, VAEConfig
 
 QUALITY = "quality.json"
 INITIAL_LATENTS = 256

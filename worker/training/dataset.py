@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from common.errors import DatasetError
 from worker.tasks.preprocessing import PREPROCESSING, SIZE
 
-POOL_EPISODES = 48  # whose frames are shuffled together: about 100 MB
+POOL_EPISODES = 48  # whose frames are shuffled together
+POOL_FRAMES = 16_000  # of them at most, or one episode: 200 MB
 VALIDATION_EVERY = 20  # every 20th episode is held out, whole
 
 Arrays = dict[str, NDArray[Any]]
@@ -54,18 +55,33 @@ def load_pictures(path: Path) -> NDArray[np.uint8]:
 
 
 def picture_batches(
-    paths: Sequence[Path], batch: int, seed: int, first_pool: int = 0
-) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Endless shuffled batches `(batch, 64, 64, 3)` with the number of their pool; a pure function of its arguments."""
+    paths: Sequence[Path], batch: int, seed: int, first_pool: int = 0, taken: int = 0
+) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
+    """Endless shuffled batches `(batch, 64, 64, 3)`, each with its pool and how many of that are taken with it.
+
+    A pure function of its arguments: begin behind a batch with the numbers that came with it.
+    """
     pool = first_pool
     while True:
         random = np.random.default_rng([seed, pool])
         chosen = random.choice(len(paths), size=min(POOL_EPISODES, len(paths)), replace=False)
-        pictures = np.concatenate([load_pictures(paths[index]) for index in chosen])
+        pictures = _load_pool([paths[index] for index in chosen])
         order = random.permutation(len(pictures))
-        for start in range(0, max(len(order) - batch, 0) + 1, batch):
-            yield pool, pictures[order[start : start + batch]]
-        pool += 1
+        starts = range(0, max(len(order) - batch, 0) + 1, batch)
+        for number, start in enumerate(starts[taken:], start=taken + 1):
+            yield pool, number, pictures[order[start : start + batch]]
+        pool, taken = pool + 1, 0
+
+
+def _load_pool(paths: Sequence[Path]) -> NDArray[np.uint8]:
+    loaded: list[NDArray[np.uint8]] = []
+    frames = 0
+    for path in paths:
+        loaded.append(load_pictures(path))
+        frames += len(loaded[-1])
+        if frames >= POOL_FRAMES:
+            break
+    return np.concatenate(loaded)
 
 
 def pad(sequences: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:

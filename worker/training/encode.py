@@ -15,7 +15,8 @@ from common.files import write_aside
 from worker.training.checkpoint import load_checkpoint, load_config
 from worker.training.dataset import episodes, load, load_pictures
 from worker.training.train_vae import CHECKPOINT, as_tensor
-from worker.worldmodel.vae import VAE, VAEConfig
+from worker.worldmodel.vae import VAE
+from worker.worldmodel.vae_config import VAEConfig
 
 ENCODED = "encoded"
 
@@ -30,7 +31,7 @@ def encode(folder: Path) -> Iterator[int]:
     vae = hash_file(folder / CHECKPOINT)
     for path in episodes(folder):
         target = folder / ENCODED / path.name
-        if target.exists() and str(load(target, "vae")["vae"]) == vae:
+        if target.exists() and _is_of(target, vae):
             continue
         pictures = load_pictures(path)
         drive = load(path, "action", "reward", "ended")
@@ -51,6 +52,14 @@ def encoder_of(folder: Path) -> str:
         if str(load(path, "vae")["vae"]) != vae:
             raise DatasetError(f"{path} is of another VAE: run `dreamfleet encode --data {folder}` again")
     return vae
+
+
+def _is_of(target: Path, vae: str) -> bool:
+    """Whether an encoded episode is whole, has what this version looks for, and comes from this VAE."""
+    try:
+        return str(load(target, "vae", "ended", "mu")["vae"]) == vae
+    except DatasetError:
+        return False
 
 
 def _latents(model: VAE, pictures: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -1,22 +1,15 @@
-"""Named amounts of everything that training does."""
+"""Named amounts of everything that training does, and the models it is done to."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from common.errors import UsageError
 from worker.training.collect import CollectConfig
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """One model's training: Adam at `rate`, `updates` of `batch` pictures or episodes, gradients clipped at `clip`."""
-
-    updates: int
-    batch: int
-    rate: float
-    clip: float = 1.0
-    seed: int = 0
+from worker.training.train_config import TrainConfig
+from worker.worldmodel import mdnrnn_config, vae_config
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from worker.worldmodel.vae_config import VAEConfig
 
 
 @dataclass(frozen=True)
@@ -27,16 +20,51 @@ class Preset:
     collect: CollectConfig
     vae: TrainConfig
     mdnrnn: TrainConfig
+    vae_layers: VAEConfig = vae_config.PAPER
+    mdnrnn_layers: MDNRNNConfig = mdnrnn_config.REWARDED
 
 
 # About 25 minutes of two cores: 4 of driving, 12 of VAE, 8 of MDN-RNN.
 TINY = Preset(
     name="tiny",
     collect=CollectConfig(episodes=1200, steps=300),
-    vae=TrainConfig(updates=2800, batch=100, rate=5e-4),
+    vae=TrainConfig(updates=2800, batch=100, rate=5e-4, clip=0),
     mdnrnn=TrainConfig(updates=1600, batch=32, rate=1e-3),
 )
-PRESETS = {preset.name: preset for preset in (TINY,)}
+# The sources' amounts: ten passes over the frames for the VAE, 4000 updates of 100 drives for the MDN-RNN.
+_RNN = TrainConfig(updates=4000, batch=100, rate=1e-3, patience=10)
+NOTEBOOK = Preset(
+    name="notebook",
+    collect=CollectConfig(episodes=1000, steps=300),
+    vae=TrainConfig(updates=30_000, batch=100, rate=1e-3, patience=10, clip=0),
+    mdnrnn=_RNN,
+    # Its pictures are 96 wide; recorded ones are 64.
+    vae_layers=replace(vae_config.NOTEBOOK, picture=64),
+    mdnrnn_layers=mdnrnn_config.NOTEBOOK,
+)
+ARTICLE = Preset(
+    name="article",
+    collect=CollectConfig(episodes=2000, steps=300),
+    vae=TrainConfig(updates=60_000, batch=100, rate=1e-3, patience=10, clip=0),
+    mdnrnn=_RNN,
+    vae_layers=vae_config.ARTICLE,
+    mdnrnn_layers=mdnrnn_config.ARTICLE,
+)
+ATTENTIVE = Preset(
+    name="attentive",
+    collect=CollectConfig(episodes=500, steps=384),
+    vae=TrainConfig(updates=19_200, batch=100, rate=1e-3, patience=10, clip=0),
+    mdnrnn=_RNN,
+    mdnrnn_layers=mdnrnn_config.ATTENTIVE,
+)
+PAPER = Preset(
+    name="paper",
+    collect=CollectConfig(episodes=10_000, steps=1000),
+    vae=TrainConfig(updates=1_000_000, batch=100, rate=1e-4, patience=10, validate_every=2000, clip=0),
+    mdnrnn=_RNN,
+    mdnrnn_layers=mdnrnn_config.PAPER,
+)
+PRESETS = {preset.name: preset for preset in (TINY, NOTEBOOK, ARTICLE, ATTENTIVE, PAPER)}
 
 
 def find_preset(name: str) -> Preset:

@@ -9,61 +9,99 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from common.errors import DatasetError
 from common.progress import append_curve
-from worker.training.checkpoint import load_checkpoint, save_checkpoint
-from worker.training.dataset import episodes, load_pictures, picture_batches, split
-from worker.training.presets import TrainConfig
-from worker.worldmodel.vae import PAPER, VAE, VAEConfig
+from worker.tasks.preprocessing import SIZE
+from worker.training.dataset import POOL_EPISODES, episodes, load_pictures, picture_batches, split
+from worker.training.schedule import Schedule
+from worker.training.train_config import TrainConfig
+from worker.worldmodel.vae import VAE
+from worker.worldmodel.vae_config import PAPER, VAEConfig
 
 CHECKPOINT = "vae.safetensors"
-SAVE_EVERY = 200
 VALIDATION_PICTURES = 2000
+CURVE_PICTURES = 500  # of them, for the curve while training
 ACTIVE_NATS = 0.1  # a picture, on average over the held-out ones, above which a latent carries something
 
 Report = Callable[[int, str], None]
 
 
-def train_vae(folder: Path, config: TrainConfig, report: Report, layers: VAEConfig = PAPER) -> dict[str, float]:
-    """Train, or go on, to `config.updates`; returns the quality on held-out episodes."""
+def train_vae(
+    folder: Path, config: TrainConfig, report: Report, layers: VAEConfig = PAPER,
+    device: torch.device | None = None, continue_from: Path | None = None,
+) -> dict[str, float]:  # fmt: skip
+    """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
+
+    A stop changes nothing: batches and chance follow from the seed and the update alone.
+    """
     train, held_out = split(episodes(folder))
+    if layers.picture != SIZE:
+        raise DatasetError(f"recorded pictures are {SIZE} wide, this VAE's {layers.picture}: choose other layers")
     torch.manual_seed(config.seed)
-    model = VAE(layers)
-    optimiser = torch.optim.Adam(model.parameters(), lr=config.rate)
-    progress = load_checkpoint(folder / CHECKPOINT, model, optimiser) or {"update": 0, "pool": 0}
-    update: int = progress["update"]
-    report(update, "")
-    noise = torch.Generator().manual_seed(config.seed + update)
-    for pool, batch in picture_batches(train, config.batch, config.seed, progress["pool"]):
-        if update >= config.updates:
-            break
-        loss, error, divergence = model.loss(
-            as_tensor(batch), torch.randn(len(batch), model.config.latent, generator=noise)
-        )
-        optimiser.zero_grad()
+    model = VAE(layers).to(device)
+    schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from)
+    progress = schedule.progress
+    report(schedule.update, "")
+    validation = held_out_pictures(held_out, CURVE_PICTURES)
+    batches = picture_batches(train, config.batch, config.seed, progress.get("pool", 0), progress.get("taken", 0))
+    epoch_pools = max(1, len(train) // POOL_EPISODES)
+    while not schedule.done:
+        pool, taken, batch = next(batches)
+        schedule.set_rate(pool // epoch_pools)
+        torch.manual_seed(config.seed * 1_000_003 + schedule.update)
+        model.train()
+        noise = torch.randn(len(batch), layers.latent).to(device)
+        loss, error, divergence = model.loss(as_tensor(batch, device), noise)
         loss.backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
-        update += 1
-        report(update, f"error {error.item():.1f}  KL {divergence.item():.1f}")
-        if update % 20 == 0:
-            append_curve(folder / "vae.jsonl", update=update, error=error.item(), kl=divergence.item())
-        if update % SAVE_EVERY == 0 or update == config.updates:
-            save_checkpoint(folder / CHECKPOINT, model, optimiser, {"update": update, "pool": pool + 1})
-    return quality(model, held_out)
+        schedule.step()
+        schedule.progress |= {"pool": pool, "taken": taken}
+        report(schedule.update, f"error {error.item():.1f}  KL {divergence.item():.1f}")
+        if schedule.update % 20 == 0:
+            append_curve(folder / "vae.jsonl", update=schedule.update, error=error.item(), kl=divergence.item())
+        if schedule.due:
+            held_out_loss, held_out_error = validate(model, validation, device)
+            append_curve(
+                folder / "vae.jsonl", update=schedule.update, held_out=held_out_loss, held_out_error=held_out_error
+            )
+            schedule.validated(held_out_loss)
+    return quality(model, held_out, device)
 
 
-def quality(model: VAE, held_out: Sequence[Path]) -> dict[str, float]:
+def validate(model: VAE, pictures: NDArray[np.uint8], device: torch.device | None) -> tuple[float, float]:
+    """Loss and summed squared error a held-out picture, at the latents' means."""
+    model.eval()
+    with torch.no_grad():
+        parts = [
+            torch.stack(model.loss(batch, torch.zeros(len(batch), model.config.latent, device=device))[:2]) * len(batch)
+            for batch in (as_tensor(pictures[start : start + 100], device) for start in range(0, len(pictures), 100))
+        ]
+    loss, error = (torch.stack(parts).sum(dim=0) / len(pictures)).tolist()
+    return loss, error
+
+
+def held_out_pictures(held_out: Sequence[Path], most: int) -> NDArray[np.uint8]:
+    """Every fifth picture of held-out episodes, until there are enough."""
+    found: list[NDArray[np.uint8]] = []
+    for path in held_out:
+        found.append(load_pictures(path)[::5])
+        if sum(len(each) for each in found) >= most:
+            break
+    return np.concatenate(found)[:most]
+
+
+def quality(model: VAE, held_out: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
     """Summed squared error a picture, beside that of the mean picture, and how many latents are active."""
-    pictures = np.concatenate([load_pictures(path)[::5] for path in held_out])[:VALIDATION_PICTURES]
-    mean = pictures.astype(np.float32).mean(axis=0) / 255
+    pictures = held_out_pictures(held_out, VALIDATION_PICTURES)
+    mean = pictures.mean(axis=0, dtype=np.float64) / 255
     errors, baseline, nats = [], [], []
     model.eval()
     with torch.no_grad():
         for start in range(0, len(pictures), 100):
-            batch = as_tensor(pictures[start : start + 100])
+            batch = as_tensor(pictures[start : start + 100], device)
             mu, logvar = model.encode(batch)
-            errors.append((model.decode(mu) - batch).square().sum(dim=(1, 2, 3)).numpy())
+            errors.append((model.decode(mu) - batch).square().sum(dim=(1, 2, 3)).cpu().numpy())
             baseline.append(((pictures[start : start + 100] / 255.0 - mean) ** 2).sum(axis=(1, 2, 3)))
-            nats.append((0.5 * (mu.square() + logvar.exp() - logvar - 1)).numpy())
+            nats.append((0.5 * (mu.square() + logvar.exp() - logvar - 1)).cpu().numpy())
     active = (np.concatenate(nats).mean(axis=0) > ACTIVE_NATS).sum()
     return {
         "reconstruction_error": round(float(np.concatenate(errors).mean()), 2),
@@ -72,6 +110,6 @@ def quality(model: VAE, held_out: Sequence[Path]) -> dict[str, float]:
     }
 
 
-def as_tensor(pictures: NDArray[np.uint8]) -> torch.Tensor:
+def as_tensor(pictures: NDArray[np.uint8], device: torch.device | None = None) -> torch.Tensor:
     """Pictures `(N, 64, 64, 3)` uint8 as `(N, 3, 64, 64)` in [0, 1]."""
-    return torch.from_numpy(pictures).permute(0, 3, 1, 2).float() / 255
+    return torch.from_numpy(pictures).to(device).permute(0, 3, 1, 2).float() / 255

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
-from pathlib import Path
 
 SUMMARY = "train the VAE on a data set, or go on with it"
 EXTRAS = ("train",)
@@ -12,22 +10,29 @@ EXTRAS = ("train",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--preset", default="tiny", help="how much of everything (default tiny)")
-    parser.add_argument("--updates", type=int, help="updates in all, instead of the preset's")
+    from worker.training.flags import add_training_flags
+    from worker.worldmodel.vae_config import VAEConfig
+
+    add_training_flags(parser, VAEConfig)
 
 
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
     from common.progress import progress_bar
     from worker.training.assemble import record_quality
+    from worker.training.flags import changed
     from worker.training.presets import find_preset
+    from worker.training.schedule import device_of, summary
     from worker.training.train_vae import train_vae
+    from worker.worldmodel.vae import VAE
 
-    config = find_preset(args.preset).vae
-    config = replace(config, updates=args.updates or config.updates)
+    preset = find_preset(args.preset)
+    config, layers = changed(preset.vae, args), changed(preset.vae_layers, args)
+    if args.summary:
+        print(summary(VAE(layers)))
+        return 0
     with progress_bar("VAE", config.updates, "updates") as bar:
-        figures = train_vae(args.data, config, bar.move)
+        figures = train_vae(args.data, config, bar.move, layers, device_of(args.device), args.continue_from)
     record_quality(args.data, figures)
     print("  ".join(f"{name} {value}" for name, value in figures.items()))
     return 0

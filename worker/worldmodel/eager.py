@@ -13,7 +13,8 @@ from torch.distributions import Categorical, Normal
 
 from common.bundle import Bundle
 from common.codec import from_plain
-from worker.worldmodel.vae import VAE, VAEConfig
+from worker.worldmodel.vae import VAE
+from worker.worldmodel.vae_config import VAEConfig
 
 
 def make_torch_step(bundle: Bundle, picture: NDArray[np.uint8], parameters: NDArray[np.float32]) -> Callable[[], Any]:

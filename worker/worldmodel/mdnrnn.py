@@ -8,76 +8,13 @@ it; in that code the softmax runs over the batch and the state stays zero, so th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from common.errors import UsageError
-
-Reward = Literal["none", "positive", "notebook", "value"]
-
-
-@dataclass(frozen=True)
-class MDNRNNConfig:
-    """Inputs, an LSTM of `hidden` units, `mixtures` Gaussians a latent dimension, heads.
-
-    The reward head: the logit of a positive reward; the `notebook`'s, of a reward that is not positive while the
-    episode goes on; or the reward's value.
-    """
-
-    latent: int = 32
-    actions: int = 3
-    hidden: int = 256
-    mixtures: int = 5
-    reward: Reward = "positive"
-    done: bool = False
-    previous_reward: bool = False  # what the reward head told of the step before is an input
-    dropout: float = 0.0  # of the LSTM's output before the heads
-    window: int = 0  # inputs that attention looks at, the current one among them; 0: none
-    attention_units: int = 64
-
-    def __post_init__(self) -> None:
-        if min(self.latent, self.actions, self.hidden, self.mixtures, self.attention_units) < 1 or self.window < 0:
-            raise UsageError("an MDN-RNN's sizes must be at least 1, its window at least 0")
-        if not 0 <= self.dropout < 1:
-            raise UsageError(f"--dropout must be from 0 to below 1, not {self.dropout}")
-        if self.previous_reward and self.reward == "none":
-            raise UsageError("the previous reward as an input needs a reward head: in the dream nothing else tells it")
-
-    @property
-    def inputs(self) -> int:
-        """Latents, actions and the previous reward."""
-        return self.latent + self.actions + self.previous_reward
-
-    @property
-    def lstm_inputs(self) -> int:
-        """`inputs`, and beside them what attention makes of the window."""
-        return self.inputs + (self.latent + self.actions if self.window else 0)
-
-    @property
-    def rewarded(self) -> bool:
-        """Whether there is a reward head."""
-        return self.reward != "none"
-
-    @property
-    def outputs(self) -> int:
-        """Of the heads: log weights, means, log deviations `(3, latent, mixtures)`, reward, done."""
-        return 3 * self.mixtures * self.latent + self.rewarded + self.done
-
-    @property
-    def state(self) -> int:
-        """Of a step: hidden, cell, previous reward, window of latents and actions (oldest first)."""
-        return 2 * self.hidden + self.previous_reward + self.window * (self.latent + self.actions)
-
-
-REWARDED = MDNRNNConfig()
-PAPER = MDNRNNConfig(reward="none")
-ARTICLE = MDNRNNConfig(previous_reward=True)
-NOTEBOOK = MDNRNNConfig(reward="notebook", previous_reward=True)
-ATTENTIVE = MDNRNNConfig(window=8)
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig, Reward
 
 
 class Prediction(NamedTuple):
@@ -184,7 +121,7 @@ def latent_loss(prediction: Prediction, targets: Tensor, mask: Tensor) -> Tensor
     scaled = (targets[..., None] - prediction.means) * torch.exp(-prediction.log_deviations)
     log_normal = -0.5 * scaled.square() - prediction.log_deviations - 0.5 * math.log(2 * math.pi)
     likelihood = torch.logsumexp(prediction.log_weights + log_normal, dim=-1).mean(dim=-1)
-    return -(likelihood * mask).sum() / mask.sum()
+    return -(likelihood * mask).sum() / mask.sum().clamp(min=1)
 
 
 def reward_labels(kind: Reward, rewards: Tensor, done: Tensor) -> Tensor:
@@ -198,11 +135,11 @@ def reward_labels(kind: Reward, rewards: Tensor, done: Tensor) -> Tensor:
 def reward_loss(kind: Reward, told: Tensor, labels: Tensor, mask: Tensor) -> Tensor:
     """Mean squared error of a value, else binary cross-entropy in nats."""
     if kind == "value":
-        return ((told - labels).square() * mask).sum() / mask.sum()
+        return ((told - labels).square() * mask).sum() / mask.sum().clamp(min=1)
     return binary_loss(told, labels, mask)
 
 
 def binary_loss(logits: Tensor, labels: Tensor, mask: Tensor) -> Tensor:
     """Binary cross-entropy in nats a step."""
     losses = functional.binary_cross_entropy_with_logits(logits, labels, reduction="none")
-    return (losses * mask).sum() / mask.sum()
+    return (losses * mask).sum() / mask.sum().clamp(min=1)

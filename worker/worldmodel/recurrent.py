@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto
 
 from worker.worldmodel.graph import GraphBuilder
-from worker.worldmodel.mdnrnn import MDNRNNConfig
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
 Weights = Mapping[str, NDArray[np.float32]]
 

@@ -84,7 +84,7 @@ def test_batches_are_a_pure_function_of_seed_and_pool(tmp_path):
     paths = write_drives(tmp_path)
 
     def first(seed, pool):
-        return next(picture_batches(paths, 16, seed, pool))[1]
+        return next(picture_batches(paths, 16, seed, pool))[-1]
 
     assert np.array_equal(first(0, 0), first(0, 0))
     assert not np.array_equal(first(0, 0), first(1, 0))
@@ -94,13 +94,22 @@ def test_batches_are_a_pure_function_of_seed_and_pool(tmp_path):
 def test_a_pool_shows_no_picture_twice(tmp_path):
     paths = write_drives(tmp_path)
     batches = itertools.takewhile(lambda each: each[0] == 0, picture_batches(paths, 16, seed=0))
-    pictures = np.concatenate([batch for _, batch in batches])
+    pictures = np.concatenate([batch for _, _, batch in batches])
     assert len(np.unique(pictures.reshape(len(pictures), -1), axis=0)) == len(pictures)
+
+
+def test_batches_go_on_behind_any_of_them(tmp_path):
+    paths = write_drives(tmp_path)
+    batches = list(itertools.islice(picture_batches(paths, 16, 0), 9))
+    for index, (pool, taken, _) in enumerate(batches[:-1]):
+        behind = next(picture_batches(paths, 16, 0, pool, taken))
+        assert behind[:2] == batches[index + 1][:2]
+        assert np.array_equal(behind[2], batches[index + 1][2])
 
 
 def test_fewer_pictures_than_a_batch_make_a_smaller_batch(tmp_path):
     paths = write_drives(tmp_path, episodes=2, steps=3)
-    assert [len(batch) for _, batch in itertools.islice(picture_batches(paths, 100, seed=0), 2)] == [5, 5]
+    assert [len(batch) for _, _, batch in itertools.islice(picture_batches(paths, 100, seed=0), 2)] == [5, 5]
 
 
 def test_memory_holds_a_pool_and_not_the_data_set(tmp_path, monkeypatch):

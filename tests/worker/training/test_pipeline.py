@@ -11,8 +11,9 @@ from worker.training.assemble import assemble
 from worker.training.checkpoint import load_weights
 from worker.training.dataset import load
 from worker.training.encode import encode
-from worker.training.presets import TrainConfig, find_preset
-from worker.training.train_mdnrnn import area_under_curve
+from worker.training.foresight import area_under_curve
+from worker.training.presets import find_preset
+from worker.training.train_config import TrainConfig
 from worker.worldmodel.inference import Encoder, PolicyStep
 
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)

@@ -1,0 +1,132 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.errors import DatasetError, UsageError
+from tests.support.drives import write_drive, write_drives
+from worker.training import train_mdnrnn, train_vae
+from worker.training.checkpoint import load_config, load_progress, load_weights
+from worker.training.drives import load_drives
+from worker.training.encode import encode
+from worker.training.presets import PRESETS
+from worker.training.schedule import device_of, summary
+from worker.training.train_config import TrainConfig
+from worker.worldmodel.mdnrnn import MDNRNN
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from worker.worldmodel.vae import VAE
+from worker.worldmodel.vae_config import VAEConfig
+
+LAYERS = VAEConfig(latent=4, channels=(4, 4, 8, 8), batch_norm=True, dropout=0.1)
+SMALL = MDNRNNConfig(latent=4, hidden=8, mixtures=2, dropout=0.2)
+SHORT = TrainConfig(updates=4, batch=8, rate=1e-3, validate_every=2)
+
+
+def ignore(_done, _note):
+    pass
+
+
+@pytest.fixture(scope="module")
+def encoded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    write_drives(folder, episodes=4, steps=8)
+    train_vae.train_vae(folder, SHORT, ignore, LAYERS)
+    assert len(list(encode(folder))) == 4
+    return folder
+
+
+def linked(encoded, folder):
+    for name in ("encoded", train_vae.CHECKPOINT):
+        (folder / name).symlink_to(encoded / name)
+    return folder
+
+
+def equal(one: Path, other: Path):
+    first, second = load_weights(one), load_weights(other)
+    return all(np.array_equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("stop", [1, 3])
+def test_the_vae_goes_on_to_the_same_weights_as_without_a_stop(encoded, tmp_path, stop):
+    (tmp_path / "episodes").symlink_to(encoded / "episodes")
+    for updates in (stop, 4):
+        train_vae.train_vae(tmp_path, replace(SHORT, updates=updates), ignore, LAYERS)
+    assert equal(encoded / train_vae.CHECKPOINT, tmp_path / train_vae.CHECKPOINT)
+
+
+def test_a_checkpoint_keeps_its_layers_and_refuses_others(encoded):
+    assert load_config(encoded / train_vae.CHECKPOINT, VAEConfig) == LAYERS
+    with pytest.raises(DatasetError, match=r"of another model: latent 4, not 5; .*same flags"):
+        train_vae.train_vae(encoded, SHORT, ignore, replace(LAYERS, latent=5))
+
+
+def test_training_ends_when_held_out_drives_gain_nothing_and_goes_on_with_new_ones(encoded, tmp_path):
+    write_drives(tmp_path, episodes=4, steps=8)
+    impatient = TrainConfig(updates=40, batch=8, rate=1e-12, patience=2, validate_every=1)
+    train_vae.train_vae(tmp_path, impatient, ignore, replace(LAYERS, batch_norm=False))
+    stopped = load_progress(tmp_path / train_vae.CHECKPOINT)
+    assert stopped["stopped"] == 3
+    assert stopped["update"] < 40
+    seen = []
+    train_vae.train_vae(tmp_path, impatient, lambda done, _: seen.append(done), replace(LAYERS, batch_norm=False))
+    assert seen == [stopped["update"]]
+    write_drive(tmp_path, 4, steps=8)
+    train_vae.train_vae(tmp_path, impatient, lambda done, _: seen.append(done), replace(LAYERS, batch_norm=False))
+    assert len(seen) > 2
+
+
+def test_curves_hold_held_out_losses_beside_those_of_training(encoded):
+    text = (encoded / "vae.jsonl").read_text()
+    assert text.count("held_out_error") == 2
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_presets_layers_train_and_foresee(encoded, tmp_path, name):
+    layers = replace(PRESETS[name].mdnrnn_layers, latent=4, hidden=8, done=True)
+    figures = train_mdnrnn.train_mdnrnn(linked(encoded, tmp_path), SHORT, ignore, layers)
+    assert "nats_per_dimension" in figures
+    assert ("reward_auc" in figures) == layers.rewarded
+
+
+def test_training_begins_from_another_checkpoint(encoded, tmp_path):
+    first, second = (tmp_path / name for name in ("first", "second"))
+    for folder in (first, second):
+        folder.mkdir()
+        linked(encoded, folder)
+    train_mdnrnn.train_mdnrnn(first, SHORT, ignore, SMALL)
+    source, still = first / train_mdnrnn.CHECKPOINT, replace(SHORT, updates=2, rate=1e-12)
+    train_mdnrnn.train_mdnrnn(second, still, ignore, SMALL, continue_from=source)
+    one, other = load_weights(source), load_weights(second / train_mdnrnn.CHECKPOINT)
+    assert all(np.allclose(one[name], other[name], atol=1e-9) for name in one)
+    (second / train_mdnrnn.CHECKPOINT).unlink()
+    with pytest.raises(UsageError, match="no checkpoint"):
+        train_mdnrnn.train_mdnrnn(second, still, ignore, SMALL, continue_from=tmp_path / "absent.safetensors")
+
+
+def test_a_batch_in_chunks_has_the_same_gradients(encoded, monkeypatch):
+    import torch
+
+    model = MDNRNN(replace(SMALL, dropout=0.0, done=True))
+    drives = load_drives(sorted((encoded / "encoded").glob("*.npz")))
+    drives.logvar.fill_(-100)  # chance is drawn a chunk at a time
+    found = []
+    for steps in (10_000, 1):
+        monkeypatch.setattr("worker.training.drives.CHUNK_STEPS", steps)
+        model.zero_grad()
+        values = train_mdnrnn.backward(model, drives, torch.Generator().manual_seed(0))
+        found.append((values, [each.grad.clone() for each in model.parameters() if each.requires_grad]))
+    assert found[0][0] == pytest.approx(found[1][0], rel=1e-5)
+    for one, other in zip(found[0][1], found[1][1], strict=True):
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-4)
+
+
+def test_a_device_that_is_not_there_is_refused():
+    assert device_of("auto").type in ("cpu", "cuda")
+    with pytest.raises(UsageError, match="cpu, cuda or auto"):
+        device_of("abacus")
+
+
+def test_a_summary_counts_what_is_learnt():
+    assert summary(MDNRNN(PRESETS["notebook"].mdnrnn_layers)).splitlines()[-1].split()[-1] == "423,649"
+    assert "BatchNorm2d" in summary(VAE(LAYERS))

@@ -1,0 +1,68 @@
+"""Encoded drives as batches of an MDN-RNN."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from worker.training.dataset import load, pad
+from worker.worldmodel.mdnrnn import reward_labels
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig
+
+FLIP = np.array([-1, 1, 1], dtype=np.float32)  # a mirrored drive steers the other way
+CHUNK_STEPS = 10_000  # that go through a model at once: about 300 MB
+
+
+@dataclass(frozen=True)
+class Drives:
+    """A batch `(N, T, ...)` of drives, padded; `mask` `(N, T)` is 1 where a step is real, `done` where one ended."""
+
+    mu: Tensor
+    logvar: Tensor
+    action: Tensor
+    reward: Tensor
+    done: Tensor
+    mask: Tensor
+
+    def chunks(self) -> Iterator[Drives]:
+        """The same drives, few at a time."""
+        rows = max(1, CHUNK_STEPS // self.mask.shape[1])
+        for start in range(0, len(self.mask), rows):
+            yield Drives(*(getattr(self, each.name)[start : start + rows] for each in fields(self)))
+
+    def to(self, device: torch.device | None) -> Drives:
+        """On a device."""
+        return Drives(*(getattr(self, each.name).to(device) for each in fields(self)))
+
+
+def load_drives(paths: Sequence[Path], mirrored: NDArray[np.bool_] | None = None) -> Drives:
+    """The drives of these episodes, some of them mirrored."""
+    columns: dict[str, list[NDArray[np.float32]]] = {each.name: [] for each in fields(Drives)}
+    for path, flip in zip(paths, np.zeros(len(paths), np.bool_) if mirrored is None else mirrored, strict=True):
+        prefix = "mirrored_" if flip else ""
+        arrays = load(path, f"{prefix}mu", f"{prefix}logvar", "action", "reward", "ended")
+        columns["mu"].append(arrays[f"{prefix}mu"])
+        columns["logvar"].append(arrays[f"{prefix}logvar"])
+        columns["action"].append(arrays["action"] * (FLIP if flip else FLIP**2))
+        columns["reward"].append(arrays["reward"])
+        done = np.zeros(len(arrays["reward"]), dtype=np.float32)
+        done[-1] = arrays["ended"]
+        columns["done"].append(done)
+        columns["mask"].append(np.ones(len(arrays["reward"]), dtype=np.float32))
+    return Drives(**{name: torch.from_numpy(pad(arrays)) for name, arrays in columns.items()})
+
+
+def inputs_of(config: MDNRNNConfig, latents: Tensor, drives: Drives) -> Tensor:
+    """`(N, T, inputs)`: latents, actions, and where the model takes it the reward head's label of the step before."""
+    parts = [latents, drives.action]
+    if config.previous_reward:
+        labels = reward_labels(config.reward, drives.reward, drives.done)
+        parts.append(functional.pad(labels, (1, 0))[:, :-1, None])
+    return torch.cat(parts, dim=-1)

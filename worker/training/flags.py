@@ -1,0 +1,49 @@
+"""Flags that change a preset's training and layers: one a field."""
+
+from __future__ import annotations
+
+import argparse
+import types
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from worker.training.train_config import TrainConfig
+
+T = TypeVar("T")
+FIXED = ("actions", "picture")  # what the task says
+
+
+def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> None:
+    """The flags of a `train` verb whose model is configured by `layers`."""
+    parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
+    parser.add_argument("--preset", default="tiny", help="how much of everything, and which layers (default tiny)")
+    parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
+    parser.add_argument("--continue-from", type=Path, metavar="FILE", help="begin from this checkpoint's weights")
+    parser.add_argument("--summary", action="store_true", help="print layers and parameters, and train nothing")
+    for title, config in (
+        ("training, instead of the preset's", TrainConfig),
+        ("layers, instead of the preset's", layers),
+    ):
+        group, hints = parser.add_argument_group(title), get_type_hints(config)
+        for each in fields(config):
+            if each.name not in FIXED:
+                flag = "--" + each.name.replace("_", "-")
+                group.add_argument(flag, default=argparse.SUPPRESS, **_options(hints[each.name]))
+
+
+def changed(config: T, args: argparse.Namespace) -> T:
+    """A preset's configuration with what the flags say."""
+    given = {each.name: getattr(args, each.name) for each in fields(config) if hasattr(args, each.name)}  # type: ignore[arg-type]
+    given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+    return replace(config, **given)  # type: ignore[type-var]
+
+
+def _options(hint: Any) -> dict[str, Any]:
+    if get_origin(hint) in (Union, types.UnionType):
+        hint = next(each for each in get_args(hint) if each is not type(None))
+    if get_origin(hint) is Literal:
+        return {"choices": get_args(hint)}
+    if get_origin(hint) is tuple:
+        return {"type": get_args(hint)[0], "nargs": "+"}
+    return {"action": argparse.BooleanOptionalAction} if hint is bool else {"type": hint}

@@ -1,0 +1,130 @@
+"""How well a model foresees: heads' accuracy at once, and after steps of dreaming under recorded actions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from worker.training.drives import Drives, load_drives
+from worker.worldmodel.mdnrnn import MDNRNN, Prediction, reward_labels
+
+AHEAD = (1, 10, 50)  # steps of dreaming
+EVERY = 25  # a dream begins behind so many recorded steps more
+MOST = 40  # held-out drives
+
+Floats = NDArray[np.float32]
+
+
+def foresight(model: MDNRNN, held_out: Sequence[Path]) -> dict[str, float]:
+    """Of each head, how it judges recorded steps, and `_after_N` those that N dreamt steps lead to.
+
+    Binary heads by the area under the curve, a value by its root mean square error; latents by theirs, in units of
+    their spread. A figure that the drives cannot tell (they are too short, or all labels equal) is left out.
+    """
+    device = next(model.parameters()).device
+    drives = load_drives(held_out[:MOST]).to(device)
+    model.eval()
+    with torch.no_grad():
+        told, hidden_states = _follow(model, drives)
+        labels = _labels(model, drives)
+        mask = drives.mask > 0
+        figures = {name: _judge(model, name, _head(told, name)[mask], labels[name][mask]) for name in labels}
+        for ahead, (seen, predicted, latents) in _dream(model, drives, hidden_states).items():
+            rows, steps = seen
+            for name in labels:
+                figures[f"{name}_after_{ahead}"] = _judge(
+                    model, name, _head(predicted, name), labels[name][rows, steps]
+                )
+            error = (latents - drives.mu[rows, steps]).square().mean().sqrt() / drives.mu[mask].std()
+            figures[f"latent_error_after_{ahead}"] = float(error)
+    named = {name if "error" in name else _figure(model, name): value for name, value in figures.items()}
+    return {name: round(value, 3) for name, value in named.items() if np.isfinite(value)}
+
+
+def area_under_curve(scores: Floats, positive: NDArray[np.bool_]) -> float:
+    """How often a positive scores above a negative; 0.5 is chance, NaN without both kinds."""
+    ranks = np.empty(len(scores))
+    ranks[np.argsort(scores)] = np.arange(1, len(scores) + 1)
+    positives = int(positive.sum())
+    pairs = positives * (len(scores) - positives)
+    return float((ranks[positive].sum() - positives * (positives + 1) / 2) / pairs) if pairs else float("nan")
+
+
+def _follow(model: MDNRNN, drives: Drives) -> tuple[Prediction, list[Tensor]]:
+    """Predictions along the recorded drives, and the state before each step."""
+    config = model.config
+    labels = reward_labels(config.reward, drives.reward, drives.done)
+    state = drives.mu.new_zeros(len(drives.mu), config.state)
+    states, hidden = [], []
+    for step in range(drives.mu.shape[1]):
+        if config.previous_reward and step:
+            state = _remember(model, state, labels[:, step - 1])
+        states.append(state)
+        last, state = model.advance(torch.cat([drives.mu[:, step], drives.action[:, step]], dim=1), state)
+        hidden.append(last)
+    return model.predict(torch.stack(hidden, dim=1)), states
+
+
+def _dream(
+    model: MDNRNN, drives: Drives, states: list[Tensor]
+) -> dict[int, tuple[tuple[Tensor, Tensor], Prediction, Tensor]]:
+    """From recorded prefixes on, dreaming means under the recorded actions.
+
+    By steps ahead: which recorded steps (rows, steps) the dreams have come to, what is told there, dreamt latents.
+    """
+    config, length = model.config, drives.mu.shape[1]
+    found: dict[int, list[tuple[Tensor, Tensor, Tensor, Tensor]]] = {ahead: [] for ahead in AHEAD}
+    for start in range(EVERY, length - 1, EVERY):
+        latent, state = drives.mu[:, start], states[start]
+        for ahead in range(1, min(max(AHEAD), length - 1 - start) + 1):
+            hidden, state = model.advance(torch.cat([latent, drives.action[:, start + ahead - 1]], dim=1), state)
+            told = model.predict(hidden)
+            latent = (told.log_weights.exp() * told.means).sum(dim=-1)
+            if config.previous_reward:
+                state = _remember(model, state, told.reward if config.reward == "value" else (told.reward > 0).float())
+            if ahead in found:
+                rows = torch.nonzero(drives.mask[:, start + ahead])[:, 0]
+                last, _ = model.advance(torch.cat([latent, drives.action[:, start + ahead]], dim=1), state)
+                found[ahead].append((rows, torch.full_like(rows, start + ahead), last[rows], latent[rows]))
+    result = {}
+    for ahead, parts in found.items():
+        if parts:
+            rows, steps, hidden, latents = (torch.cat(each) for each in zip(*parts, strict=True))
+            result[ahead] = ((rows, steps), model.predict(hidden), latents)
+    return result
+
+
+def _remember(model: MDNRNN, state: Tensor, label: Tensor) -> Tensor:
+    state = state.clone()
+    state[:, 2 * model.config.hidden] = label
+    return state
+
+
+def _labels(model: MDNRNN, drives: Drives) -> dict[str, Tensor]:
+    config, labels = model.config, dict[str, Tensor]()
+    if config.rewarded:
+        labels["reward"] = reward_labels(config.reward, drives.reward, drives.done)
+    if config.done:
+        labels["done"] = drives.done
+    return labels
+
+
+def _head(told: Prediction, name: str) -> Tensor:
+    return told.reward if name == "reward" else told.done
+
+
+def _judge(model: MDNRNN, name: str, told: Tensor, label: Tensor) -> float:
+    if name == "reward" and model.config.reward == "value":
+        return float((told - label).square().mean().sqrt())
+    return area_under_curve(told.cpu().numpy(), label.cpu().numpy() > 0)
+
+
+def _figure(model: MDNRNN, name: str) -> str:
+    head, _, ahead = name.partition("_")
+    kind = "rmse" if head == "reward" and model.config.reward == "value" else "auc"
+    return f"{head}_{kind}" + (f"_{ahead}" if ahead else "")

@@ -1,0 +1,104 @@
+"""When training ends, at which rate it learns, and on what."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from common.errors import UsageError
+from worker.training.checkpoint import load_checkpoint, save_checkpoint
+from worker.training.train_config import TrainConfig
+
+
+class Schedule:
+    """A training's progress on disk: goes on where it stopped, and ends early when held-out drives gain nothing."""
+
+    def __init__(
+        self, path: Path, model: torch.nn.Module, config: TrainConfig, episodes: int, other: Path | None = None
+    ) -> None:
+        """`episodes` to train on, in all; `other` is a checkpoint to begin from where `path` has none."""
+        self._path, self._model, self._config, self._episodes = path, model, config, episodes
+        self._best_path = path.with_suffix(".best.safetensors")
+        self.optimiser = torch.optim.Adam(model.parameters(), lr=config.rate)
+        self.progress: dict[str, Any] = {"update": 0}
+        if (found := load_checkpoint(path, model, self.optimiser)) is not None:
+            self.progress = found
+        elif other is not None and load_checkpoint(other, model, self.optimiser) is None:
+            raise UsageError(f"--continue-from: no checkpoint at {other}")
+        if self.progress.get("stopped") not in (None, episodes):  # there is something new to learn from
+            self.progress |= {"stopped": None, "idle": 0}
+
+    @property
+    def update(self) -> int:
+        """Updates made."""
+        return int(self.progress["update"])
+
+    @property
+    def done(self) -> bool:
+        """Whether to make no more updates."""
+        return self.update >= self._config.updates or self.progress.get("stopped") is not None
+
+    def set_rate(self, epoch: int) -> None:
+        """The rate of an epoch."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = self._config.rate * self._config.decay**epoch
+
+    def step(self) -> None:
+        """One update from the gradients as they are."""
+        if self._config.clip:
+            torch.nn.utils.clip_grad_norm_(self._model.parameters(), self._config.clip)
+        self.optimiser.step()
+        self.optimiser.zero_grad()
+        self.progress["update"] += 1
+
+    @property
+    def due(self) -> bool:
+        """Whether to look at the held-out drives."""
+        return self.update % self._config.validate_every == 0 or self.update == self._config.updates
+
+    def save(self) -> None:
+        """Keep the present state."""
+        save_checkpoint(self._path, self._model, self.optimiser, self.progress)
+
+    def validated(self, loss: float) -> None:
+        """Take a held-out loss: keep the state, and end with the best one when patience is over."""
+        if loss < self.progress.get("best", float("inf")):
+            self.progress |= {"best": loss, "idle": 0}
+        else:
+            self.progress["idle"] = self.progress.get("idle", 0) + 1
+        self.save()
+        if not self._config.patience:
+            return
+        if self.progress["idle"] == 0:
+            shutil.copyfile(self._path, self._best_path)
+        elif self.progress["idle"] >= self._config.patience and self._best_path.exists():
+            update = self.update
+            best = load_checkpoint(self._best_path, self._model, self.optimiser) or {}
+            self.progress = {**best, "stopped": self._episodes, "idle": 0, "given_up_at": update}
+            self.save()
+
+
+def device_of(name: str) -> torch.device:
+    """`cpu`, `cuda`, or `auto`: cuda where there is one."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UsageError("--device cuda: torch sees no CUDA device here; use cpu or auto")
+    if name not in ("cpu", "cuda"):
+        raise UsageError(f"--device must be cpu, cuda or auto, not {name!r}")
+    return torch.device(name)
+
+
+def summary(model: torch.nn.Module) -> str:
+    """Layers and how many parameters of each are learnt."""
+    rows = []
+    for name, module in model.named_modules():
+        learnt = [each for each in module.parameters(recurse=False) if each.requires_grad]
+        if learnt:
+            count, shapes = sum(each.numel() for each in learnt), ", ".join(str(tuple(each.shape)) for each in learnt)
+            rows.append(f"{name:<14} {type(module).__name__:<16} {count:>10,}  {shapes}")
+    total = sum(each.numel() for each in model.parameters() if each.requires_grad)
+    return "\n".join([*rows, f"{'in all':<31} {total:>10,}"])

@@ -1,0 +1,28 @@
+"""How a model is trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from common.errors import UsageError
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One model's training: Adam at `rate`, `updates` of `batch` pictures or episodes."""
+
+    updates: int
+    batch: int
+    rate: float
+    clip: float = 1.0  # norm of the gradients at most; 0: any
+    seed: int = 0
+    decay: float = 1.0  # of the rate, an epoch: as many updates as show every recorded frame or drive once
+    patience: int = 0  # validations without a better held-out loss before training ends; 0: never
+    validate_every: int = 200  # updates
+
+    def __post_init__(self) -> None:
+        for name in ("updates", "batch", "validate_every"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        if not (self.rate > 0 and self.clip >= 0 and 0 < self.decay <= 1 and self.patience >= 0 and self.seed >= 0):
+            raise UsageError("--rate must be positive, --decay in (0, 1], --clip, --patience and --seed not negative")

@@ -1,0 +1,70 @@
+"""What an MDN-RNN is made of; apart from the module, so that what only configures needs no torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from common.errors import UsageError
+
+Reward = Literal["none", "positive", "notebook", "value"]
+
+
+@dataclass(frozen=True)
+class MDNRNNConfig:
+    """Inputs, an LSTM of `hidden` units, `mixtures` Gaussians a latent dimension, heads.
+
+    The reward head: the logit of a positive reward; the `notebook`'s, of a reward that is not positive while the
+    episode goes on; or the reward's value.
+    """
+
+    latent: int = 32
+    actions: int = 3
+    hidden: int = 256
+    mixtures: int = 5
+    reward: Reward = "positive"
+    done: bool = False
+    previous_reward: bool = False  # what the reward head told of the step before is an input
+    dropout: float = 0.0  # of the LSTM's output before the heads
+    window: int = 0  # inputs that attention looks at, the current one among them; 0: none
+    attention_units: int = 64
+
+    def __post_init__(self) -> None:
+        if min(self.latent, self.actions, self.hidden, self.mixtures, self.attention_units) < 1 or self.window < 0:
+            raise UsageError("an MDN-RNN's sizes must be at least 1, its window at least 0")
+        if not 0 <= self.dropout < 1:
+            raise UsageError(f"--dropout must be from 0 to below 1, not {self.dropout}")
+        if self.previous_reward and self.reward == "none":
+            raise UsageError("the previous reward as an input needs a reward head: in the dream nothing else tells it")
+
+    @property
+    def inputs(self) -> int:
+        """Latents, actions and the previous reward."""
+        return self.latent + self.actions + self.previous_reward
+
+    @property
+    def lstm_inputs(self) -> int:
+        """`inputs`, and beside them what attention makes of the window."""
+        return self.inputs + (self.latent + self.actions if self.window else 0)
+
+    @property
+    def rewarded(self) -> bool:
+        """Whether there is a reward head."""
+        return self.reward != "none"
+
+    @property
+    def outputs(self) -> int:
+        """Of the heads: log weights, means, log deviations `(3, latent, mixtures)`, reward, done."""
+        return 3 * self.mixtures * self.latent + self.rewarded + self.done
+
+    @property
+    def state(self) -> int:
+        """Of a step: hidden, cell, previous reward, window of latents and actions (oldest first)."""
+        return 2 * self.hidden + self.previous_reward + self.window * (self.latent + self.actions)
+
+
+REWARDED = MDNRNNConfig()
+PAPER = MDNRNNConfig(reward="none")
+ARTICLE = MDNRNNConfig(previous_reward=True)
+NOTEBOOK = MDNRNNConfig(reward="notebook", previous_reward=True)
+ATTENTIVE = MDNRNNConfig(window=8)
