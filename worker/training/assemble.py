@@ -27,7 +27,7 @@ from common.bundle import (
 )
 from common.errors import DatasetError
 from common.fingerprint import package_version
-from worker.tasks.preprocessing import PREPROCESSING
+from worker.tasks.preprocessing import PREPROCESSING, SIZE
 from worker.training import train_mdnrnn, train_vae
 from worker.training.checkpoint import load_config, load_weights
 from worker.training.dataset import episodes, load, split
@@ -91,7 +91,7 @@ def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn:
     return Manifest(
         name=name,
         task="car-racing",
-        preprocessing=PREPROCESSING,
+        preprocessing=PREPROCESSING if vae.picture == SIZE else f"raw-{vae.picture}",  # which no task gives yet
         picture=(vae.picture, vae.picture, 3),
         latent=vae.latent,
         hidden=rnn.hidden,

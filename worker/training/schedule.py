@@ -29,7 +29,8 @@ class Schedule:
             self.progress = found
         elif other is not None and load_checkpoint(other, model, self.optimiser) is None:
             raise UsageError(f"--continue-from: no checkpoint at {other}")
-        if self.progress.get("stopped") not in (None, episodes):  # there is something new to learn from
+        # Ended early: only something new to learn from, or no patience at all, makes it go on.
+        if self.progress.get("stopped") not in (None, episodes) or not config.patience:
             self.progress |= {"stopped": None, "idle": 0}
 
     @property
