@@ -17,12 +17,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+
 from common.codec import MalformedError, from_plain
 from common.controller import ControllerShape
 from common.errors import BundleError, ControllerError
 from common.fields import OPTIONAL, written
 from common.files import write_aside
 from common.messages import Between, Word
+from common.tensors import read_array, weights_finite
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -70,8 +73,10 @@ class Bundle:
             with zipfile.ZipFile(path) as archive:
                 manifest = _read_manifest(archive, path)
                 for name in {*REQUIRED, *manifest.parts}:
-                    if hashlib.sha256(archive.read(name)).hexdigest() != manifest.parts.get(name):
+                    data = archive.read(name)
+                    if hashlib.sha256(data).hexdigest() != manifest.parts.get(name):
                         raise BundleError(f"{path}: part {name} is damaged; fetch or build the bundle again")
+                    _look(path, manifest, name, data)
         except FileNotFoundError:
             raise BundleError(f"no bundle at {path}") from None
         except (OSError, zipfile.BadZipFile, KeyError, EOFError, NotImplementedError) as error:
@@ -209,6 +214,25 @@ def hash_file(path: Path) -> str:
     """SHA-256 of a file, hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _look(path: Path, manifest: Manifest, name: str, data: bytes) -> None:
+    """Refuse what would only show as nonsense while it is scored."""
+    if name.endswith(".onnx") and not weights_finite(data):
+        raise BundleError(f"{path}: {name} has weights that are NaN or infinite; train the model again")
+    if name != INITIAL:
+        return
+    try:
+        latents = read_array(data)
+    except (ValueError, EOFError) as error:
+        raise BundleError(f"{path}: {name} is no array of latents ({error}); build the bundle again") from error
+    if latents.ndim != 3 or latents.shape[1:] != (2, manifest.latent) or not len(latents):
+        raise BundleError(
+            f"{path}: {name} must be (N, 2, {manifest.latent}) with N at least 1, not {latents.shape}; build the "
+            "bundle again from encoded drives"
+        )
+    if not np.isfinite(latents).all():
+        raise BundleError(f"{path}: {name} holds NaN or infinity; encode the drives again")
 
 
 def _read_manifest(archive: zipfile.ZipFile, path: Path) -> Manifest:

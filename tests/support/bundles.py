@@ -1,5 +1,7 @@
 """World models with random weights: everything but knowledge."""
 
+import io
+
 import numpy as np
 import torch
 
@@ -18,6 +20,12 @@ def random_models(seed=0, vae=PAPER, rnn=REWARDED):
         if "running" in name:  # as if it had been trained
             values.uniform_(0.5, 1.5)
     return models[0].eval(), models[1].eval()
+
+
+def npy(array):
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
 
 
 def weights(model):

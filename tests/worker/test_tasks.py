@@ -6,6 +6,7 @@ from common.bundle import Manifest, write_bundle
 from common.errors import BundleError, ControllerError, UsageError
 from common.messages import TaskSpec
 from tests.support import tasks
+from tests.support.bundles import npy
 from worker.scoring import Scorer
 from worker.tasks.api import find_task, known_tasks
 from worker.tasks.preprocessing import picture
@@ -30,7 +31,8 @@ def test_an_unknown_task_is_an_error_that_says_which_there_are(name, says):
 
 
 def test_a_bundle_of_another_task_is_refused(tmp_path):
-    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "policy.onnx", "initial_latents.npy"), b"x")
+    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "policy.onnx"), b"x")
+    parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = Manifest("moon", "moon", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
     with pytest.raises(BundleError, match="of task 'moon'"):
         find_task("car-racing").make_policy(write_bundle(tmp_path / "moon.zip", manifest, parts))

@@ -27,7 +27,7 @@ from common.bundle import (
 )
 from common.errors import DatasetError
 from common.fingerprint import package_version
-from worker.tasks.preprocessing import PREPROCESSING
+from worker.tasks.preprocessing import PREPROCESSING, SIZE
 from worker.training import train_mdnrnn, train_vae
 from worker.training.checkpoint import load_config, load_weights
 from worker.training.dataset import episodes, load, split
@@ -62,6 +62,11 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundl
         load_config(folder / train_vae.CHECKPOINT, VAEConfig),
         load_config(folder / train_mdnrnn.CHECKPOINT, MDNRNNConfig),
     )
+    for checkpoint, arrays in ((train_vae.CHECKPOINT, vae), (train_mdnrnn.CHECKPOINT, rnn)):
+        if not all(np.isfinite(array).all() for array in arrays.values()):
+            raise DatasetError(f"{folder / checkpoint} holds NaN or infinity; delete it and train again")
+    if configs[0].latent != configs[1].latent:
+        raise DatasetError(f"the VAE has {configs[0].latent} latents, the MDN-RNN {configs[1].latent}: train it again")
     if train_mdnrnn.vae_of(folder) != encoder_of(folder):
         raise DatasetError(f"the MDN-RNN in {folder} was trained on another VAE: train it again before you bundle")
     quality = folder / QUALITY
@@ -86,7 +91,7 @@ def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn:
     return Manifest(
         name=name,
         task="car-racing",
-        preprocessing=PREPROCESSING,
+        preprocessing=PREPROCESSING if vae.picture == SIZE else f"raw-{vae.picture}",  # which no task gives yet
         picture=(vae.picture, vae.picture, 3),
         latent=vae.latent,
         hidden=rnn.hidden,

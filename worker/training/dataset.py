@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,22 @@ def load(path: Path, *names: str) -> Arrays:
             return {name: archive[name] for name in names}
     except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error, RuntimeError) as error:
         raise DatasetError(f"{path} is damaged ({error}); delete it and run the verb that wrote it again") from error
+
+
+def check_whole(paths: Sequence[Path], *names: str) -> None:
+    """`DatasetError` names the first episode that is damaged or lacks an array; reads the archives' directories."""
+    for path in paths:
+        try:
+            with ZipFile(path) as archive:
+                missing = {f"{name}.npy" for name in names} - set(archive.namelist())
+        except (OSError, BadZipFile) as error:
+            raise DatasetError(
+                f"{path} is damaged ({error}); delete it and run the verb that wrote it again"
+            ) from error
+        if missing:
+            raise DatasetError(
+                f"{path} lacks {', '.join(sorted(missing))}; delete it and run the verb that wrote it again"
+            )
 
 
 def load_pictures(path: Path) -> NDArray[np.uint8]:

@@ -13,7 +13,7 @@ from common.bundle import hash_file
 from common.errors import DatasetError
 from common.files import write_aside
 from worker.training.checkpoint import load_checkpoint, load_config
-from worker.training.dataset import episodes, load, load_pictures
+from worker.training.dataset import check_whole, episodes, load, load_pictures
 from worker.training.train_vae import CHECKPOINT, as_tensor
 from worker.worldmodel.vae import VAE
 from worker.worldmodel.vae_config import VAEConfig
@@ -29,6 +29,7 @@ def encode(folder: Path) -> Iterator[int]:
     load_checkpoint(folder / CHECKPOINT, model, None)
     model.eval()
     vae = hash_file(folder / CHECKPOINT)
+    check_whole(episodes(folder), "picture", "preprocessing", "action", "reward", "ended")
     for path in episodes(folder):
         target = folder / ENCODED / path.name
         if target.exists() and _is_of(target, vae):
@@ -47,6 +48,8 @@ def encode(folder: Path) -> Iterator[int]:
 
 def encoder_of(folder: Path) -> str:
     """Hash of the VAE checkpoint that a folder's latents come from; `DatasetError` if it is not the folder's own."""
+    if not (folder / CHECKPOINT).exists():
+        raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
     vae = hash_file(folder / CHECKPOINT)
     for path in episodes(folder, ENCODED):
         if str(load(path, "vae")["vae"]) != vae:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from common.errors import UsageError
+from common.errors import DatasetError, UsageError
 from worker.training.checkpoint import load_checkpoint, save_checkpoint
 from worker.training.train_config import TrainConfig
 
@@ -28,7 +29,8 @@ class Schedule:
             self.progress = found
         elif other is not None and load_checkpoint(other, model, self.optimiser) is None:
             raise UsageError(f"--continue-from: no checkpoint at {other}")
-        if self.progress.get("stopped") not in (None, episodes):  # there is something new to learn from
+        # Ended early: only something new to learn from, or no patience at all, makes it go on.
+        if self.progress.get("stopped") not in (None, episodes) or not config.patience:
             self.progress |= {"stopped": None, "idle": 0}
 
     @property
@@ -46,8 +48,13 @@ class Schedule:
         for group in self.optimiser.param_groups:
             group["lr"] = self._config.rate * self._config.decay**epoch
 
-    def step(self) -> None:
-        """One update from the gradients as they are."""
+    def step(self, loss: float) -> None:
+        """One update from the gradients as they are; `DatasetError` where the loss they are of is no number."""
+        if not math.isfinite(loss):
+            raise DatasetError(
+                f"the loss of update {self.update + 1} is {loss}: the data holds NaN or the rate is too high; what was "
+                f"saved last in {self._path} is kept"
+            )
         if self._config.clip:
             torch.nn.utils.clip_grad_norm_(self._model.parameters(), self._config.clip)
         self.optimiser.step()

@@ -12,7 +12,7 @@ from torch import Tensor
 from common.errors import DatasetError
 from common.progress import append_curve
 from worker.training.checkpoint import load_progress
-from worker.training.dataset import episodes, split
+from worker.training.dataset import episodes, load, split
 from worker.training.drives import Drives, inputs_of, load_drives
 from worker.training.encode import ENCODED, encoder_of
 from worker.training.foresight import foresight
@@ -36,6 +36,9 @@ def train_mdnrnn(
     """
     train, held_out = split(episodes(folder, ENCODED))
     vae = encoder_of(folder)
+    latents = load(train[0], "mu")["mu"].shape[1]
+    if layers.latent != latents:
+        raise DatasetError(f"the encoded drives have {latents} latents, this MDN-RNN {layers.latent}: give --latent")
     torch.manual_seed(config.seed)
     model = MDNRNN(layers).to(device)
     schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from)
@@ -52,7 +55,7 @@ def train_mdnrnn(
         drives = load_drives([train[index] for index in chosen], random.random(len(chosen)) < 0.5)
         model.train()
         values = backward(model, drives, noise, device)
-        schedule.step()
+        schedule.step(sum(values.values()))
         report(update, "  ".join(f"{name} {value:.3f}" for name, value in values.items()))
         if update % 10 == 0:
             append_curve(folder / "mdnrnn.jsonl", update=update, **values)

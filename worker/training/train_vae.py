@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from common.errors import DatasetError
 from common.progress import append_curve
 from worker.tasks.preprocessing import SIZE
-from worker.training.dataset import POOL_EPISODES, episodes, load_pictures, picture_batches, split
+from worker.training.dataset import POOL_EPISODES, check_whole, episodes, load_pictures, picture_batches, split
 from worker.training.schedule import Schedule
 from worker.training.train_config import TrainConfig
 from worker.worldmodel.vae import VAE
@@ -35,6 +35,7 @@ def train_vae(
     A stop changes nothing: batches and chance follow from the seed and the update alone.
     """
     train, held_out = split(episodes(folder))
+    check_whole([*train, *held_out], "picture", "preprocessing")
     if layers.picture != SIZE:
         raise DatasetError(f"recorded pictures are {SIZE} wide, this VAE's {layers.picture}: choose other layers")
     torch.manual_seed(config.seed)
@@ -53,7 +54,7 @@ def train_vae(
         noise = torch.randn(len(batch), layers.latent).to(device)
         loss, error, divergence = model.loss(as_tensor(batch, device), noise)
         loss.backward()  # type: ignore[no-untyped-call]
-        schedule.step()
+        schedule.step(loss.item())
         schedule.progress |= {"pool": pool, "taken": taken}
         report(schedule.update, f"error {error.item():.1f}  KL {divergence.item():.1f}")
         if schedule.update % 20 == 0:

@@ -13,6 +13,7 @@ from common.errors import BundleError
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]
+NAMES = ("weights", "biases")  # of a layer
 
 
 def open_part(bundle: Bundle, name: str) -> onnxruntime.InferenceSession:
@@ -26,6 +27,19 @@ def open_part(bundle: Bundle, name: str) -> onnxruntime.InferenceSession:
         return onnxruntime.InferenceSession(bundle.read(name), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the runtime's errors share no public base
         raise BundleError(f"{bundle.path}: {name} cannot be run ({error})") from error
+
+
+def check_sizes(
+    bundle: Bundle, name: str, session: onnxruntime.InferenceSession, expected: dict[str, list[int]]
+) -> None:
+    """`BundleError` if a graph's inputs or outputs are not as large as the manifest says."""
+    found = {each.name: each.shape[1:] for each in (*session.get_inputs(), *session.get_outputs())}
+    for value, shape in expected.items():
+        if found.get(value) != shape:
+            raise BundleError(
+                f"{bundle.path}: {value} of {name} has sizes {found.get(value)}, its manifest says {shape}; build the "
+                "bundle again"
+            )
 
 
 class Step(NamedTuple):
@@ -46,6 +60,9 @@ class PolicyStep:
         self._whole = self.shape == bundle.default_shape
         if self._whole:
             session = open_part(bundle, POLICY)
+            manifest = bundle.manifest
+            expected = {"picture": [*manifest.picture], "parameters": [self.shape.size], "latent": [manifest.latent]}
+            check_sizes(bundle, POLICY, session, expected)
             sizes = {each.name: each.shape for each in session.get_inputs()}
             self._joined = "state" in sizes  # bundles from before it have `hidden` and `cell`
             self.state_size = sizes["state"][1] if self._joined else 2 * self.hidden_size
@@ -115,9 +132,6 @@ class Controllers:
         return np.asarray(action, dtype=np.float32)
 
 
-NAMES = ("weights", "biases")
-
-
 class Dream(NamedTuple):
     """What one step of the dream gives, a row a dreamer.
 
@@ -136,7 +150,8 @@ class DreamStep:
     """Controller and MDN-RNN, which dreams the next latent."""
 
     def __init__(self, bundle: Bundle) -> None:
-        session = open_part(bundle, DREAM)
+        session, manifest = open_part(bundle, DREAM), bundle.manifest
+        check_sizes(bundle, DREAM, session, {"latent": [manifest.latent], "action": [manifest.actions]})
         sizes = {each.name: each.shape for each in session.get_inputs()}
         self._run = session.run
         self._names = [each.name for each in session.get_outputs()]
@@ -196,7 +211,9 @@ class Encoder:
     """Pictures to latents."""
 
     def __init__(self, bundle: Bundle) -> None:
-        self._run = open_part(bundle, ENCODER).run
+        session, manifest = open_part(bundle, ENCODER), bundle.manifest
+        check_sizes(bundle, ENCODER, session, {"picture": list(manifest.picture), "mu": [manifest.latent]})
+        self._run = session.run
 
     def encode(self, picture: Pictures) -> tuple[Floats, Floats]:
         """`mu` and `logvar` (N, latent) of `picture` (N, side, side, 3)."""

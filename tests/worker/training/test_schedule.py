@@ -71,6 +71,11 @@ def test_training_ends_when_held_out_drives_gain_nothing_and_goes_on_with_new_on
     seen = []
     train_vae.train_vae(tmp_path, impatient, lambda done, _: seen.append(done), replace(LAYERS, batch_norm=False))
     assert seen == [stopped["update"]]
+    once_more = replace(impatient, patience=0, updates=stopped["update"] + 1)
+    kept = (tmp_path / train_vae.CHECKPOINT).read_bytes()
+    train_vae.train_vae(tmp_path, once_more, ignore, replace(LAYERS, batch_norm=False))
+    assert load_progress(tmp_path / train_vae.CHECKPOINT)["update"] == stopped["update"] + 1
+    (tmp_path / train_vae.CHECKPOINT).write_bytes(kept)
     write_drive(tmp_path, 4, steps=8)
     train_vae.train_vae(tmp_path, impatient, lambda done, _: seen.append(done), replace(LAYERS, batch_norm=False))
     assert len(seen) > 2
