@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-SUMMARY = "measure dreamed steps a second, against this core's matrix rate and against torch"
+SUMMARY = "measure dreamed steps a second, against its matrix products alone and against torch"
 EXTRAS = ("worker",)
 
 

@@ -1,0 +1,59 @@
+"""Evolving in the dream, with means that are driven in reality."""
+
+import os
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from common.bundle import DREAM, write_bundle
+from common.runs import open_run
+
+pytestmark = pytest.mark.timeout(300)
+GENERATIONS, POPULATION, EPISODES = 4, 8, 3
+
+
+def begin(processes, bundle, name):
+    return processes.coordinator(
+        "--preset", "dream", "--bundle", bundle.path, "--population", POPULATION, "--episodes", EPISODES,
+        "--horizon", 300, "--generations", GENERATIONS, "--reality-check", 2, "--evaluation-episodes", 2, name=name,
+    )  # fmt: skip
+
+
+def outcome(processes, name):
+    with open_run(processes.runs, name) as run:
+        fitness = [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
+        vectors = [run.candidate(g, i).tobytes() for g in range(GENERATIONS) for i in range(POPULATION)]
+        parameters = np.load(run.controller_path)["parameters"].tobytes()
+        return fitness, vectors, [(each.generation, each.mean) for each in run.evaluations()], parameters
+
+
+def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bundle):
+    coordinator = begin(processes, random_bundle, "alone")
+    worker = processes.worker("--run", "alone")
+    assert coordinator.finish(200)[0] == 0
+    worker.end()
+    coordinator = begin(processes, random_bundle, "three")
+    workers = [processes.worker("--run", "three", "--name", f"w{number}") for number in range(3)]
+    coordinator.wait_for("generation 0: mean")
+    os.kill(workers[1].popen.pid, signal.SIGKILL)
+    assert coordinator.finish(200)[0] == 0
+    alone = outcome(processes, "alone")
+    assert alone == outcome(processes, "three")
+    assert [generation for generation, _ in alone[2]] == [1, 3]
+    code, out, err = processes.call("replay", "alone", "--runs-dir", processes.runs, "--candidate", "2/3")
+    assert code == 0, err
+    assert out.count("same bits") == EPISODES
+    code, out, err = processes.call("evaluate", "--controller", "alone", "--runs-dir", processes.runs, "--episodes", 1)
+    assert code == 0, err
+
+
+def test_a_world_model_without_a_dream_is_refused_by_its_worker(processes, random_bundle, tmp_path):
+    parts = {name: random_bundle.read(name) for name in random_bundle.manifest.parts if name != DREAM}
+    old = write_bundle(tmp_path / "old.zip", replace(random_bundle.manifest, parts={}), parts)
+    begin(processes, old, "old")
+    worker = processes.worker("--run", "old")
+    code, _ = worker.finish(60)
+    assert code == 1
+    assert any("from before dreams" in line for line in worker.lines)
