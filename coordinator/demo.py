@@ -43,6 +43,7 @@ class DemoConfig:
     horizon: int = option(1000, "steps of an episode at most in reality")
     patience: int = option(100, "cut an episode after so many steps without reward in reality")
     sigma0: float = option(0.1, "first step size; half of it after a dream")
+    bundle: str = option("tiny", "the frozen world model: a shipped name or a file")
     seed: int = option(1, "makes the runs")
     tracks: int = option(16, "unseen tracks that the outcome is judged on")
     workers: int = option(0, "worker processes; 0: one a core")
@@ -93,7 +94,10 @@ class Demo:
         self._say(f"{stage.what}: a coordinator and {workers} workers on this machine")
         self._logs = self._runs_dir / stage.run
         with ExitStack() as stack:
-            flags = {"run": stage.run, "runs-dir": self._runs_dir, "listen": self._endpoint, **stage.flags}
+            flags = {
+                "run": stage.run, "runs-dir": self._runs_dir, "listen": self._endpoint, "bundle": self._config.bundle,
+                **stage.flags,
+            }  # fmt: skip
             arguments = [text for name, value in flags.items() for text in (f"--{name}", str(value))]
             coordinator = self._spawn(stack, "coordinator", *arguments)
             client = self._connect(coordinator)

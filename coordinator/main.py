@@ -68,7 +68,7 @@ def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle]:
         bundle = find_bundle(request.config.bundle)
         settings = request.config.settings(bundle)
         if request.start is not None:
-            request.start.check(request.config.task, bundle, settings.controller)
+            request.start.check(bundle, settings.controller)
         return settings, bundle
     with open_run(request.runs_dir, request.name) as stored:
         settings = stored.settings

@@ -18,17 +18,14 @@ from coordinator import cma_state
 
 @dataclass(frozen=True)
 class Start:
-    """The first mean `(size,)`, and what it was evolved for."""
+    """The first mean `(size,)`, and the world model it was evolved on; in the dream or in reality is all one."""
 
     mean: NDArray[np.float64]
-    task: str
     bundle: str  # SHA-256
     source: str
 
-    def check(self, task: str, bundle: Bundle, shape: ControllerShape) -> None:
-        """Refuse parameters that mean nothing to this task, world model and controller."""
-        if self.task != task:
-            raise ControllerError(f"{self.source} drives in {self.task!r}, this run scores in {task!r}")
+    def check(self, bundle: Bundle, shape: ControllerShape) -> None:
+        """Refuse parameters that mean nothing to this world model and controller."""
         if self.bundle != bundle.sha256:
             raise ControllerError(
                 f"{self.source} belongs to the world model {self.bundle[:12]}, not to {bundle.path.name} "
@@ -48,13 +45,13 @@ def find_start(name: str, runs_dir: Path) -> Start:
             if not stored.controller_path.is_file():
                 return start_of(stored)
     controller, _ = find_controller(name, runs_dir)
-    return Start(controller.parameters.astype(np.float64), controller.task, controller.bundle, f"controller {name}")
+    return Start(controller.parameters.astype(np.float64), controller.bundle, f"controller {name}")
 
 
 def start_of(stored: RunFolder) -> Start:
     """The mean of a run's latest generation."""
     mean, _ = latest(stored)
-    return Start(mean, stored.spec.task, stored.spec.bundle, f"run {stored.name}")
+    return Start(mean, stored.spec.bundle, f"run {stored.name}")
 
 
 def latest(stored: RunFolder) -> tuple[NDArray[np.float64], float]:

@@ -45,10 +45,10 @@ def test_jobs_of_other_controllers_have_other_digests(random_bundle):
 
 
 def test_a_start_of_another_length_is_refused(random_bundle):
-    start = Start(np.zeros(867), "car-racing", random_bundle.sha256, "run night")
-    start.check("car-racing", random_bundle, random_bundle.shape_of("zh"))
+    start = Start(np.zeros(867), random_bundle.sha256, "run night")
+    start.check(random_bundle, random_bundle.shape_of("zh"))
     with pytest.raises(ControllerError, match="867 parameters, this run's controllers 99"):
-        start.check("car-racing", random_bundle, random_bundle.shape_of("z"))
+        start.check(random_bundle, random_bundle.shape_of("z"))
 
 
 def test_a_hidden_layer_has_units():
