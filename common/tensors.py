@@ -37,10 +37,10 @@ def weights_finite(model: bytes) -> bool:
 
 def read_array(data: bytes) -> NDArray[np.float32]:
     """A `.npy` of floats; `ValueError` if it is none."""
-    array = np.load(io.BytesIO(data), allow_pickle=False)
-    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
+    array = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    if array.dtype.kind != "f":
         raise ValueError("not an array of floats")
-    return array.astype(np.float32)
+    return np.asarray(array, dtype=np.float32)
 
 
 def _arrays(tensor: memoryview) -> Iterator[NDArray[Any]]:

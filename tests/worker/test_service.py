@@ -4,6 +4,7 @@ import logging
 import queue
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 
 import worker.service
@@ -13,6 +14,7 @@ from common.errors import BundleError, RefusedError, UsageError
 from common.messages import MAX_MESSAGE, MAX_PART, Intervals, ResultBatch
 from common.session import Network
 from tests.support import tasks
+from tests.support.bundles import npy
 from tests.support.hand import DEADLINE, SECOND, Hand, tag
 from tests.support.processes import free_port
 from tests.support.relay import Relay
@@ -28,7 +30,8 @@ SLOW_BEATS = Intervals(beat=2 * DEADLINE, repeat=0.1)
 @pytest.fixture(scope="module")
 def small_bundle(tmp_path_factory):
     """No world model, only as many bytes: the toy tasks do not look inside."""
-    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "initial_latents.npy"), b"x")
+    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx"), b"x")
+    parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = Manifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
     path = tmp_path_factory.mktemp("bundle") / "small.zip"
     return write_bundle(path, manifest, {**parts, "policy.onnx": bytes((PARTS - 1) * MAX_PART)})
