@@ -25,6 +25,7 @@ JOURNAL = "journal.sqlite"
 BUNDLE = "bundle.zip"
 CONTROLLER = "controller.npz"
 ARCHIVE = "archive"
+ROLLOUTS = "rollouts"
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class RunSettings:
     evaluate_every: Count  # generations; 0: never
     evaluation_episodes: Annotated[int, Between(1, 10**4)]
     racing: bool = False  # only the better half of the candidates drives the second half of the episodes
+    collect_every: Count = 0  # generations; 0: never
+    collect_episodes: Annotated[int, Between(1, 10**4)] = 1
 
     def to_json(self) -> str:
         """The text kept in the journal."""
@@ -50,9 +53,12 @@ class RunSettings:
     def from_json(cls, text: str) -> RunSettings:
         """Read what `to_json` wrote; `JournalError` if it is damaged."""
         try:
-            return from_plain(cls, {"racing": False, **json.loads(text)})
+            return from_plain(cls, {**_LATER_SETTINGS, **json.loads(text)})
         except (ValueError, TypeError, MalformedError) as error:
             raise JournalError(f"the journal's settings are damaged: {error}") from error
+
+
+_LATER_SETTINGS = {"racing": False, "collect_every": 0, "collect_episodes": 1}  # that older journals lack
 
 
 @dataclass(frozen=True)
@@ -184,6 +190,11 @@ class RunFolder:
         query = "SELECT generation, episodes, mean, std FROM evaluation WHERE mean IS NOT NULL ORDER BY generation"
         return [StoredEvaluation(*row) for row in self._all(query)]
 
+    def rollouts(self) -> list[Path]:
+        """Every collected drive that was accepted, oldest first."""
+        query = "SELECT generation, episode FROM result WHERE kind = 'collect' ORDER BY generation, episode"
+        return [rollout_path(self.path, *row) for row in self._all(query)]
+
     def strategy_state(self) -> bytes | None:
         """The strategy as it was before its latest generation was asked; `None` before the first."""
         row = self._one("SELECT state FROM strategy ORDER BY generation DESC LIMIT 1")
@@ -205,6 +216,11 @@ class RunFolder:
 
 
 _RESULT = "kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint"
+
+
+def rollout_path(folder: Path, generation: int, episode: int) -> Path:
+    """Where a drive that a run collected lies: an episode as data sets hold it."""
+    return folder / ROLLOUTS / f"{generation:06d}-{episode:04d}.npz"
 
 
 def default_runs_dir() -> Path:

@@ -33,6 +33,7 @@ from common.messages import (
     Intervals,
     JobBatch,
     ResultBatch,
+    UploadPart,
 )
 from common.runs import BUNDLE
 from common.session import LEASE_MS, Network, enqueue_into, open_session
@@ -117,6 +118,7 @@ class Service:
         return [
             subscribe(keys.any_worker("result", name), enqueue_into(events, "result")),
             subscribe(keys.any_worker("beat", name), enqueue_into(events, "beat")),
+            subscribe(keys.any_worker("upload", name), enqueue_into(events, "upload")),
             session.liveliness().declare_subscriber(
                 keys.any_worker("live/worker", name), enqueue_into(events, "token"), history=True
             ),
@@ -176,6 +178,11 @@ class Service:
             beat = self._inbox.decode(Beat, event.payload.to_bytes())
             if beat is not None and self._ours(beat.run_uid) and beat.nonce == self._nonce:
                 self._run.fleet.beat(keys.worker_of(str(event.key_expr)), beat, now)
+
+        elif kind == "upload":
+            part = self._inbox.decode(UploadPart, event.payload.to_bytes())
+            if part is not None and self._ours(part.run_uid):
+                self._run.upload(keys.worker_of(str(event.key_expr)), part, now)
 
     def _ours(self, run_uid: str) -> bool:
         if run_uid != self._run.uid:
@@ -276,7 +283,8 @@ class Service:
 
     def _take_snapshot(self) -> Snapshot:
         now = monotonic()
-        return take_snapshot(self._run, self._name, dict(self._inbox.dropped), now - self._started, now)
+        dropped = self._inbox.dropped + self._run.uploads.dropped
+        return take_snapshot(self._run, self._name, dropped, now - self._started, now)
 
     def _answer_status(self, part: str) -> Callable[[zenoh.Query], None]:
         """An answer in the queryable's own thread: it reads the last snapshot and nothing else."""

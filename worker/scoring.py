@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from common.bundle import Bundle
 from common.messages import Kind, TaskSpec
+from worker.drive import Drive
 from worker.rollout import Course, Score, rollout
 from worker.tasks.api import find_task
 
+DRIVER = "controller"  # as a kept drive names who drove
 FULL_EPISODE = 10**6  # steps: the environment's own limit ends it
 
 
@@ -23,12 +25,21 @@ class Scorer:
         self._spec = spec
         self._environment = task.make_judge() if judge else task.make_environment()
         self._policy = task.make_policy(bundle)
+        self._preprocessing = bundle.manifest.preprocessing
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None
     ) -> Score:
         """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode."""
         return rollout(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
+
+    def collect(
+        self, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None
+    ) -> tuple[Score, Drive]:
+        """An episode as candidates drive it, and what happened in it, failures included."""
+        drive = Drive(DRIVER, self._preprocessing)
+        course = self.course("collect", seed)
+        return rollout(self._environment, self._policy, parameters, course, on_step, drive), drive
 
     @property
     def drawn_by(self) -> str:

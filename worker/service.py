@@ -22,7 +22,7 @@ from common.bundle import Bundle, BundleStore, default_cache
 from common.codec import Inbox, encode, encoding
 from common.errors import ConnectionFailedError, RefusedError
 from common.fingerprint import fingerprint
-from common.messages import MAX_LEASES, TAG_BYTES, Beat, JobBatch, Result, ResultBatch, Running
+from common.messages import MAX_LEASES, TAG_BYTES, Beat, JobBatch, Result, ResultBatch, Running, UploadPart
 from common.session import Network, enqueue_into, open_session
 from worker.admission import Admission, ask, make_request, neediest
 from worker.backlog import Backlog
@@ -31,6 +31,7 @@ from worker.config import WorkerConfig
 from worker.outbox import Outbox
 from worker.slot import Slot, SlotEvent
 from worker.tasks.api import find_task, known_tasks
+from worker.uploads import PACE, Uploads
 
 log = logging.getLogger(__name__)
 RETRY = 1.0  # seconds between attempts to connect or join
@@ -91,6 +92,7 @@ class Worker:
             ]
             self._backlog = Backlog(admission.spec)
             self._outbox = Outbox(admission.intervals.repeat)
+            self._uploads = Uploads(admission.intervals.repeat)
             self._coordinators, self._parted = set(), False
             declared = self._declare(session)
             log.info("joined run %s as %s, %d slots", admission.run, self.identity, self._slot_count)
@@ -172,6 +174,7 @@ class Worker:
             if now >= self._beat_at:
                 self._beat_at = now + self._admission.intervals.beat
                 self._send_beat(session, now, capacity=0 if drain_until else self._capacity())
+            self._send_uploads(session, now)  # after the beat, which says that the job is in these hands
             if self._must_rejoin(now):
                 self._rejoin(session, now)
 
@@ -188,6 +191,7 @@ class Worker:
     def _wait(self) -> None:
         """Handle what has arrived, waiting until the next beat or repetition at most."""
         timeout = min(max(self._beat_at - monotonic(), 0.0), self._admission.intervals.repeat / 4)
+        timeout = min(timeout, PACE) if len(self._uploads) else timeout
         try:
             self._handle(*self._events.get(timeout=timeout))
             while True:
@@ -222,7 +226,9 @@ class Worker:
         self._quiet_since = monotonic()
         for job, why in self._backlog.take_in(batch):
             self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
-        self._outbox.settle(verdict.digest for verdict in batch.verdicts)
+        judged = [verdict.digest for verdict in batch.verdicts]
+        self._outbox.settle(judged)
+        self._uploads.settle(judged)
         for slot in self._slots:
             if slot.job is not None and slot.job.digest in batch.cancels:
                 slot.abandon()
@@ -236,6 +242,8 @@ class Worker:
             self._finished += 1
             self._steps_finished += result.steps
             self._outbox.add(result)
+            if event.upload is not None:
+                self._uploads.add(result.digest, event.upload)
             self._fill_slots()  # before the other slots' events are looked at
 
     def _capacity(self) -> int:
@@ -257,6 +265,15 @@ class Worker:
             run_uid=run.run_uid, incarnation=run.incarnation, fingerprint=fingerprint(), results=results
         )
         session.put(keys.result(run.run, self.identity), encode(batch), encoding=encoding(ResultBatch))
+
+    def _send_uploads(self, session: zenoh.Session, now: float) -> None:
+        run = self._admission
+        for piece in self._uploads.due(now):
+            part = UploadPart(
+                run_uid=run.run_uid, incarnation=run.incarnation, digest=piece.digest, sha256=piece.sha256,
+                offset=piece.offset, total=piece.total, data=piece.data,
+            )  # fmt: skip
+            session.put(keys.upload(run.run, self.identity), encode(part), encoding=encoding(UploadPart))
 
     def _send_beat(self, session: zenoh.Session, now: float, capacity: int) -> None:
         running = [slot for slot in self._slots if slot.job is not None]
@@ -308,6 +325,7 @@ class Worker:
         self._backlog.begin()
         self._backlog.clear()
         self._outbox.resend_all()
+        self._uploads.resend_all()
         self._parted, self._beat_at, self._quiet_since = False, 0.0, monotonic()
         log.info("joined run %s again, incarnation %d", admission.run, admission.incarnation)
 

@@ -6,6 +6,7 @@ Spawned, never forked: a forked Zenoh session hangs. The child knows nothing of 
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import logging
 import os
 import queue
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from common.errors import DreamfleetError
-from common.messages import Job, Result, TaskSpec
+from common.messages import MAX_UPLOAD, Job, Result, TaskSpec
 from common.threads import pin_thread_pools
 
 log = logging.getLogger(__name__)
@@ -44,6 +45,14 @@ class Abandoned:
 
 
 @dataclass(frozen=True)
+class Outcome:
+    """A child's word on a job: its result, and the file that it left, through the pipe and never through a disk."""
+
+    result: Result
+    upload: bytes | None = None
+
+
+@dataclass(frozen=True)
 class SlotEvent:
     """What a slot tells its worker: ready, a result, a job given up, or that the child is gone."""
 
@@ -51,6 +60,7 @@ class SlotEvent:
     life: int
     ready: Ready | None = None
     result: Result | None = None
+    upload: bytes | None = None
     abandoned: bool = False
     gone: str | None = None
 
@@ -199,7 +209,8 @@ class Slot:
             elif isinstance(said, Abandoned):
                 self._events.put(("slot", SlotEvent(self.number, life, abandoned=True)))
             else:
-                self._events.put(("slot", SlotEvent(self.number, life, result=said)))
+                event = SlotEvent(self.number, life, result=said.result, upload=said.upload)
+                self._events.put(("slot", event))
         self._events.put(("slot", SlotEvent(self.number, life, gone=why)))
 
 
@@ -254,7 +265,7 @@ def _signals_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _score(scorer: Any, job: Job, vector: bytes, count: Any) -> Result:
+def _score(scorer: Any, job: Job, vector: bytes, count: Any) -> Outcome:
     started = perf_counter()
     made = 0
 
@@ -263,13 +274,29 @@ def _score(scorer: Any, job: Job, vector: bytes, count: Any) -> Result:
         made = done
         count(done)
 
+    parameters, upload = np.frombuffer(vector, dtype="<f4"), None
     try:
-        score = scorer.score(job.kind, np.frombuffer(vector, dtype="<f4"), job.seeds[0], on_step)
+        if job.kind == "collect":
+            score, drive = scorer.collect(parameters, job.seeds[0], on_step)
+            upload = _packed(drive)
+        else:
+            score = scorer.score(job.kind, parameters, job.seeds[0], on_step)
     except AbandonedError:
         raise
     except Exception as error:  # whatever a task raises is this job's error, not the slot's end
-        return Result(job.digest, None, made, perf_counter() - started, _one_line(error), None)
-    return Result(job.digest, score.fitness, score.steps, perf_counter() - started, None, None)
+        return Outcome(Result(job.digest, None, made, perf_counter() - started, _one_line(error), None))
+    sha256 = None if upload is None else hashlib.sha256(upload).digest()
+    return Outcome(
+        Result(job.digest, score.fitness, score.steps, perf_counter() - started, None, sha256),
+        upload,
+    )
+
+
+def _packed(drive: Any) -> bytes:
+    data: bytes = drive.packed()
+    if len(data) > MAX_UPLOAD:
+        raise ValueError(f"a drive of {len(drive)} steps is larger than {MAX_UPLOAD >> 20} MiB: shorten the horizon")
+    return data
 
 
 def _memory_of(pid: int) -> int:
