@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 RETRY = 1.0  # seconds between attempts to connect or join
 GONE = 5.0  # seconds without a coordinator after which a run counts as over
 SILENT_BEATS = 5  # in which a coordinator that knows this worker would have answered
+UPLOAD_GRACE = 30.0  # seconds more while a drive is on its way: no verdict is due before it is there
 CLOCK_GAP = 2.0  # seconds between turns of the loop that mean a suspended host
 SMOOTHING = 0.3  # weight of the newest interval in the throughput
 
@@ -308,7 +309,8 @@ class Worker:
         if self._parted or self._admission.nonce not in self._coordinators:
             return True
         idle = any(slot.ready for slot in self._slots) and all(slot.job is None for slot in self._slots)
-        silent = now - self._quiet_since > SILENT_BEATS * self._admission.intervals.beat
+        patience = SILENT_BEATS * self._admission.intervals.beat + (UPLOAD_GRACE if len(self._uploads) else 0.0)
+        silent = now - self._quiet_since > patience
         return silent and (idle or len(self._outbox) > 0)
 
     def _rejoin(self, session: zenoh.Session, now: float) -> None:
