@@ -11,7 +11,10 @@ from typing import BinaryIO
 
 @contextmanager
 def write_aside(path: Path) -> Iterator[BinaryIO]:
-    """Open a neighbour of `path` for writing; on success it is synced and takes the name, on failure it vanishes."""
+    """Open a neighbour of `path` for writing; on success it is synced and takes the name, on failure it vanishes.
+
+    The folder is synced too: a name that a power cut takes back would be no file at all.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -20,5 +23,10 @@ def write_aside(path: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         aside.replace(path)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
     finally:
         aside.unlink(missing_ok=True)

@@ -27,6 +27,7 @@ JOURNAL = "journal.sqlite"
 BUNDLE = "bundle.zip"
 CONTROLLER = "controller.npz"
 ARCHIVE = "archive"
+ROLLOUTS = "rollouts"
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,8 @@ class RunSettings:
     # Only the better half of the candidates drives the second half of the episodes.
     racing: bool = field(default=False, metadata=OPTIONAL)
     features: Literal["zh", "z"] = field(default="zh", metadata=OPTIONAL)  # what the controller sees
+    collect_every: Count = field(default=0, metadata=OPTIONAL)  # generations; 0: never
+    collect_episodes: Annotated[int, Between(1, 10**4)] = field(default=1, metadata=OPTIONAL)
 
     def to_json(self) -> str:
         """The text kept in the journal."""
@@ -193,6 +196,11 @@ class RunFolder:
         query = "SELECT generation, episodes, mean, std FROM evaluation WHERE mean IS NOT NULL ORDER BY generation"
         return [StoredEvaluation(*row) for row in self._all(query)]
 
+    def rollouts(self) -> list[Path]:
+        """Every collected drive that was accepted, oldest first."""
+        query = "SELECT generation, episode FROM result WHERE kind = 'collect' ORDER BY generation, episode"
+        return [rollout_path(self.path, *row) for row in self._all(query)]
+
     def strategy_state(self) -> bytes | None:
         """The strategy as it was before its latest generation was asked; `None` before the first."""
         row = self._one("SELECT state FROM strategy ORDER BY generation DESC LIMIT 1")
@@ -214,6 +222,11 @@ class RunFolder:
 
 
 _RESULT = "kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint"
+
+
+def rollout_path(folder: Path, generation: int, episode: int) -> Path:
+    """Where a drive that a run collected lies: an episode as data sets hold it."""
+    return folder / ROLLOUTS / f"{generation:06d}-{episode:04d}.npz"
 
 
 def default_runs_dir() -> Path:

@@ -29,6 +29,11 @@ MIGRATIONS = (
     CREATE INDEX result_of_candidate ON result (kind, generation, candidate, episode);
     CREATE TABLE strategy (generation INTEGER PRIMARY KEY, state BLOB NOT NULL) STRICT;
     """,
+    """
+    CREATE TABLE collection (
+        generation INTEGER PRIMARY KEY, vector BLOB NOT NULL, episodes INTEGER NOT NULL
+    ) STRICT;
+    """,
 )
 """Entry i brings a journal from version i to i + 1; only ever appended to."""
 VERSION = len(MIGRATIONS)

@@ -18,11 +18,19 @@ def training_seed(run_seed: int, generation: int, episode: int) -> int:
 
     A hash rather than a sum, so that runs with neighbouring seeds share no track.
     """
-    text = f"dreamfleet training {run_seed} {generation} {episode}"
-    number = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")
-    return TRAINING_FIRST + number % (TRAINING_LAST - TRAINING_FIRST + 1)
+    return _derived(f"dreamfleet training {run_seed} {generation} {episode}")
+
+
+def collection_seed(run_seed: int, generation: int, episode: int) -> int:
+    """Seed of one drive that is kept for training: a training track, and none that a candidate is scored on."""
+    return _derived(f"dreamfleet collection {run_seed} {generation} {episode}")
 
 
 def validation_seeds(episodes: int) -> tuple[int, ...]:
     """The first `episodes` validation seeds: the same tracks at every evaluation, so that its curve is comparable."""
     return tuple(VALIDATION[:episodes])
+
+
+def _derived(text: str) -> int:
+    number = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")
+    return TRAINING_FIRST + number % (TRAINING_LAST - TRAINING_FIRST + 1)

@@ -86,8 +86,10 @@ def _failure(failure: dict[str, Any]) -> str:
 
 def _progress(status: dict[str, Any]) -> Table:
     generation, evaluating = status["generation"], status["evaluating"]
+    collecting = status.get("collecting", {"episodes": 0})  # which an older coordinator does not tell
     grid = Table.grid(padding=(0, 2, 0, 1))
-    for label, part in ((f"generation {generation['number']}", generation), ("evaluation", evaluating)):
+    parts = {f"generation {generation['number']}": generation, "evaluation": evaluating, "kept drives": collecting}
+    for label, part in parts.items():
         if part["episodes"] and not (part is generation and status["state"] in ("ended", "evaluating")):
             done, wanted = part["episodes_done"], part["episodes"]
             grid.add_row(label, ProgressBar(wanted, done, width=40), f"{done}/{wanted} episodes")

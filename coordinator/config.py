@@ -35,18 +35,13 @@ class RunConfig:
         25, "drive the mean in reality every so many generations; 0: never", alias="--reality-check"
     )
     evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation tracks")
+    collect_every: int = option(0, "keep drives of the mean for training, every so many generations; 0: never")
+    collect_episodes: int = option(8, "drives that are kept each time, on training tracks")
 
     def __post_init__(self) -> None:
-        bounds = {
-            "population": 2,
-            "episodes": 1,
-            "horizon": 1,
-            "patience": 0,
-            "seed": 0,
-            "evaluate_every": 0,
-            "hidden_units": 1,
-        }
-        for name, least in {**bounds, "evaluation_episodes": 1}.items():
+        bounds = {"population": 2, "episodes": 1, "horizon": 1, "patience": 0, "seed": 0, "evaluate_every": 0}
+        bounds |= {"evaluation_episodes": 1, "collect_every": 0, "collect_episodes": 1, "hidden_units": 1}
+        for name, least in bounds.items():
             if getattr(self, name) < least:
                 raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
         if self.racing and self.episodes < 2:
@@ -72,6 +67,8 @@ class RunConfig:
             evaluation_episodes=self.evaluation_episodes,
             racing=self.racing,
             features=self.features,
+            collect_every=self.collect_every,
+            collect_episodes=self.collect_episodes,
         )
 
 

@@ -34,6 +34,11 @@ class Wanted:
     failed: dict[str, str] = field(default_factory=dict)  # worker -> error
     attempts: Counter[str] = field(default_factory=Counter)  # worker -> how often it failed there
 
+    @property
+    def in_slack(self) -> bool:
+        """Whether it only fills what scoring leaves idle."""
+        return self.work.job.kind != "score"
+
 
 @dataclass(frozen=True)
 class Send:
@@ -51,9 +56,9 @@ class Fleet:
         self._beat = beat
         self._wanted: dict[bytes, Wanted] = {}
         self._tags: dict[bytes, bytes] = {}
-        self._queue: list[tuple[bool, int, bytes]] = []  # evaluations last, then in order of offer
+        self._queue: list[tuple[bool, int, bytes]] = []  # what waits for slack last, then in order of offer
         self._orders = 0
-        self._evaluating = 0  # evaluations that somebody holds
+        self._in_slack = 0  # evaluations and collected drives that somebody holds
         self._failing: dict[bytes, Wanted] = {}  # those of the wanted that failed somewhere
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this one and the last
         self._tail = Tail(beat)
@@ -61,7 +66,7 @@ class Fleet:
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
         self.notes: list[str] = []  # what happened to workers, for whoever writes it down and clears it
-        self.hurry = False  # nothing but evaluations is left to wait for
+        self.hurry = False  # nothing but evaluations and collected drives is left to wait for
         self.paused = False
 
     def offer(self, work: Iterable[Work]) -> None:
@@ -130,6 +135,25 @@ class Fleet:
         self.counts["accepted_steps" if verdict == "accepted" else "discarded_steps"] += result.steps
         self.counts[verdict] += 1
         return verdict, work
+
+    def wants(self, digest: bytes) -> Work | None:
+        """The work of a wanted job."""
+        wanted = self._wanted.get(digest)
+        return None if wanted is None else wanted.work
+
+    def holds(self, identity: str, digest: bytes) -> bool:
+        """Whether a worker holds a wanted job."""
+        return digest in self._wanted and identity in self._wanted[digest].holders
+
+    def put_off(self, identity: str, digest: bytes, now: float) -> None:
+        """A result came whose upload is still on its way: no verdict yet, and the lease stays."""
+        member = self.members.get(identity)
+        if member is None:
+            return
+        self._hear(member, now)
+        lease = member.leases.get(digest)
+        if lease is not None and lease.ended is None:
+            lease.ended = now
 
     def tick(self, now: float) -> None:
         """Let time pass: departures, silences, batches to send again."""
@@ -244,13 +268,13 @@ class Fleet:
         self._hold(self._wanted[digest], member.identity)
 
     def _hold(self, wanted: Wanted, identity: str) -> None:
-        self._evaluating += wanted.work.job.kind == "evaluate" and not wanted.holders
+        self._in_slack += wanted.in_slack and not wanted.holders
         wanted.holders.add(identity)
 
     def _unhold(self, wanted: Wanted, identity: str) -> None:
         if identity in wanted.holders:
             wanted.holders.discard(identity)
-            self._evaluating -= wanted.work.job.kind == "evaluate" and not wanted.holders
+            self._in_slack -= wanted.in_slack and not wanted.holders
 
     def _apply(self, move: Move, given: dict[str, list[Work]]) -> None:
         """Give a job to an idle slot too, or instead of to a worker that has not begun it."""
@@ -285,7 +309,7 @@ class Fleet:
 
     def _enqueue(self, digest: bytes) -> None:
         wanted = self._wanted[digest]
-        heapq.heappush(self._queue, (wanted.work.job.kind == "evaluate", wanted.order, digest))
+        heapq.heappush(self._queue, (wanted.in_slack, wanted.order, digest))
 
     def _assign(self) -> dict[str, list[Work]]:
         """One job at a time to the least loaded worker with credit, so that a generation's tail is spread evenly."""
@@ -299,9 +323,9 @@ class Fleet:
             wanted = self._wanted.get(entry[2])
             if wanted is None or wanted.holders:
                 continue  # answered meanwhile, or adopted again from a worker that came back
-            if entry[0] and not self.hurry and self._evaluating >= self._evaluation_slots():
+            if entry[0] and not self.hurry and self._in_slack >= self._slack_slots():
                 passed_over.append(entry)
-                break  # evaluations are last in the queue
+                break  # what waits for slack is last in the queue
             able = [name for name in loads if name not in wanted.failed]
             if not able and all(name in wanted.failed for name, member in self.members.items() if member.present):
                 able = list(loads)  # nobody else is there: a killed child must not hang a run
@@ -318,6 +342,6 @@ class Fleet:
             heapq.heappush(self._queue, entry)
         return given
 
-    def _evaluation_slots(self) -> int:
-        """Evaluations of a mean fill the tail of a generation and never more than a quarter of the slots."""
+    def _slack_slots(self) -> int:
+        """Drives of a mean fill the tail of a generation and never more than a quarter of the slots."""
         return max(1, sum(member.slots for member in self.members.values() if member.present) // 4)

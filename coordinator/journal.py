@@ -21,6 +21,7 @@ from common import schema
 from common.errors import DreamfleetError, JournalError
 from common.messages import Job, Result
 from common.runs import BUNDLE, JOURNAL, RunFolder, RunSettings, StoredEvaluation, StoredGeneration
+from coordinator.collection import Collection
 from coordinator.evaluation import Evaluation
 
 
@@ -147,6 +148,18 @@ class Journal:
     def finish_evaluation(self, generation: int, mean: float, std: float) -> None:
         """Write what an evaluation gave."""
         self._execute("UPDATE evaluation SET mean = ?, std = ? WHERE generation = ?", mean, std, generation)
+
+    def schedule_collection(self, collection: Collection) -> None:
+        """Write that drives of a generation's mean are to be kept."""
+        self._execute(
+            "INSERT INTO collection (generation, vector, episodes) VALUES (?, ?, ?)",
+            collection.generation, collection.vector, collection.episodes,
+        )  # fmt: skip
+
+    def collections(self) -> list[Collection]:
+        """Everything that was scheduled to be kept, oldest first."""
+        query = "SELECT generation, vector, episodes FROM collection ORDER BY generation"
+        return [Collection(*row) for row in self._execute(query)]
 
     def last_generation(self) -> OpenGeneration | None:
         """The generation that was open when the last incarnation ended; `None` in a new run."""

@@ -15,6 +15,7 @@ class Lease:
     batch: int
     absent: int = 0  # beats in a row that have seen the batch and do not show the job
     steps: int | None = None  # environment steps that it has made, once a beat has shown it running
+    ended: float | None = None  # when its result first came, of which the upload is still on its way
 
 
 @dataclass

@@ -5,15 +5,17 @@ Everything that happens is written before it counts: `advance` commits, and only
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from common.controller import Controller
 from common.errors import JournalError
-from common.messages import HelloRequest, Result, ResultBatch
-from common.runs import CONTROLLER, RunSettings, StoredEvaluation, StoredGeneration
+from common.files import write_aside
+from common.messages import HelloRequest, Job, Result, ResultBatch, UploadPart
+from common.runs import CONTROLLER, RunSettings, StoredEvaluation, StoredGeneration, rollout_path
 from common.seeds import training_seed
+from coordinator.collection import Collection
 from coordinator.config import LimitsConfig
 from coordinator.evaluation import Evaluation, parted
 from coordinator.evolution import Evolution, EvolutionConfig
@@ -22,6 +24,7 @@ from coordinator.generation import Generation
 from coordinator.jobs import travelling
 from coordinator.journal import Journal
 from coordinator.start import Start
+from coordinator.uploads import Uploads
 
 
 @dataclass
@@ -55,6 +58,9 @@ class Run:
         self._untold: list[StoredGeneration] = []
         self._journal = journal
         self._evaluating: dict[int, OpenEvaluation] = {}
+        self.uploads = Uploads()
+        self._collecting: set[bytes] = set()  # digests of the drives that are still to come
+        self._collections = 0  # drives that were ever scheduled
         self.uid = journal.fact("uid") or ""
         self.fingerprint = journal.fact("fingerprint")
         self.incarnation = journal.begin_incarnation()
@@ -98,14 +104,29 @@ class Run:
 
     def results(self, worker: str, batch: ResultBatch, now: float) -> None:
         """Judge a worker's results; the first wanted ones are written and counted."""
-        for result in batch.results:
+        for each in batch.results:
+            result = self._with_upload(worker, each)
+            if result is None:
+                self.fleet.put_off(worker, each.digest, now)
+                continue
             _, work = self.fleet.result(worker, result, now)
             if work is not None:
                 self._journal.add_result(work.job, result, worker, batch.fingerprint, self.incarnation)
                 if work.job.kind == "score":
                     self._score(result)
-                else:
+                elif work.job.kind == "evaluate":
                     self._evaluated(work.job.generation, result)
+                else:
+                    self._collecting.discard(result.digest)
+            self.uploads.forget(result.digest)
+
+    def upload(self, worker: str, part: UploadPart, now: float) -> None:
+        """Take in part of a drive, from a worker that was given the job and while it is wanted."""
+        work = self.fleet.wants(part.digest)
+        if work is None or work.job.kind != "collect" or not self.fleet.holds(worker, part.digest):
+            self.uploads.dropped["unwanted upload"] += 1
+            return
+        self.uploads.add(worker, part, now)
 
     def advance(self, now: float) -> None:
         """Close what is complete, open what follows, and make all of it durable."""
@@ -116,7 +137,8 @@ class Run:
             work, errors = poison
             reasons = "; ".join(f"{worker}: {error}" for worker, error in errors.items())
             self.pause(f"candidate {work.job.generation}/{work.job.candidate} failed on two workers ({reasons})")
-        if self.fleet.hurry and not self._evaluating and self.ended is None:
+        self.uploads.tick(now)
+        if self.fleet.hurry and not self._in_slack and self.ended is None:
             self._end(self._stop_reason() or "stopped")
         self._journal.commit()
 
@@ -141,6 +163,11 @@ class Run:
         """Episodes of open evaluations: done, wanted."""
         open_ones = self._evaluating.values()
         return sum(len(each.scores) for each in open_ones), sum(len(each.digests) for each in open_ones)
+
+    @property
+    def collection_progress(self) -> tuple[int, int]:
+        """Drives of the mean, of the whole run: kept, wanted."""
+        return self._collections - len(self._collecting), self._collections
 
     @property
     def best(self) -> StoredEvaluation | None:
@@ -183,9 +210,11 @@ class Run:
             generation.record(digest, fitness, steps)
         for evaluation in self._journal.pending_evaluations():
             self._reopen(evaluation)
+        for collection in self._journal.collections():
+            self._collect(collection)
         if (reason := self._stop_reason()) is not None and not generation.done:
-            self.fleet.hurry = bool(self._evaluating)
-            self.ended = None if self._evaluating else reason
+            self.fleet.hurry = self._in_slack
+            self.ended = None if self._in_slack else reason
         else:
             self._journal.drop_fact("ended")
             self.fleet.offer(generation.missing)
@@ -219,9 +248,13 @@ class Run:
         self.history.append(closed)
         self._untold.append(closed)
         reason = self._stop_reason()
-        every = self.settings.evaluate_every
-        if every and (closed.number % every == every - 1 or reason):
+        if _is_due(self.settings.evaluate_every, closed.number, last=bool(reason)):
             self._evaluate(closed.number)
+        if _is_due(self.settings.collect_every, closed.number, last=bool(reason)):
+            mean = travelling(self._evolution.mean)
+            collection = Collection(closed.number, mean, self.settings.collect_episodes)
+            self._journal.schedule_collection(collection)
+            self._collect(collection)
         # Opened also when the run ends here: a later life with wider limits then goes on from it.
         self.generation = self._open(closed.number + 1, now)
         if reason:
@@ -240,6 +273,39 @@ class Run:
         self._evaluating[evaluation.generation] = OpenEvaluation(evaluation, [each.job.digest for each in work], scores)
         self.fleet.offer([each for each in work if each.job.digest not in scores])
         self._finish_evaluation(evaluation.generation)
+
+    def _collect(self, collection: Collection) -> None:
+        known = self._journal.results_of("collect", collection.generation)
+        work = collection.work(self.settings.task, self.settings.seed)
+        missing = [each for each in work if each.job.digest not in known]
+        self._collections += len(work)
+        self._collecting.update(each.job.digest for each in missing)
+        self.fleet.offer(missing)
+
+    def _with_upload(self, worker: str, result: Result) -> Result | None:
+        """The result as it may be judged, its drive on disk if it has one; `None` while the drive is on its way."""
+        work = self.fleet.wants(result.digest)
+        if work is None or work.job.kind != "collect" or result.fitness is None:
+            return result
+        if result.upload is None:
+            return replace(result, fitness=None, error="the drive was not kept: update dreamfleet on this host")
+        data = self.uploads.take(worker, result.digest, result.upload)
+        if data is None:
+            return None
+        self._keep(work.job, data)
+        return result
+
+    def _keep(self, job: Job, data: bytes) -> None:
+        path = rollout_path(self._journal.path.parent, job.generation, job.episode)
+        try:
+            with write_aside(path) as file:
+                file.write(data)
+        except OSError as error:
+            raise JournalError(f"cannot write {path}: {error.strerror}; make room and continue the run") from error
+
+    @property
+    def _in_slack(self) -> bool:
+        return bool(self._evaluating or self._collecting)
 
     def _score(self, result: Result) -> None:
         assert result.fitness is not None
@@ -280,3 +346,7 @@ class Run:
         self.ended = reason
         self._journal.set_fact("ended", reason)
         self.controller().save(self._journal.path.parent / CONTROLLER)
+
+
+def _is_due(every: int, generation: int, *, last: bool) -> bool:
+    return every > 0 and (generation % every == every - 1 or last)

@@ -9,6 +9,8 @@ import json
 import logging
 import queue
 import secrets
+import threading
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -34,6 +36,7 @@ from common.messages import (
     Intervals,
     JobBatch,
     ResultBatch,
+    UploadPart,
 )
 from common.runs import BUNDLE
 from common.session import LEASE_MS, Network, enqueue_into, open_session
@@ -44,6 +47,7 @@ from coordinator.status import PARTS, Snapshot, take_snapshot
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a loss waits to be acted upon
 DRAIN = 256  # events that share one commit at most
+MOST_WAITING = 4096  # messages in the queue: at most 196 MB
 LINGER = 0.005  # seconds that a commit waits for more to share it
 SNAPSHOT_INTERVAL = 0.2
 
@@ -60,6 +64,8 @@ class Service:
         self._nonce = secrets.token_hex(8)
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._inbox = Inbox()
+        self._overflow: Counter[str] = Counter()  # counted in Zenoh's threads, under the lock
+        self._lock = threading.Lock()
         self._stopping = self._draining = False
 
     def stop(self) -> None:
@@ -116,8 +122,7 @@ class Service:
         name, events = self._name, self._events
         subscribe, answer = session.declare_subscriber, session.declare_queryable
         return [
-            subscribe(keys.any_worker("result", name), enqueue_into(events, "result")),
-            subscribe(keys.any_worker("beat", name), enqueue_into(events, "beat")),
+            *(subscribe(keys.any_worker(kind, name), self._enqueue(kind)) for kind in ("result", "beat", "upload")),
             session.liveliness().declare_subscriber(
                 keys.any_worker("live/worker", name), enqueue_into(events, "token"), history=True
             ),
@@ -126,6 +131,18 @@ class Service:
             *(answer(keys.status(name, part), _callback(self._answer_status(part))) for part in PARTS),
             answer(keys.bundle(name, self._run.settings.task.bundle), _callback(self._answer_bundle)),
         ]
+
+    def _enqueue(self, kind: str) -> Any:
+        """What is repeated anyway is dropped and counted while too much waits: a flood must not fill the memory."""
+
+        def enqueue(sample: zenoh.Sample) -> None:
+            if self._events.qsize() < MOST_WAITING:
+                self._events.put((kind, sample))
+            else:
+                with self._lock:
+                    self._overflow["too many at once"] += 1
+
+        return zenoh.handlers.Callback(enqueue, indirect=False)
 
     def _loop(self, session: zenoh.Session) -> None:
         taken = monotonic()
@@ -177,6 +194,11 @@ class Service:
             beat = self._inbox.decode(Beat, event.payload.to_bytes())
             if beat is not None and self._ours(beat.run_uid) and beat.nonce == self._nonce:
                 self._run.fleet.beat(keys.worker_of(str(event.key_expr)), beat, now)
+
+        elif kind == "upload":
+            part = self._inbox.decode(UploadPart, event.payload.to_bytes())
+            if part is not None and self._ours(part.run_uid):
+                self._run.upload(keys.worker_of(str(event.key_expr)), part, now)
 
     def _ours(self, run_uid: str) -> bool:
         if run_uid != self._run.uid:
@@ -277,7 +299,9 @@ class Service:
 
     def _take_snapshot(self) -> Snapshot:
         now = monotonic()
-        return take_snapshot(self._run, self._name, dict(self._inbox.dropped), now - self._started, now)
+        with self._lock:
+            dropped = self._inbox.dropped + self._run.uploads.dropped + self._overflow
+        return take_snapshot(self._run, self._name, dropped, now - self._started, now)
 
     def _answer_status(self, part: str) -> Callable[[zenoh.Query], None]:
         """An answer in the queryable's own thread: it reads the last snapshot and nothing else."""

@@ -59,6 +59,7 @@ def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float
     evaluation = asdict(run.evaluations[-1]) if run.evaluations else None
     best = asdict(run.best) if run.best else None
     done, wanted = run.evaluation_progress
+    kept, to_keep = run.collection_progress
     status = {
         "run": name,
         "run_uid": run.uid,
@@ -73,6 +74,7 @@ def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float
         "last": last,
         "evaluation": evaluation,
         "evaluating": {"episodes_done": done, "episodes": wanted},
+        "collecting": {"episodes_done": kept, "episodes": to_keep},
         "best": best,
         "workers": {"present": sum(member.present for member in members), "known": len(members)},
         "slots": sum(member.slots for member in members if member.present),

@@ -15,6 +15,7 @@ from coordinator.member import Lease, Member
 
 SMOOTHING = 0.1  # weight of the newest episode in the typical one
 QUIET_BEATS = 2  # without a word: a straggler that nothing is known of
+UPLOAD_SECONDS = 30.0  # after a result, in which its upload should have come
 MARGIN = 1.5  # how many times sooner a copy must be expected to finish
 
 
@@ -90,6 +91,7 @@ class Tail:
                 if (
                     alone
                     and lease.steps is None
+                    and lease.ended is None
                     and digest not in moved
                     and taker.identity not in wanted[digest].failed
                 ):
@@ -116,6 +118,8 @@ class Tail:
         quiet = now - holder.heard
         if quiet > QUIET_BEATS * self._beat:
             return True
+        if lease.ended is not None:
+            return now - lease.ended > UPLOAD_SECONDS
         if lease.steps is None or not (holder.pace and taker.pace and self._typical):
             return False
         left = max(self._typical - lease.steps - holder.pace * quiet, self._typical / 10)

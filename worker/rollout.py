@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.drive import Drive
 from worker.tasks.api import Policy, Rewarded, Score
 
 IDLE_COST = 0.1  # CarRacing's own cost of a step
@@ -31,8 +32,9 @@ def rollout(
     parameters: NDArray[np.float32],
     course: Course,
     on_step: Callable[[int], None] = lambda _steps: None,
+    drive: Drive | None = None,
 ) -> Score:
-    """Drive one episode; the sum of its rewards, in step order, in double precision.
+    """Drive one episode; the sum of its rewards, in step order, in double precision. `drive` keeps what happens.
 
     An episode cut after `patience` steps without a positive reward is charged what standing still would have cost up
     to the horizon, so that cut and uncut candidates compare.
@@ -44,17 +46,22 @@ def rollout(
     rewarded = policy if isinstance(policy, Rewarded) else None
     fitness, idle, steps, ended = 0.0, 0, 0, False
     while steps < course.horizon and not ended:
-        observation, reward, terminated, truncated, _ = environment.step(policy.act(observation))
+        action, seen = policy.act(observation), observation
+        observation, reward, terminated, truncated, _ = environment.step(action)
+        if drive is not None:
+            drive.add(seen, action, float(reward))
         fitness += float(reward)
         if rewarded is not None:
             rewarded.reward(float(reward))
         steps += 1
         on_step(steps)
-        ended = terminated or truncated
+        ended = bool(terminated or truncated)
         idle = 0 if float(reward) > 0 else idle + 1
         if course.patience and idle >= course.patience and not ended:
             fitness -= IDLE_COST * (course.horizon - steps)
             break
+    if drive is not None:
+        drive.ended = ended
     if not math.isfinite(fitness):
         raise ValueError("the episode's rewards do not add up to a number")
     return Score(fitness, steps)

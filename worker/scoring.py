@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from common.bundle import Bundle
 from common.messages import Kind, TaskSpec
+from worker.drive import Drive
 from worker.rollout import Course, rollout
 from worker.tasks.api import Batched, Score, find_task
 
+DRIVER = "controller"  # as a kept drive names who drove
 FULL_EPISODE = 10**6  # steps: the environment's own limit ends it
 
 
@@ -25,6 +27,7 @@ class Scorer:
         self._batch = task.make_batch(fitting, spec) if isinstance(task, Batched) and not judge else None
         self._environment = task.make_judge() if judge else task.make_environment()
         self._policy = task.make_policy(fitting)
+        self._preprocessing = bundle.manifest.preprocessing
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None
@@ -45,6 +48,14 @@ class Scorer:
             before = sum(each.steps for each in scores)
             scores.append(self.score(*job, lambda done, before=before: on_step(before + done)))  # type: ignore[misc]
         return scores
+
+    def collect(
+        self, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None
+    ) -> tuple[Score, Drive]:
+        """An episode as candidates drive it, and what happened in it, failures included."""
+        drive = Drive(DRIVER, self._preprocessing)
+        course = self.course("collect", seed)
+        return rollout(self._environment, self._policy, parameters, course, on_step, drive), drive
 
     @property
     def drawn_by(self) -> str:

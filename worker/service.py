@@ -22,7 +22,7 @@ from common.bundle import Bundle, BundleStore, default_cache
 from common.codec import Inbox, encode, encoding
 from common.errors import ConnectionFailedError, RefusedError
 from common.fingerprint import fingerprint
-from common.messages import MAX_LEASES, TAG_BYTES, Beat, JobBatch, Result, ResultBatch, Running
+from common.messages import MAX_LEASES, TAG_BYTES, Beat, JobBatch, Result, ResultBatch, Running, UploadPart
 from common.session import Network, enqueue_into, open_session
 from worker.admission import Admission, ask, make_request, neediest
 from worker.backlog import Backlog
@@ -31,11 +31,13 @@ from worker.config import WorkerConfig
 from worker.outbox import Outbox
 from worker.slot import Slot, SlotEvent
 from worker.tasks.api import find_task, known_tasks
+from worker.uploads import PACE, Uploads
 
 log = logging.getLogger(__name__)
 RETRY = 1.0  # seconds between attempts to connect or join
 GONE = 5.0  # seconds without a coordinator after which a run counts as over
 SILENT_BEATS = 5  # in which a coordinator that knows this worker would have answered
+UPLOAD_GRACE = 30.0  # seconds more while a drive is on its way: no verdict is due before it is there
 CLOCK_GAP = 2.0  # seconds between turns of the loop that mean a suspended host
 SMOOTHING = 0.3  # weight of the newest interval in the throughput
 
@@ -92,6 +94,7 @@ class Worker:
             self._width = find_task(admission.spec.task).width
             self._backlog = Backlog(admission.spec)
             self._outbox = Outbox(admission.intervals.repeat)
+            self._uploads = Uploads(admission.intervals.repeat)
             self._coordinators, self._parted = set(), False
             declared = self._declare(session)
             log.info("joined run %s as %s, %d slots", admission.run, self.identity, self._slot_count)
@@ -173,6 +176,7 @@ class Worker:
             if now >= self._beat_at:
                 self._beat_at = now + self._admission.intervals.beat
                 self._send_beat(session, now, capacity=0 if drain_until else self._capacity())
+            self._send_uploads(session, now)  # after the beat, which says that the job is in these hands
             if self._must_rejoin(now):
                 self._rejoin(session, now)
 
@@ -196,6 +200,7 @@ class Worker:
     def _wait(self) -> None:
         """Handle what has arrived, waiting until the next beat or repetition at most."""
         timeout = min(max(self._beat_at - monotonic(), 0.0), self._admission.intervals.repeat / 4)
+        timeout = min(timeout, PACE) if len(self._uploads) else timeout
         try:
             self._handle(*self._events.get(timeout=timeout))
             while True:
@@ -230,7 +235,9 @@ class Worker:
         self._quiet_since = monotonic()
         for job, why in self._backlog.take_in(batch):
             self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
-        self._outbox.settle(verdict.digest for verdict in batch.verdicts)
+        judged = [verdict.digest for verdict in batch.verdicts]
+        self._outbox.settle(judged)
+        self._uploads.settle(judged)
         for slot in self._slots:
             for digest in batch.cancels:
                 slot.abandon(digest)
@@ -245,6 +252,8 @@ class Worker:
             self._steps_finished += result.steps
             self._outbox.add(result)
         if results:
+            if event.done is not None and event.done.upload is not None:
+                self._uploads.add(results[0].digest, event.done.upload)
             self._fill_slots()  # before the other slots' events are looked at
 
     def _capacity(self) -> int:
@@ -266,6 +275,15 @@ class Worker:
             run_uid=run.run_uid, incarnation=run.incarnation, fingerprint=fingerprint(), results=results
         )
         session.put(keys.result(run.run, self.identity), encode(batch), encoding=encoding(ResultBatch))
+
+    def _send_uploads(self, session: zenoh.Session, now: float) -> None:
+        run = self._admission
+        for piece in self._uploads.due(now):
+            part = UploadPart(
+                run_uid=run.run_uid, incarnation=run.incarnation, digest=piece.digest, sha256=piece.sha256,
+                offset=piece.offset, total=piece.total, data=piece.data,
+            )  # fmt: skip
+            session.put(keys.upload(run.run, self.identity), encode(part), encoding=encoding(UploadPart))
 
     def _send_beat(self, session: zenoh.Session, now: float, capacity: int) -> None:
         running = [
@@ -305,7 +323,8 @@ class Worker:
         if self._parted or self._admission.nonce not in self._coordinators:
             return True
         idle = any(slot.ready for slot in self._slots) and not any(slot.running for slot in self._slots)
-        silent = now - self._quiet_since > SILENT_BEATS * self._admission.intervals.beat
+        patience = SILENT_BEATS * self._admission.intervals.beat + (UPLOAD_GRACE if len(self._uploads) else 0.0)
+        silent = now - self._quiet_since > patience
         return silent and (idle or len(self._outbox) > 0)
 
     def _rejoin(self, session: zenoh.Session, now: float) -> None:
@@ -322,6 +341,7 @@ class Worker:
         self._backlog.begin()
         self._backlog.clear()
         self._outbox.resend_all()
+        self._uploads.resend_all()
         self._parted, self._beat_at, self._quiet_since = False, 0.0, monotonic()
         log.info("joined run %s again, incarnation %d", admission.run, admission.incarnation)
 

@@ -6,6 +6,7 @@ Spawned, never forked: a forked Zenoh session hangs. The child knows nothing of 
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import logging
 import os
 import queue
@@ -24,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from common.errors import DreamfleetError
-from common.messages import Job, Result, TaskSpec
+from common.messages import MAX_UPLOAD, Job, Result, TaskSpec
 from common.threads import pin_thread_pools
 
 log = logging.getLogger(__name__)
@@ -46,10 +47,14 @@ class Ready:
 
 @dataclass(frozen=True)
 class Done:
-    """A child's word that a turn is over: a result of each of its jobs, or none where it was told to give up."""
+    """A child's word that a turn is over: a result of each of its jobs, or none where it was told to give up.
+
+    A file that a job left comes through the pipe, never through a disk.
+    """
 
     turn: int
     results: tuple[Result, ...]
+    upload: bytes | None = None
 
 
 @dataclass(frozen=True)
@@ -300,10 +305,10 @@ def serve_jobs(
 
         try:
             count(0)
-            results = _score(scorer, work, count)
+            done = _do(scorer, turn, work, count)
         except AbandonedError:
-            results = ()
-        pipe.send(Done(turn, results))
+            done = Done(turn, ())
+        pipe.send(done)
 
 
 @contextmanager
@@ -317,33 +322,42 @@ def _signals_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _score(scorer: Any, work: Sequence[Work], count: Callable[[int], None]) -> tuple[Result, ...]:
+def _do(scorer: Any, turn: int, work: Sequence[Work], count: Callable[[int], None]) -> Done:
     """A result of each job; whatever a task raises is the jobs' error, not the slot's end."""
-    started = perf_counter()
-    made = 0
+    started, made, upload = perf_counter(), 0, None
 
     def on_step(done: int) -> None:
         nonlocal made
         made = done
         count(done)
 
-    jobs = [job for job, _ in work]
+    episodes = [(job.kind, np.frombuffer(vector, dtype="<f4"), job.seeds[0]) for job, vector in work]
     try:
-        scores = scorer.score_all(
-            [(job.kind, np.frombuffer(vector, dtype="<f4"), job.seeds[0]) for job, vector in work], on_step
-        )
+        if episodes[0][0] == "collect":
+            _, vector, seed = episodes[0]
+            score, drive = scorer.collect(vector, seed, on_step)
+            scores, upload = [score], _packed(drive)
+        else:
+            scores = scorer.score_all(episodes, on_step)
     except AbandonedError:
         raise
     except Exception as error:
-        spent = perf_counter() - started
-        return tuple(
-            Result(job.digest, None, made // len(jobs), spent / len(jobs), _one_line(error), None) for job in jobs
-        )
-    spent = (perf_counter() - started) / len(jobs)
-    return tuple(
-        Result(job.digest, score.fitness, score.steps, spent, None, None)
-        for job, score in zip(jobs, scores, strict=True)
-    )
+        each = made // len(work), (perf_counter() - started) / len(work), _one_line(error)
+        return Done(turn, tuple(Result(job.digest, None, *each, None) for job, _ in work))
+    spent = (perf_counter() - started) / len(work)
+    sha256 = None if upload is None else hashlib.sha256(upload).digest()
+    results = [
+        Result(job.digest, score.fitness, score.steps, spent, None, sha256)
+        for (job, _), score in zip(work, scores, strict=True)
+    ]
+    return Done(turn, tuple(results), upload)
+
+
+def _packed(drive: Any) -> bytes:
+    data: bytes = drive.packed()
+    if len(data) > MAX_UPLOAD:
+        raise ValueError(f"a drive of {len(drive)} steps is larger than {MAX_UPLOAD >> 20} MiB: shorten the horizon")
+    return data
 
 
 def _memory_of(pid: int) -> int:

@@ -9,6 +9,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from common.messages import TAG_BYTES, Beat, Result, Running
 from coordinator.fleet import DEPARTURE_GRACE, SILENT_BEATS, Fleet
 from coordinator.jobs import make_work, travelling
+from coordinator.tail import UPLOAD_SECONDS
 from tests.support.samples import HEAD, SPEC
 
 A, B = "a/00000001", "b/00000002"
@@ -193,6 +194,44 @@ def test_evaluations_wait_for_slack_and_take_a_quarter_of_the_slots():
     assert len(digests(fleet.dispatch(0.1), A)) == 4
 
 
+def test_evaluations_and_collected_drives_share_the_quarter():
+    fleet = fleet_of(A, capacity=8, jobs=0)
+    fleet.offer(work(1, "evaluate") + work(5, "collect"))
+    kinds = [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work]
+    assert kinds == ["evaluate", "collect"]
+
+
+def uploading():
+    """A's only job is done, and its drive is on its way; B is idle."""
+    fleet = fleet_of(A, jobs=0)
+    fleet.offer(work(2, "collect"))
+    fleet.hurry = True
+    first, second = digests(fleet.dispatch(0.0), A)
+    fleet.welcome(B, 1, "f", 0.0)
+    fleet.put_off(A, first, 1.0)
+    fleet.put_off(A, second, 1.0)
+    fleet.beat(A, beat(seen=1, unacked=[first, second]), 1.0)
+    fleet.beat(B, beat(), 1.0)
+    return fleet, first, second
+
+
+def test_a_job_whose_upload_is_on_its_way_is_not_taken_away():
+    fleet, first, second = uploading()
+    assert fleet.dispatch(1.0) == []
+    assert fleet.holds(A, first)
+    assert fleet.result(A, result(first), 2.0)[0] == "accepted"
+    assert fleet.result(A, result(second), 2.0)[0] == "accepted"
+
+
+def test_an_upload_that_never_comes_is_a_straggler():
+    fleet, *_ = uploading()
+    late = 1.1 + UPLOAD_SECONDS
+    fleet.beat(A, beat(seen=1, unacked=fleet.members[A].leases), late)
+    fleet.beat(B, beat(), late)
+    assert len(digests(fleet.dispatch(late), B)) == 1
+    assert fleet.counts["copied"] == 1
+
+
 def test_a_paused_fleet_gives_nothing_and_still_judges():
     fleet = fleet_of(A)
     given = digests(fleet.dispatch(0.0), A)
@@ -344,7 +383,7 @@ class AnyOrder(RuleBasedStateMachine):
     @invariant()
     def held_evaluations_are_counted(self):
         held = [each for each in self.fleet._wanted.values() if each.holders and each.work.job.kind == "evaluate"]
-        assert self.fleet._evaluating == len(held)
+        assert self.fleet._in_slack == len(held)
 
     @invariant()
     def credit_is_accounted(self):

@@ -23,16 +23,16 @@ def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, 
         "--generations", 5,
     )  # fmt: skip
     with open_session(Network(connect=(processes.endpoint,))) as session:
-        for kind in ("result", "beat"):
+        for kind in ("result", "beat", "upload"):
             key = getattr(keys, kind)("test", "stranger/0badc0de")
             for payload in (b"", b"\xc1\xff", bytes(MAX_MESSAGE + 1), encode(MSGPACK[kind]), encode(MSGPACK["view"])):
                 session.put(key, payload)
         replies = list(session.get(keys.hello("test"), payload=b"let me in", timeout=5))
         assert b'"accepted": false' in replies[0].ok.payload.to_bytes()
         assert not list(session.get(keys.bundle("test", "ab" * 32), timeout=1))
-    while sum((dropped := processes.status()["dropped"]).values()) < 11:
+    while sum((dropped := processes.status()["dropped"]).values()) < 16:
         pass
-    assert dropped == {"not msgpack": 4, "oversize": 2, "foreign run": 2, "wrong fields": 2, "not JSON": 1}
+    assert dropped == {"not msgpack": 6, "oversize": 3, "foreign run": 3, "wrong fields": 3, "not JSON": 1}
     processes.worker("--task", tasks.SLOW_TOY)
     assert coordinator.finish()[0] == 0
 
@@ -60,10 +60,10 @@ def flood(processes, random_bundle, count):
     processes.worker("--task", tasks.SLOW_TOY)
     coordinator.wait_for("generation 1: mean")
     before = resident(coordinator)
-    kinds = ("result", "beat")
+    kinds = ("result", "beat", "upload")
     with open_session(Network(connect=(processes.endpoint,))) as session:
         for number, payload in enumerate(mutations(count, seed=5)):
-            key = getattr(keys, kinds[number % 2])("test", "stranger/0badc0de")
+            key = getattr(keys, kinds[number % 3])("test", "stranger/0badc0de")
             session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
         while sum((dropped := processes.status()["dropped"]).values()) < count:
             pass

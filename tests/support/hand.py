@@ -1,5 +1,6 @@
 """A coordinator driven by hand: a real router, the real codec, and no rule but the test's."""
 
+import hashlib
 import queue
 from dataclasses import asdict
 
@@ -18,6 +19,7 @@ from common.messages import (
     JobBatch,
     ResultBatch,
     TaskSpec,
+    UploadPart,
     VectorPart,
     Verdict,
 )
@@ -44,13 +46,15 @@ class Hand:
         self._held = []
         self._bundle = bundle.path.read_bytes()
         self._said = queue.SimpleQueue()
-        self.session = open_session(Network(listen=(f"tcp/127.0.0.1:{port}",)))
+        self.endpoint = f"tcp/127.0.0.1:{port}"
+        self.session = open_session(Network(listen=(self.endpoint,)))
         declare, answer = self.session.declare_subscriber, self.session.declare_queryable
         self._declared = [
             answer(keys.hello(run), _direct(self._hello)),
             answer(keys.bundle(run, bundle.sha256), _direct(self._part)),
             declare(keys.any_worker("result", run), self._hear(ResultBatch)),
             declare(keys.any_worker("beat", run), self._hear(Beat)),
+            declare(keys.any_worker("upload", run), self._hear(UploadPart)),
         ]
         self._token = None
         self.appear()
@@ -96,8 +100,18 @@ class Hand:
             came |= _digests(self.next(ResultBatch))
         return came
 
-    def job(self, episode=0):
-        return samples.job(episode, spec=self.spec)
+    def upload(self, of):
+        """Wait until every part of this job's file has come; its bytes."""
+        parts, total = {}, 1
+        while sum(map(len, parts.values())) < total:
+            part = self.next(UploadPart, lambda part: part.digest == of.digest)
+            parts[part.offset], total = part.data, part.total
+        data = b"".join(parts[offset] for offset in sorted(parts))
+        assert hashlib.sha256(data).digest() == part.sha256
+        return data
+
+    def job(self, episode=0, kind="score"):
+        return samples.job(episode, kind, spec=self.spec)
 
     def batch(self, number, *jobs, vectors=(WHOLE,), cancels=(), accepted=(), **head):
         verdicts = tuple(Verdict(job.digest, "accepted") for job in accepted)

@@ -10,8 +10,9 @@ import numpy as np
 from gymnasium import spaces
 
 MODULE = "tests.support.tasks"
-TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, JUDGED, COUNTED = (
-    f"{MODULE}:{name}" for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Judged", "Counted")
+TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, JUDGED, COUNTED, HEAVY = (
+    f"{MODULE}:{name}"
+    for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Judged", "Counted", "Heavy")
 )
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
 
@@ -146,6 +147,30 @@ class CountedEnvironment(ToyEnvironment):
     def step(self, action):
         self._made[0] += 1
         return super().step(action)
+
+
+class Heavy(Toy):
+    """What it sees cannot be compressed: a kept drive is a megabyte."""
+
+    name = HEAVY
+
+    def make_environment(self):
+        return HeavyEnvironment()
+
+
+class HeavyEnvironment(ToyEnvironment):
+    observation_space = spaces.Box(0, 255, (100_000,), np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        _, told = super().reset(seed=seed)
+        return self._look(), told
+
+    def step(self, action):
+        _, *rest = super().step(action)
+        return self._look(), *rest
+
+    def _look(self):
+        return self.np_random.integers(0, 256, 100_000, np.uint8)
 
 
 def steps_made(folder):

@@ -1,5 +1,6 @@
 """A worker against a coordinator driven by hand, over a real router."""
 
+import hashlib
 import logging
 import queue
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +12,7 @@ import worker.service
 from common.bundle import BundleStore, Manifest, default_cache, write_bundle
 from common.codec import encode
 from common.errors import BundleError, RefusedError, UsageError
-from common.messages import MAX_MESSAGE, MAX_PART, Intervals, ResultBatch
+from common.messages import MAX_MESSAGE, MAX_PART, Beat, Intervals, ResultBatch, UploadPart
 from common.session import Network
 from tests.support import tasks
 from tests.support.bundles import npy
@@ -210,6 +211,37 @@ def test_a_job_that_is_not_what_its_digest_says_is_an_error(stage, cached):
     job = MSGPACK["job"].jobs[0]  # of another run's task
     hand.send(1, job)
     assert "digest" in hand.result(job).error
+
+
+def test_a_drive_is_uploaded_again_until_its_verdict_and_then_no_more(stage, cached):
+    hand = stage.hand(tasks.HEAVY)
+    stage.worker()
+    hand.ready()
+    kept, other = hand.job(0, "collect"), hand.job(1)
+    hand.send(1, kept)
+    data = hand.upload(kept)
+    assert len(data) > 3 * MAX_PART
+    assert hand.result(kept).upload == hashlib.sha256(data).digest()
+    assert hand.upload(kept) == data
+    hand.send(2, other, accepted=(kept,))
+    hand.beat(lambda beat: beat.seen == 2 and tag(kept) not in beat.unacked)
+    for _ in range(3):
+        assert isinstance(hand.next((UploadPart, Beat)), Beat)
+
+
+def test_a_coordinators_next_life_hears_a_drive_from_the_beginning(stage, cached):
+    hand = stage.hand(tasks.HEAVY)
+    stage.worker()
+    hand.ready()
+    kept = hand.job(0, "collect")
+    hand.send(1, kept)
+    data = hand.upload(kept)
+    hand.vanish()
+    hand.nonce, hand.incarnation = SECOND, 2
+    hand.appear()
+    hand.beat(lambda beat: beat.nonce == SECOND and tag(kept) in beat.unacked)
+    assert hand.next(UploadPart).incarnation == 2
+    assert hand.upload(kept) == data
 
 
 def test_a_cancelled_job_is_not_started(stage, cached):

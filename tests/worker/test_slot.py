@@ -1,3 +1,5 @@
+import hashlib
+import io
 import os
 import queue
 import select
@@ -7,6 +9,7 @@ import sys
 from dataclasses import replace
 from time import monotonic
 
+import numpy as np
 import pytest
 
 from common.errors import DreamfleetError
@@ -41,6 +44,13 @@ class Harness:
                 (result,) = results
                 return result
 
+    def outcome(self):
+        """The result, and the file that came with it."""
+        while True:
+            event = self.events.get(timeout=TIMEOUT)[1]
+            if results := self.slot.handle(event):
+                return results[0], event.done.upload
+
     def score(self, episode=0):
         self.wait_ready()
         self.slot.submit([(job(episode, spec=self.spec), VECTOR)])
@@ -66,6 +76,28 @@ def test_it_scores_and_the_same_job_gives_the_same_bits(harness):
     assert first.fitness is not None
     assert first.steps == 10
     assert first.fitness == second.fitness != other.fitness
+
+
+def test_a_kept_drive_is_what_a_candidate_would_drive(harness):
+    slot = harness(tasks.TOY)
+    scored = slot.score()
+    slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
+    kept, file = slot.outcome()
+    assert (kept.fitness, kept.steps) == (scored.fitness, scored.steps)
+    assert kept.upload == hashlib.sha256(file).digest()
+    with np.load(io.BytesIO(file), allow_pickle=False) as drive:
+        assert drive["reward"].sum() == pytest.approx(scored.fitness, rel=1e-5)
+        assert (len(drive["picture"]), bool(drive["ended"])) == (10, True)
+    slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
+    assert slot.outcome()[1] == file, "equal drives give equal files"
+
+
+def test_a_failed_drive_is_an_error_without_a_file(harness):
+    slot = harness(tasks.RAISING)
+    slot.wait_ready()
+    slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
+    failed, file = slot.outcome()
+    assert (failed.fitness, failed.upload, file) == (None, None, None)
 
 
 @pytest.mark.parametrize(

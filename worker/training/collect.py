@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from common.errors import DatasetError, UsageError
 from common.files import write_aside
 from common.threads import pin_thread_pools
+from worker.drive import Drive, write_episode
 from worker.render.check import make_car_racing
 from worker.tasks.preprocessing import PREPROCESSING
 from worker.training.drivers import DRIVERS
@@ -66,7 +67,7 @@ def _collect_one(task: tuple[Path, CollectConfig, int]) -> int:
     folder, config, number = task
     arrays = drive(config, number)
     with write_aside(episode_path(folder, number)) as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        write_episode(file, arrays)
     return len(arrays["action"])
 
 
@@ -79,27 +80,15 @@ def drive(config: CollectConfig, number: int) -> dict[str, NDArray[Any]]:
     observation, _ = environment.reset(seed=int(random.integers(2**20, 2**31)))
     if random.random() < config.anywhere:
         observation = _put_anywhere(environment, random)
-    pictures: list[NDArray[np.uint8]] = []
-    actions: list[NDArray[np.float32]] = []
-    rewards: list[float] = []
-    idle, ended = 0, False
-    while len(actions) < config.steps and idle < config.patience and not ended:
-        action = driver.act()
-        pictures.append(observation)
+    kept, idle = Drive(name, PREPROCESSING), 0
+    while len(kept) < config.steps and idle < config.patience and not kept.ended:
+        action, seen = driver.act(), observation
         observation, reward, terminated, truncated, _ = environment.step(action)
-        actions.append(action)
-        rewards.append(float(reward))
+        kept.add(seen, action, float(reward))
         idle = 0 if float(reward) > 0 else idle + 1
-        ended = terminated or truncated
+        kept.ended = bool(terminated or truncated)
     environment.close()
-    return {
-        "picture": np.stack(pictures),
-        "action": np.stack(actions),
-        "reward": np.array(rewards, dtype=np.float32),
-        "ended": np.array(ended),
-        "driver": np.array(name),
-        "preprocessing": np.array(PREPROCESSING),
-    }
+    return kept.arrays()
 
 
 def _put_anywhere(environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:

@@ -1,4 +1,4 @@
-"""`dreamfleet collect`: random drives as training data."""
+"""`dreamfleet collect`: drives as training data, at random or from a run that kept its own."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-SUMMARY = "drive at random and keep what was seen, as training data for a world model"
+from common.errors import UsageError
+from common.runs import default_runs_dir
+
+SUMMARY = "drive at random, or take in what a run collected, as training data for a world model"
 EXTRAS = ("worker",)
 
 
@@ -18,10 +21,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, help="episodes in all, instead of the preset's")
     parser.add_argument("--seed", type=int, help="makes the data set, instead of the preset's")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
+    parser.add_argument("--from-run", metavar="RUN", help="drive nothing: take in what this run collected, each once")
+    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Collect what is missing."""
+    if args.from_run is not None:
+        return _take_in(args)
     from common.progress import progress_bar
     from worker.training.collect import collect
     from worker.training.presets import find_preset
@@ -35,4 +42,17 @@ def run(args: argparse.Namespace) -> int:
             frames, done = frames + count, done + 1
             bar.move(done)
     print(f"{args.data}: {done} episodes, {frames} frames new; {config.episodes} episodes in all")
+    return 0
+
+
+def _take_in(args: argparse.Namespace) -> int:
+    from common.runs import open_run
+    from worker.training.intake import take_in
+
+    with open_run(args.runs_dir, args.from_run) as stored:
+        drives = stored.rollouts()
+        if not drives:
+            raise UsageError(f"run {args.from_run} has collected nothing: start a run with --collect-every")
+    new = list(take_in(args.data, drives))
+    print(f"{args.data}: {len(new)} episodes, {sum(new)} frames new, of {len(drives)} that {args.from_run} collected")
     return 0

@@ -1,0 +1,23 @@
+"""Drives of the mean that are kept: the next world model then learns from what evolved controllers see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from common.messages import TaskSpec
+from common.seeds import collection_seed
+from coordinator.jobs import Work, make_work
+
+
+@dataclass(frozen=True)
+class Collection:
+    """The distribution's mean after `generation`, as float32 bytes, to be driven on `episodes` training tracks."""
+
+    generation: int
+    vector: bytes
+    episodes: int
+
+    def work(self, spec: TaskSpec, run_seed: int) -> list[Work]:
+        """Its jobs."""
+        seeds = [collection_seed(run_seed, self.generation, episode) for episode in range(self.episodes)]
+        return make_work(spec, "collect", self.generation, 0, self.vector, seeds)

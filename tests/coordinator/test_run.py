@@ -1,0 +1,224 @@
+"""A run's life against its journal, without a transport."""
+
+import hashlib
+from dataclasses import replace
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from common.controller import ControllerShape
+from common.messages import MAX_PART, TAG_BYTES, Beat, HelloRequest, Result, ResultBatch, UploadPart
+from common.runs import RunFolder, RunSettings
+from coordinator.config import LimitsConfig
+from coordinator.fleet import Fleet
+from coordinator.journal import Journal
+from coordinator.run import Run
+from tests.support.samples import SPEC
+
+A, B = "a/00000001", "b/00000002"
+DRIVES = 2
+SETTINGS = RunSettings(
+    SPEC, ControllerShape(1), 2, 1, 0.1, "diagonal", 1, evaluate_every=0, evaluation_episodes=1, collect_every=1,
+    collect_episodes=DRIVES,
+)  # fmt: skip
+
+
+class Bench:
+    """A run in a folder, driven by hand; time stands still unless it is moved."""
+
+    def __init__(self, path, bundle):
+        self.path, self.now = path, 0.0
+        path.mkdir(parents=True)
+        self.journal = Journal.create(path, SETTINGS, bundle)
+        self.begin()
+
+    def begin(self):
+        self.run = Run(self.journal, SETTINGS, LimitsConfig(generations=1), Fleet(1.0), self.now)
+        self.run.advance(self.now)
+        for name in (A, B):
+            self.run.admit(HelloRequest(1, 1, "0", name, (SPEC.task,), "f", 1), self.now)
+            self.beat(name)
+
+    def restart(self):
+        """Killed: what was not committed never was."""
+        self.journal._connection.rollback()
+        self.journal.close()
+        self.journal = Journal(self.path / "journal.sqlite")
+        self.begin()
+
+    def beat(self, name, unacked=()):
+        head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "drawn_by": "-"}
+        tags = tuple(digest[:TAG_BYTES] for digest in unacked)
+        self.run.fleet.beat(
+            name,
+            Beat(**head, seen=10**9, capacity=4, slots=4, queued=(), running=(), unacked=tags, load=0.0,
+                 steps_per_second=0.0),
+            self.now,
+        )  # fmt: skip
+
+    def deliver(self, name, result):
+        batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,))
+        self.run.results(name, batch, self.now)
+        self.run.advance(self.now)
+
+    def upload(self, name, part):
+        self.run.upload(name, part, self.now)
+
+    def parts(self, job):
+        data = drive_of(job)
+        return [
+            UploadPart(
+                run_uid=self.run.uid, incarnation=1, digest=job.digest, sha256=hashlib.sha256(data).digest(),
+                offset=offset, total=len(data), data=data[offset : offset + MAX_PART],
+            )
+            for offset in range(0, len(data), MAX_PART)
+        ]  # fmt: skip
+
+    def verdicts(self):
+        sends = self.run.fleet.dispatch(self.now)
+        return [(send.identity, each.digest, each.verdict) for send in sends for each in send.content.verdicts]
+
+    def reach_collection(self):
+        """Score the only generation; the jobs that collect, and who holds each."""
+        while not self.run.fleet.hurry:
+            for send in self.run.fleet.dispatch(self.now):
+                for work in send.content.work:
+                    self.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
+        return self.collecting()
+
+    def collecting(self):
+        given = {}
+        for send in self.run.fleet.dispatch(self.now):
+            given.update({work.job.episode: (send.identity, work.job) for work in send.content.work})
+        return [given[episode] for episode in sorted(given)]
+
+    def kept(self):
+        with RunFolder(self.path) as folder:
+            return [path.read_bytes() for path in folder.rollouts()]
+
+
+def drive_of(job):
+    """Two parts and a bit, a pure function of the job."""
+    return hashlib.sha256(job.digest).digest() * (2 * MAX_PART // 32) + job.digest
+
+
+def result_of(job):
+    return Result(job.digest, 5.0, 10, 0.1, None, hashlib.sha256(drive_of(job)).digest())
+
+
+@pytest.fixture
+def bench(tmp_path, random_bundle):
+    made = Bench(tmp_path / "night", random_bundle.path)
+    yield made
+    made.journal.close()
+
+
+def test_a_result_has_no_verdict_before_its_drive_is_on_disk(bench):
+    (name, job), _ = bench.reach_collection()
+    bench.verdicts()
+    bench.deliver(name, result_of(job))
+    assert bench.verdicts() == []
+    for part in bench.parts(job):
+        bench.upload(name, part)
+    assert bench.verdicts() == []
+    bench.deliver(name, result_of(job))
+    assert bench.verdicts() == [(name, job.digest, "accepted")]
+    assert bench.kept() == [drive_of(job)]
+    assert bench.run.collection_progress == (1, DRIVES)
+    bench.deliver(name, result_of(job))
+    assert bench.verdicts() == [(name, job.digest, "duplicate")]
+    assert len(bench.run.uploads) == 0
+
+
+def test_the_end_waits_for_every_drive(bench):
+    jobs = bench.reach_collection()
+    for name, job in jobs:
+        assert bench.run.ended is None
+        for part in bench.parts(job):
+            bench.upload(name, part)
+        bench.deliver(name, result_of(job))
+    assert bench.run.ended == "1 generations"
+    assert bench.kept() == [drive_of(job) for _, job in jobs]
+
+
+def test_parts_of_a_job_that_nobody_gave_are_dropped_and_counted(bench):
+    (name, job), _ = bench.reach_collection()
+    part = bench.parts(job)[0]
+    for stranger, each in (("x/0badc0de", part), (name, replace(part, digest=b"x" * 32))):
+        bench.upload(stranger, each)
+    assert bench.run.uploads.dropped == {"unwanted upload": 2}
+    assert len(bench.run.uploads) == 0
+
+
+def test_a_drive_without_its_upload_is_an_error(bench):
+    (name, job), _ = bench.reach_collection()
+    bench.verdicts()
+    bench.deliver(name, replace(result_of(job), upload=None))
+    assert ("refused" in verdict for *_, verdict in bench.verdicts())
+    assert "not kept" in next(iter(bench.run.fleet.failures[0][1].values()))
+
+
+def test_a_restart_in_mid_upload_asks_again_and_what_was_kept_stays(bench):
+    (name, job), (_, other) = bench.reach_collection()
+    for part in bench.parts(job):
+        bench.upload(name, part)
+    bench.deliver(name, result_of(job))
+    bench.upload(name, bench.parts(other)[0])
+    bench.restart()
+    assert bench.run.collection_progress == (1, DRIVES)
+    bench.beat(B, unacked=[other.digest])  # it was driven in the last life
+    for part in bench.parts(other):
+        bench.upload(B, part)
+    bench.deliver(B, result_of(other))
+    assert bench.run.ended is not None
+    assert bench.kept() == [drive_of(job), drive_of(other)]
+
+
+STEPS = st.one_of(
+    st.tuples(st.just("part"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1), st.integers(0, 2)),
+    st.tuples(st.just("spoilt"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1), st.integers(0, 2)),
+    st.tuples(st.just("result"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1)),
+    st.tuples(st.just("adopt"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1)),
+    st.tuples(st.just("wait"), st.floats(0.1, 90.0)),
+    st.tuples(st.just("restart")),
+)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(steps=st.lists(STEPS, max_size=40))
+def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_once(
+    tmp_path_factory, random_bundle, steps
+):
+    bench = Bench(tmp_path_factory.mktemp("run") / "night", random_bundle.path)
+    jobs = [job for _, job in bench.reach_collection()]
+    accepted = []
+    for kind, *what in steps:
+        if kind in ("part", "spoilt"):
+            part = bench.parts(jobs[what[1]])[what[2]]
+            bench.upload(what[0], part if kind == "part" else replace(part, data=bytes(len(part.data))))
+        elif kind == "result":
+            bench.deliver(what[0], result_of(jobs[what[1]]))
+        elif kind == "adopt":
+            bench.beat(what[0], unacked=[jobs[what[1]].digest])
+        elif kind == "wait":
+            bench.now += what[0]
+            bench.run.fleet.tick(bench.now)
+            bench.run.advance(bench.now)
+        elif kind == "restart" and bench.run.ended is None:
+            bench.restart()
+        accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
+        whole = {drive_of(job) for job in jobs}
+        assert set(bench.kept()) <= whole, "what counts is whole"
+        assert len(bench.kept()) == bench.run.collection_progress[0]
+    for job in jobs:  # two rounds that come through: a spoilt part ends the first
+        for _ in range(2):
+            bench.beat(A, unacked=[job.digest])
+            for part in bench.parts(job):
+                bench.upload(A, part)
+            bench.deliver(A, result_of(job))
+        accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
+    assert bench.kept() == [drive_of(job) for job in jobs]
+    assert len(accepted) == len(set(accepted))
+    assert bench.run.ended is not None
+    bench.journal.close()

@@ -1,0 +1,137 @@
+"""A run keeps drives of its own mean: what lies on disk, whoever drove and whoever died."""
+
+import hashlib
+import io
+import signal
+
+import numpy as np
+import pytest
+
+from common import keys
+from common.codec import decode, encode
+from common.messages import MAX_PART, UploadPart
+from common.runs import open_run
+from common.seeds import collection_seed
+from common.session import Network, open_session
+from tests.support import tasks
+from worker.tasks.preprocessing import PREPROCESSING
+from worker.training.dataset import episodes, load_pictures
+
+pytestmark = pytest.mark.timeout(240)
+GENERATIONS, DRIVES = 4, 3
+
+
+@pytest.fixture
+def settings(random_bundle):
+    return (
+        "--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
+        "--collect-every", 2, "--collect-episodes", DRIVES, "--generations", GENERATIONS, "--seed", 5,
+    )  # fmt: skip
+
+
+def kept(processes, name):
+    """Each drive's place and bytes; the journal says that there are no more."""
+    with open_run(processes.runs, name) as run:
+        paths = run.rollouts()
+        assert sorted(path.name for path in (run.path / "rollouts").iterdir()) == [path.name for path in paths]
+        return {path.name: path.read_bytes() for path in paths}
+
+
+def expected(generations=(1, 3)):
+    return [f"{generation:06d}-{episode:04d}.npz" for generation in generations for episode in range(DRIVES)]
+
+
+def resume(processes, name):
+    return processes.start(
+        "coordinator", "--resume", name, "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", "0.2",
+        "--generations", GENERATIONS,
+    )  # fmt: skip
+
+
+def test_the_drives_are_a_function_of_the_run_whoever_makes_them(processes, settings):
+    seen = []
+    for name, workers in (("one", 1), ("three", 3)):
+        coordinator = processes.coordinator(*settings, "--task", tasks.TOY, name=name)
+        for number in range(workers):
+            processes.worker("--run", name, "--task", tasks.TOY, "--name", f"w{number}")
+        assert coordinator.finish()[0] == 0
+        seen.append(kept(processes, name))
+    assert seen[0] == seen[1]
+    assert sorted(seen[0]) == expected()
+    with open_run(processes.runs, "one") as run:
+        results = run.results(3, 0, "collect")
+        assert [each.seed for each in results] == [collection_seed(5, 3, episode) for episode in range(DRIVES)]
+        scored = {each.seed for g in range(GENERATIONS) for i in range(4) for each in run.results(g, i)}
+        assert not scored & {each.seed for each in results}
+    with np.load(io.BytesIO(seen[0][expected()[0]])) as drive:
+        assert set(drive) == {"picture", "action", "reward", "ended", "driver", "preprocessing"}
+        assert str(drive["driver"]) == "controller"
+        assert len(drive["action"]) == len(drive["reward"]) == len(drive["picture"]) == 10
+        with open_run(processes.runs, "one") as run:
+            assert run.results(1, 0, "collect")[0].fitness == pytest.approx(drive["reward"].sum(), rel=1e-5)
+
+
+def test_a_coordinator_killed_in_mid_upload_asks_again(processes, settings):
+    whole = processes.coordinator(*settings, "--task", tasks.HEAVY, name="whole")
+    processes.worker("--run", "whole", "--task", tasks.HEAVY)
+    assert whole.finish()[0] == 0
+
+    first = processes.coordinator(*settings, "--task", tasks.HEAVY, name="test")
+    with open_session(Network(connect=(processes.endpoint,))) as session:
+        heard = session.declare_subscriber(keys.any_worker("upload", "test"))
+        processes.worker("--run", "test", "--task", tasks.HEAVY)
+        part = decode(UploadPart, heard.recv().payload.to_bytes())
+        assert part.total > 3 * MAX_PART
+        first.popen.send_signal(signal.SIGKILL)
+        first.popen.wait()
+    with open_run(processes.runs, "test") as run:
+        assert run.rollouts() == []
+    again = resume(processes, "test")
+    assert again.finish()[0] == 0
+    assert kept(processes, "test") == kept(processes, "whole")
+
+
+def test_what_strangers_upload_is_dropped_and_counted(processes, random_bundle):
+    processes.coordinator(
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
+        "--collect-every", 1,
+    )  # fmt: skip
+    with open_run(processes.runs, "test") as run:
+        head = {"run_uid": run.uid, "incarnation": 1}
+    data = b"x" * 100
+    part = UploadPart(
+        **head, digest=b"\x01" * 32, sha256=hashlib.sha256(data).digest(), offset=0, total=len(data), data=data
+    )
+    with open_session(Network(connect=(processes.endpoint,))) as session:
+        for _ in range(5):
+            session.put(keys.upload("test", "stranger/0badc0de"), encode(part))
+        while processes.status()["dropped"].get("unwanted upload", 0) < 5:
+            pass
+    assert processes.status()["collecting"] == {"episodes_done": 0, "episodes": 0}
+
+
+@pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
+def test_drives_of_the_real_car_are_episodes_that_a_data_set_takes_in_once(processes, tmp_path):
+    coordinator = processes.coordinator(
+        "--bundle", "tiny", "--population", 2, "--episodes", 1, "--horizon", 30, "--evaluate-every", 0,
+        "--collect-every", 1, "--collect-episodes", 2, "--generations", 1,
+    )  # fmt: skip
+    processes.worker()
+    assert coordinator.finish()[0] == 0
+    data = tmp_path / "data"
+    for new in (2, 0):
+        code, out, err = processes.call(
+            "collect", "--data", data, "--from-run", "test", "--runs-dir", processes.runs
+        )  # fmt: skip
+        assert code == 0, err
+        assert f"{new} episodes, {30 * new} frames new, of 2" in out
+    with open_run(processes.runs, "test") as run:
+        assert [path.read_bytes() for path in run.rollouts()] == [path.read_bytes() for path in episodes(data)]
+    for path in episodes(data):
+        pictures = load_pictures(path)
+        assert pictures.shape == (30, 64, 64, 3)
+        assert pictures.dtype == np.uint8
+        with np.load(path) as drive:
+            assert drive["action"].shape == (30, 3)
+            assert str(drive["preprocessing"]) == PREPROCESSING
+            assert not drive["ended"]

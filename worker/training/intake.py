@@ -1,0 +1,42 @@
+"""Drives that a run collected, taken into a data set: each once, under the next free number."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from common.bundle import hash_file
+from common.errors import DatasetError
+from common.files import write_aside
+from worker.training.collect import episode_path
+from worker.training.dataset import load, load_pictures
+
+
+def take_in(folder: Path, drives: Sequence[Path]) -> Iterator[int]:
+    """Copy the drives that the data set lacks; yields the frames of each. Which it has, their bytes tell."""
+    present = sorted(episode_path(folder, 0).parent.glob("[0-9]*.npz"))
+    sizes = {path.stat().st_size for path in drives if path.exists()}
+    known = {hash_file(path) for path in present if path.stat().st_size in sizes}
+    number = int(present[-1].stem) + 1 if present else 0
+    for path in drives:
+        frames = _check(path)
+        if (identity := hash_file(path)) in known:
+            continue
+        known.add(identity)
+        try:
+            with path.open("rb") as source, write_aside(episode_path(folder, number)) as target:
+                shutil.copyfileobj(source, target)
+        except OSError as error:
+            raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
+        number += 1
+        yield frames
+
+
+def _check(path: Path) -> int:
+    """Frames of a drive; whatever a worker sent lies there, so it is looked at before anything trains on it."""
+    frames = len(load_pictures(path))
+    arrays = load(path, "action", "reward", "ended", "driver")
+    if arrays["action"].shape[:1] != (frames,) or arrays["reward"].shape != (frames,):
+        raise DatasetError(f"{path} holds {frames} pictures and another number of actions or rewards; delete it")
+    return frames
