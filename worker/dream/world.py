@@ -33,8 +33,7 @@ class DreamWorld:
     """The frozen MDN-RNN as a world, at one temperature (Ha & Schmidhuber 2018, section 4)."""
 
     def __init__(self, bundle: Bundle, temperature: float) -> None:
-        if not (temperature > 0 and math.isfinite(temperature)):
-            raise UsageError(f"a dream's temperature must be a positive number, not {temperature}")
+        check_temperature(temperature)
         if DREAM not in bundle.manifest.parts:
             raise BundleError(f"{bundle.path.name} is from before dreams: build it again with `dreamfleet bundle`")
         self._kind = str(bundle.manifest.models.get("mdnrnn", {}).get("reward", "none"))
@@ -65,6 +64,12 @@ class DreamWorld:
             tile = told if self._kind == "positive" else 1 - told  # the notebook's head tells of steps without one
             reward = TILE_REWARD * tile - IDLE_COST
         return Moment(dream.latent, dream.state, reward, dream.done > 0.5)
+
+
+def check_temperature(temperature: float) -> None:
+    """`UsageError` unless it is a positive number."""
+    if not (temperature > 0 and math.isfinite(temperature)):
+        raise UsageError(f"a dream's temperature must be a positive number, not {temperature}")
 
 
 def read_initial(bundle: Bundle) -> Floats:

@@ -65,21 +65,21 @@ class CarRacingPolicy:
     def __init__(self, bundle: Bundle) -> None:
         self._step = PolicyStep(bundle)
         self._parameters = np.zeros((1, self._step.shape.size), dtype=np.float32)
-        self._state = self._step.zero_state(1)
+        self.state = self._step.zero_state(1)
         self.latent = np.zeros((1, bundle.manifest.latent), dtype=np.float32)
 
     def begin(self, parameters: NDArray[np.float32]) -> None:
         """Begin an episode: zero state."""
         self._step.shape.check(parameters)
         self._parameters = parameters.astype(np.float32).reshape(1, -1)
-        self._state = self._step.zero_state(1)
+        self.state = self._step.zero_state(1)
 
     def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Steering, gas and brake `(3,)` for one picture."""
-        action, self._state, self.latent = self._step.step(observation[None], self._parameters, self._state)
+        action, self.state, self.latent = self._step.step(observation[None], self._parameters, self.state)
         chosen: NDArray[np.float32] = action[0]
         return chosen
 
     def reward(self, value: float) -> None:
         """What the last action brought; some models see it in the next step."""
-        self._step.remember(self._state, np.array([value]))
+        self._step.remember(self.state, np.array([value]))

@@ -10,7 +10,7 @@ from common.errors import UsageError
 from common.runs import default_runs_dir
 from common.seeds import TEST
 
-SUMMARY = "record a drive as an mp4: the track, what the model sees, what its decoder makes of it"
+SUMMARY = "record a drive as an mp4: the track, what the model sees, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")
 
 
@@ -21,6 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, default=1000, help="steps at most (default 1000)")
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help="the video to write (default drive.mp4)")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
+    parser.add_argument("--temperature", type=float, default=1.0, help="of the dream beside the drive (default 1.0)")
     parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
 
 
@@ -33,12 +34,14 @@ def run(args: argparse.Namespace) -> int:
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from common.progress import progress_bar
     from common.shelf import find_controller
+    from worker.dream.daydream import DaydreamConfig
     from worker.evaluation import bundle_for
     from worker.recording import record
 
+    daydream = DaydreamConfig(args.temperature, seed=args.seed)
     controller, beside = find_controller(args.controller, args.runs_dir)
     bundle = bundle_for(controller, args.bundle, beside)
     with progress_bar("record", args.steps, "steps") as bar:
-        score = record(controller, bundle, args.seed, args.steps, args.out, bar.move)
+        score = record(controller, bundle, args.seed, args.steps, args.out, daydream, bar.move)
     print(f"{args.out}: score {score:.1f} on track {args.seed}")
     return 0

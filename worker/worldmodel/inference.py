@@ -14,6 +14,7 @@ from common.errors import BundleError
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]
 NAMES = ("weights", "biases")  # of a layer
+ATTENTION = "attention"  # an output of dreams with a window
 
 
 def open_part(bundle: Bundle, name: str) -> onnxruntime.InferenceSession:
@@ -154,7 +155,9 @@ class DreamStep:
         check_sizes(bundle, DREAM, session, {"latent": [manifest.latent], "action": [manifest.actions]})
         sizes = {each.name: each.shape for each in session.get_inputs()}
         self._run = session.run
-        self._names = [each.name for each in session.get_outputs()]
+        outputs = [each.name for each in session.get_outputs()]
+        self.attends = ATTENTION in outputs
+        self._names = [name for name in outputs if name != ATTENTION]
         self._controllers = Controllers(bundle)
         self._only = onnxruntime.RunOptions()
         self._only.only_execute_path_to_fetches = True
@@ -193,14 +196,22 @@ class DreamStep:
 
     def advance(self, latent: Floats, action: Floats, state: Floats) -> Floats:
         """The next state alone, as in reality, where the next latent is seen and not dreamt."""
+        return self._look("next_state", latent, action, state)
+
+    def attend(self, latent: Floats, action: Floats, state: Floats) -> Floats:
+        """The weights (N, window) that attention gives its inputs at this step, the oldest first."""
+        return self._look(ATTENTION, latent, action, state)
+
+    def _look(self, output: str, latent: Floats, action: Floats, state: Floats) -> Floats:
+        """One output that chance has no part in."""
         if len(self._idle.get("uniform", "")) != len(latent):
             zeros = np.zeros((len(latent), self.latent_size), dtype=np.float32)
             self._idle = {"uniform": zeros, "normal": zeros, "temperature": np.ones(1, np.float32)}
             if self.takes_mask:
                 self._idle["mask"] = np.ones((len(latent), self.hidden_size), np.float32)
         feed = {**self._idle, "latent": latent, "action": action, "state": state}
-        (after,) = self._run(["next_state"], feed, self._only)
-        return np.asarray(after, dtype=np.float32)
+        (found,) = self._run([output], feed, self._only)
+        return np.asarray(found, dtype=np.float32)
 
     def zero_state(self, rows: int) -> Floats:
         """The state before the first step."""

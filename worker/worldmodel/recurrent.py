@@ -25,6 +25,7 @@ class Recurrent:
             state, config.hidden, config.hidden, int(config.previous_reward), config.window * self._step
         )
         self.hidden, self._cell, self._previous, self._window = parts
+        self.attention = ""  # weights (N, window, 1) of the last step
 
     def advance(self, latent: str, action: str) -> str:
         """One step: `hidden` becomes the next."""
@@ -49,7 +50,8 @@ class Recurrent:
         query = graph.node("Unsqueeze", graph.linear(self.hidden, rnn["query.weight"].T), graph.shape(1))
         scores = graph.node("Tanh", graph.node("Add", keys, query))
         scores = graph.node("MatMul", scores, graph.constant(rnn["score.weight"].T))
-        weighted = graph.node("Mul", graph.node("Softmax", scores, axis=1), seen)
+        self.attention = graph.node("Softmax", scores, axis=1)
+        weighted = graph.node("Mul", self.attention, seen)
         return str(graph.node("ReduceSum", weighted, graph.shape(1), keepdims=0))
 
     def _lstm(self, inputs: str) -> None:
@@ -77,7 +79,8 @@ def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
 
     Inputs `latent` (N, latent), `action` (N, actions), `state` (N, state), `uniform` and `normal` (N, latent),
     `temperature` (1,), and with dropout `mask` (N, hidden), which the LSTM's output is multiplied by. Outputs
-    `next_latent`, `next_state`, and of heads that exist `reward` (probability or value) and `done` (N,).
+    `next_latent`, `next_state`, of heads that exist `reward` (probability or value) and `done` (N,), and with a window
+    `attention` (N, window).
 
     Sampling (Ha & Schmidhuber 2018): log weights divided by the temperature, deviations times its root. The mixture is
     the first whose cumulated weight exceeds `uniform`: `Where`s from the first to the last, no Gather.
@@ -103,6 +106,9 @@ def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
     graph.give(graph.node("Add", mean, spread), "next_latent", kind, config.latent)
     told = _told(graph, reward, config) if config.previous_reward else ""
     graph.give(recurrent.next_state(told), "next_state", kind, config.state)
+    if recurrent.attention:
+        weights = graph.node("Squeeze", recurrent.attention, graph.shape(2))
+        graph.give(weights, "attention", kind, config.window)
     for name, head in (("reward", reward), ("done", done)):
         if head:
             value = head if name == "reward" and config.reward == "value" else graph.node("Sigmoid", head)

@@ -1,0 +1,149 @@
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+
+from common.bundle import DREAM, write_bundle
+from common.errors import BundleError, DatasetError
+from tests.support.bundles import random_models, write_random_bundle
+from worker.inspection import curves, memory
+from worker.inspection.drive import DriveConfig, drive
+from worker.inspection.inspection import Subject, facts, find_subject, inspect
+from worker.inspection.page import Page
+from worker.inspection.section import Section
+from worker.worldmodel.inference import DreamStep
+from worker.worldmodel.mdnrnn import MDNRNNConfig
+from worker.worldmodel.vae import VAEConfig
+
+PNG = b"\x89PNG\r\n\x1a\n"
+VAE = VAEConfig(latent=5, channels=(4, 4, 4, 8))
+ATTENTIVE = MDNRNNConfig(latent=5, hidden=8, mixtures=2, window=3, attention_units=4)
+SHORT = DriveConfig(steps=12)
+LOOKS = ["reconstructions", "traversals", "latents", "samples"]
+
+
+class Links(HTMLParser):
+    """Every address that a browser would fetch, and the ids of the sections."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.addresses, self.sections, self.tags = [], [], set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        named = dict(attributes)
+        self.tags.add(tag)
+        self.addresses += [value for name, value in attributes if name in ("src", "href", "srcset", "data", "action")]
+        if tag == "section":
+            self.sections.append(named["id"])
+
+
+def write_curves(folder):
+    for name, parts in (("vae", ("error", "kl")), ("mdnrnn", ("latent", "reward"))):
+        points = [{"update": update, **dict.fromkeys(parts, 100.0 / update)} for update in range(1, 60)]
+        (folder / f"{name}.jsonl").write_text("\n".join(json.dumps(point) for point in points))
+
+
+@pytest.fixture
+def attentive(tmp_path):
+    return write_random_bundle(tmp_path / "attentive.zip", vae=VAE, rnn=ATTENTIVE)
+
+
+def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
+    write_curves(tmp_path)
+    told = []
+    page = inspect(Subject(attentive), tmp_path / "out", SHORT, tmp_path, lambda done, name: told.append((done, name)))
+    found = Links(page.read_text())
+    names = [*LOOKS, "dream", "rewards", "attention", "loss-vae", "loss-mdnrnn"]
+    assert found.sections == names
+    assert told == list(enumerate(names, 1))
+    assert all(address.startswith("data:image/png;base64,") for address in found.addresses)
+    assert len(found.addresses) == len(names)
+    assert not found.tags & {"script", "link", "iframe", "object"}
+    assert "url(" not in re.sub(r"data:[^\"]*", "", page.read_text())
+    for name in names:
+        assert (page.parent / f"{name}.png").read_bytes().startswith(PNG)
+
+
+def test_what_a_bundle_cannot_do_is_left_out_or_told(attentive, tmp_path):
+    rnn = MDNRNNConfig(latent=5, hidden=8, reward="none")
+    plain = write_random_bundle(tmp_path / "plain.zip", vae=VAE, rnn=rnn)
+    page = inspect(Subject(plain), tmp_path / "plain", SHORT)
+    assert Links(page.read_text()).sections == [*LOOKS, "dream"]
+    parts = {name: attentive.read(name) for name in attentive.manifest.parts if name != DREAM}
+    awake = write_bundle(tmp_path / "awake.zip", attentive.manifest, parts)
+    page = inspect(Subject(awake), tmp_path / "awake", SHORT)
+    assert Links(page.read_text()).sections == [*LOOKS, "dream"]
+    assert "from before dreams" in page.read_text()
+
+
+def test_the_table_tells_sizes_and_quality(tmp_path, attentive):
+    provenance = {"quality": {"reward_auc": 0.9}, "held_out_episodes": 7}
+    manifest = attentive.manifest.__class__(**{**vars(attentive.manifest), "provenance": provenance})
+    parts = {name: attentive.read(name) for name in attentive.manifest.parts}
+    rows = dict(facts(write_bundle(tmp_path / "b.zip", manifest, parts)))
+    assert rows["quality: reward auc"] == "0.9"
+    assert (rows["latents"], rows["attention window"], rows["held out episodes"]) == ("5", "3", "7")
+
+
+def test_a_page_escapes_what_a_stranger_named():
+    page = Page("<b>", "&", [("<i>", "<script>")], [Section('a"b', "<h>", "<p>")]).html()
+    assert Links(page).tags <= {"html", "head", "meta", "title", "style", "body", "h1", "p", "table", "tr", "th", "td",
+                                "section", "h2"}  # fmt: skip
+
+
+def test_a_drive_is_a_function_of_its_seed(attentive):
+    one, other = (drive(attentive, None, SHORT) for _ in range(2))
+    assert len(one) == SHORT.steps
+    assert np.array_equal(one.picture, other.picture)
+    assert not np.array_equal(one.picture, drive(attentive, None, DriveConfig(20_001, 12)).picture)
+    assert list(one.nats[one.most_active]) == sorted(one.nats, reverse=True)
+
+
+def test_dreams_begin_at_the_drives_first_latent_and_take_its_actions(attentive):
+    driven = drive(attentive, None, SHORT)
+    dreamt = memory.dream_latents(attentive, driven, 1.0)
+    assert dreamt.shape == driven.mu.shape
+    assert np.array_equal(dreamt[0], driven.mu[0])
+    assert not np.array_equal(dreamt[1], memory.dream_latents(attentive, driven, 1.0, seed=1)[1])
+    driven.action[:] = driven.action[::-1].copy()
+    assert not np.array_equal(dreamt, memory.dream_latents(attentive, driven, 1.0))
+
+
+def test_attention_is_that_of_the_trained_model(attentive):
+    _, model = random_models(0, VAE, ATTENTIVE)
+    random = np.random.default_rng(1)
+    latent, action = random.normal(size=(2, 5)).astype(np.float32), random.normal(size=(2, 3)).astype(np.float32)
+    state = random.normal(size=(2, ATTENTIVE.state)).astype(np.float32)
+    window = np.concatenate([state[:, 2 * 8 + 8 :], latent, action], axis=1).reshape(2, 3, 8)
+    with torch.no_grad():
+        query = model.query(torch.from_numpy(state[:, :8]))[:, None]
+        expected = torch.softmax(model.score(torch.tanh(model.keys(torch.from_numpy(window)) + query)), dim=1)[..., 0]
+    np.testing.assert_allclose(DreamStep(attentive).attend(latent, action, state), expected.numpy(), atol=1e-6)
+
+
+def test_a_bundle_of_other_pictures_is_refused(tmp_path):
+    large = VAEConfig(picture=96, padding="same", latent=5, channels=(2, 2, 2, 2))
+    bundle = write_random_bundle(tmp_path / "large.zip", vae=large, rnn=MDNRNNConfig(latent=5, hidden=4))
+    with pytest.raises(BundleError, match="not those of CarRacing"):
+        drive(bundle, None, SHORT)
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"error": 1}', '{"update": 1, "a": 2}\n{"update": 2, "b": 2}', "[]"])
+def test_a_damaged_curve_is_told(tmp_path, text):
+    (tmp_path / "vae.jsonl").write_text(text)
+    with pytest.raises(DatasetError, match="holds no loss curve"):
+        curves.losses(tmp_path)
+
+
+def test_what_is_nowhere_is_told_before_anything_is_driven(tmp_path, attentive):
+    with pytest.raises(BundleError, match=r"no bundle 'nosuch'.*no run 'nosuch'"), find_subject("nosuch", tmp_path):
+        pass
+    with pytest.raises(DatasetError, match="no folder"):
+        inspect(Subject(attentive), tmp_path / "out", SHORT, tmp_path / "nowhere")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DatasetError, match="choose another --out"):
+        inspect(Subject(attentive), tmp_path / "file" / "out", SHORT)

@@ -1,0 +1,49 @@
+"""A run's page: its own world model under its own controller."""
+
+import numpy as np
+import pytest
+
+from common.controller import Controller
+from common.runs import CONTROLLER, RunSettings, StoredGeneration, run_paths
+from coordinator.evaluation import Evaluation
+from coordinator.jobs import travelling
+from coordinator.journal import Journal
+from tests.support.samples import SPEC
+from worker.inspection.drive import DriveConfig
+from worker.inspection.inspection import find_subject, inspect
+
+
+@pytest.fixture
+def runs_dir(tmp_path, random_bundle):
+    path = tmp_path / "runs" / "night"
+    path.mkdir(parents=True)
+    shape = random_bundle.controller_shape
+    settings = RunSettings(SPEC, shape, 2, 1, 0.1, "diagonal", 1, 1, 2)
+    journal = Journal.create(path, settings, random_bundle.path)
+    vectors = [travelling(np.full(shape.size, value)) for value in (0.5, 1.5)]
+    for number in range(3):
+        journal.open_generation(number, b"", 0.1, [7], vectors)
+        closed = StoredGeneration(number, number, 1.0, number + 1, 0.0, 0.1, 20, 1.0)
+        journal.close_generation(closed, np.array([0.0, 1.0]))
+        journal.schedule_evaluation(Evaluation(number, vectors[0], 2))
+        journal.finish_evaluation(number, 100.0 * number, 5.0)
+    journal.commit()
+    journal.close()
+    return tmp_path / "runs"
+
+
+def test_a_run_that_goes_on_is_driven_at_random_and_shows_its_fitness(runs_dir, tmp_path):
+    with find_subject("night", runs_dir) as subject:
+        page = inspect(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
+    assert 'id="fitness"' in page
+    assert "a fresh drive by a random driver" in page
+
+
+def test_a_run_that_has_ended_is_driven_by_its_controller(runs_dir, random_bundle, tmp_path):
+    shape = random_bundle.controller_shape
+    parameters = np.random.default_rng(0).normal(size=shape.size).astype(np.float32)
+    Controller(shape, parameters, "dream", random_bundle.sha256).save(next(run_paths(runs_dir)) / CONTROLLER)
+    with find_subject("night", runs_dir) as subject:
+        assert np.array_equal(subject.controller.parameters, parameters)
+        page = inspect(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
+    assert "a fresh drive by the run&#x27;s controller" in page

@@ -1,0 +1,59 @@
+"""The dream beside a drive: the same controller inside the model, which begins at the drive's own latent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.bundle import DREAM, Bundle
+from worker.dream.noise import Noise
+from worker.dream.world import check_temperature
+from worker.worldmodel.inference import DreamStep
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class DaydreamConfig:
+    """How it dreams, and after how many steps it looks at the drive again."""
+
+    temperature: float = 1.0
+    every: int = 100  # two seconds: by then a dream has left the track that is driven
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_temperature(self.temperature)
+
+
+class Daydream:
+    """One controller's dream, step by step beside its drive; needs no reward head."""
+
+    def __init__(self, bundle: Bundle, parameters: Floats, config: DaydreamConfig) -> None:
+        self._step = DreamStep(bundle)
+        self._noise = Noise(config.seed, self._step.latent_size)
+        self._parameters = parameters.astype(np.float32).reshape(1, -1)
+        self._config = config
+        self._over = True
+        self.since = 0  # the step of the drive at which this dream began
+
+    def follow(self, step: int, latent: Floats, state: Floats) -> Floats:
+        """The latent `(1, latent)` dreamt for this step of the drive; the drive's own where a dream begins.
+
+        `latent` and `state` are the drive's at this step, before it acts.
+        """
+        if self._over or step - self.since >= self._config.every:
+            self._latent, self._state, self.since = latent, state, step
+        dreamt = self._latent
+        uniform, normal = self._noise.next()
+        dream = self._step.step(
+            dreamt, self._parameters, self._state, uniform[None], normal[None], self._config.temperature
+        )
+        self._latent, self._state, self._over = dream.latent, dream.state, bool(dream.done[0] > 0.5)
+        return dreamt
+
+
+def can_dream(bundle: Bundle) -> bool:
+    """Whether the bundle has a step of the dream; those from before it do not."""
+    return DREAM in bundle.manifest.parts

@@ -1,0 +1,119 @@
+"""The whole look: from a bundle or a run to a folder of pictures and a page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from common.bundle import Bundle, find_bundle, shipped_bundles
+from common.controller import Controller
+from common.errors import BundleError, DatasetError, JournalError
+from common.runs import RunFolder, open_run
+from worker.dream.daydream import can_dream
+from worker.inspection import curves, memory, vision
+from worker.inspection.drive import Drive, DriveConfig, drive
+from worker.inspection.page import Page
+from worker.inspection.section import Section
+from worker.worldmodel.inference import Decoder
+
+PAGE = "index.html"
+DRIVEN = ("episodes", "frames", "held_out_episodes")  # of a bundle's provenance
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is looked at: a bundle; of a run, its controller once it has ended."""
+
+    bundle: Bundle
+    controller: Controller | None = None
+    run: RunFolder | None = None
+
+
+@contextmanager
+def find_subject(name: str, runs_dir: Path) -> Iterator[Subject]:
+    """A bundle by file or shipped name, else a run by name."""
+    if Path(name).is_file() or name in shipped_bundles():
+        yield Subject(find_bundle(name))
+        return
+    try:
+        run = open_run(runs_dir, name)
+    except JournalError as error:
+        shipped = ", ".join(shipped_bundles()) or "none"
+        raise BundleError(f"no bundle {name!r} (a file, or one that ships: {shipped}), and {error}") from error
+    with run:
+        bundle = Bundle.open(run.bundle_path)
+        if not run.controller_path.exists():
+            yield Subject(bundle, run=run)
+            return
+        controller = Controller.load(run.controller_path)
+        yield Subject(bundle.under(controller.shape), controller, run)
+
+
+def inspect(
+    subject: Subject, out: Path, config: DriveConfig, data: Path | None = None,
+    on_section: Callable[[int, str], None] = lambda _done, _name: None,
+) -> Path:  # fmt: skip
+    """Write a PNG a section and the page; returns the page's path."""
+    sections: list[Section] = []
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for section in sections_of(subject, config, data):
+            sections.append(section)
+            on_section(len(sections), section.name)
+            if section.picture is not None:
+                (out / f"{section.name}.png").write_bytes(section.picture)
+        title = f"{subject.bundle.manifest.name}, a world model"
+        about = f"{subject.bundle.path.name}, SHA-256 {subject.bundle.sha256}"
+        (out / PAGE).write_text(Page(title, about, facts(subject.bundle), sections).html())
+    except OSError as error:
+        raise DatasetError(f"cannot write in {out}: {error.strerror}; choose another --out") from error
+    return out / PAGE
+
+
+def sections_of(subject: Subject, config: DriveConfig, data: Path | None) -> Iterator[Section]:
+    """The sections of the page, each as it is drawn."""
+    if data is not None:
+        training = curves.losses(data)
+    bundle, decoder = subject.bundle, Decoder(subject.bundle)
+    driven = drive(bundle, subject.controller, config)
+    yield vision.reconstructions(driven, decoder)
+    yield vision.traversals(driven, decoder)
+    yield vision.moments(driven)
+    yield vision.samples(bundle.manifest.latent, decoder)
+    yield from _dreams(bundle, driven, decoder)
+    if subject.run is not None and (evolved := curves.fitness(subject.run)):
+        yield evolved
+    if data is not None:
+        yield from training
+
+
+def _dreams(bundle: Bundle, driven: Drive, decoder: Decoder) -> Iterator[Section]:
+    if not can_dream(bundle):
+        text = "This bundle is from before dreams; build it again with `dreamfleet bundle` to see one."
+        yield Section("dream", "A dream beside the drive", text)
+        return
+    yield memory.dream_beside(bundle, driven, decoder)
+    if bundle.manifest.models.get("mdnrnn", {}).get("reward", "none") != "none":
+        yield memory.rewards(bundle, driven)
+    if looked := memory.attention(bundle, driven):
+        yield looked
+
+
+def facts(bundle: Bundle) -> list[tuple[str, str]]:
+    """What the manifest tells: sizes, models, origin, and the figures of quality on held-out drives."""
+    manifest, provenance = bundle.manifest, bundle.manifest.provenance
+    model, quality = manifest.models.get("mdnrnn", {}), provenance.get("quality", {})
+    rows = [
+        ("pictures", " x ".join(str(size) for size in manifest.picture)),
+        ("latents", str(manifest.latent)),
+        ("hidden units", str(manifest.hidden)),
+        ("reward head", str(model.get("reward", "not told"))),
+        ("attention window", str(model.get("window", 0) or "none")),
+    ]
+    rows += [
+        (name, str(provenance[name])) for name in ("episodes", "frames", "held_out_episodes") if name in provenance
+    ]
+    rows += [(f"quality: {name}", str(value)) for name, value in quality.items()] if isinstance(quality, dict) else []
+    return [(name.replace("_", " "), value) for name, value in rows]

@@ -1,0 +1,53 @@
+"""Sections as one HTML page that needs no other file."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+from worker.inspection.section import Section
+
+STYLE = """
+body { margin: 2.5rem auto; max-width: 1100px; padding: 0 1.5rem; color: #1c2026; background: #fff;
+  font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; }
+h1 { margin-bottom: 0; } h2 { margin: 2.5rem 0 .3rem; border-top: 1px solid #d9dde3; padding-top: 1.2rem; }
+p { margin: .3rem 0 1rem; max-width: 75ch; } .about { color: #5b6470; overflow-wrap: anywhere; }
+img { display: block; width: 100%; }
+table { border-collapse: collapse; margin: 1.5rem 0; font-size: 15px; }
+th, td { text-align: left; padding: .3rem 1.5rem .3rem 0; border-bottom: 1px solid #d9dde3; font-weight: normal; }
+th { color: #5b6470; } td { font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
+"""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A title, what it is about, a table of facts, and sections."""
+
+    title: str
+    about: str
+    facts: Sequence[tuple[str, str]]
+    sections: Sequence[Section]
+
+    def html(self) -> str:
+        """The page; pictures are data URIs."""
+        rows = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>\n" for name, value in self.facts)
+        body = "".join(_section(each) for each in self.sections)
+        return (
+            f'<!doctype html>\n<html lang="en">\n<head><meta charset="utf-8"><title>{escape(self.title)}</title>\n'
+            f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>\n<body>\n'
+            f'<h1>{escape(self.title)}</h1>\n<p class="about">{escape(self.about)}</p>\n'
+            f"<table>\n{rows}</table>\n{body}</body>\n</html>\n"
+        )
+
+
+def _section(section: Section) -> str:
+    image = ""
+    if section.picture is not None:
+        data = b64encode(section.picture).decode()
+        image = f'<img alt="{escape(section.title)}" src="data:image/png;base64,{data}">\n'
+    return (
+        f'<section id="{escape(section.name)}">\n<h2>{escape(section.title)}</h2>\n<p>{escape(section.text)}</p>\n'
+        f"{image}</section>\n"
+    )

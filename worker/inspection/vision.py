@@ -1,0 +1,76 @@
+"""What the VAE keeps of a picture, and what its latents mean."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from worker.inspection.charts import FONT, heat, new_figure, picture_grid, png
+from worker.inspection.drive import Drive
+from worker.inspection.section import Section
+from worker.worldmodel.inference import Decoder
+
+SHOWN = 8  # pictures a row, latents a table
+TRAVERSED = np.linspace(-3, 3, 7)
+
+
+def reconstructions(drive: Drive, decoder: Decoder) -> Section:
+    """Pictures of the drive, and what the decoder makes of their means."""
+    steps = np.linspace(0, len(drive) - 1, SHOWN).astype(int)
+    decoded = decoder.decode(drive.mu)
+    difference = decoded.astype(np.float64) - drive.picture
+    error = (np.square(difference / 255)).sum(axis=(1, 2, 3)).mean()
+    rows = [("seen", drive.picture[steps]), ("decoded", decoded[steps])]
+    return Section(
+        "reconstructions", "What it sees, and what it keeps",
+        f"Pictures of a fresh drive by {drive.driver}, and the decoder's picture of each one's mean latent. "
+        f"Summed squared error a picture over all {len(drive)} steps: {error:.1f}.",
+        picture_grid(rows, [f"step {step}" for step in steps]),
+    )  # fmt: skip
+
+
+def traversals(drive: Drive, decoder: Decoder) -> Section:
+    """The most active latents, one moved at a time around a picture of the drive."""
+    step = drive.richest
+    base = drive.mu[step]
+    rows = []
+    for latent in drive.most_active[:SHOWN]:
+        moved = np.tile(base, (len(TRAVERSED), 1))
+        moved[:, latent] = TRAVERSED
+        rows.append((f"z{latent}\n{drive.nats[latent]:.1f} nats", decoder.decode(moved)))
+    return Section(
+        "traversals", "What a latent means",
+        "The latents that carry most on this drive, in nats. In each row one of them is set to -3 to 3, the others "
+        f"stay those of step {step}.",
+        picture_grid(rows, [f"{value:+.0f}" if value else "0" for value in TRAVERSED]),
+    )  # fmt: skip
+
+
+def moments(drive: Drive) -> Section:
+    """Mean and log variance of every latent over the drive."""
+    order, height = drive.most_active, 1.2 + 0.075 * drive.mu.shape[1]
+    figure, axes = new_figure(2 * height, 2, sharex=True)
+    most = float(np.abs(drive.mu).max())
+    heat(axes[0, 0], drive.mu[:, order].T, "mean", cmap="RdBu_r", vmin=-most, vmax=most)
+    heat(axes[1, 0], drive.logvar[:, order].T, "log variance", cmap="viridis")
+    for each in axes[:, 0]:
+        rows = range(0, len(order), max(1, len(order) // 16))
+        each.set_yticks(rows, [f"z{order[row]}" for row in rows], fontsize=FONT - 1)
+    axes[1, 0].set_xlabel("step of the drive", fontsize=FONT)
+    return Section(
+        "latents", "The latents of the drive",
+        "Mean and log variance that the encoder gives each latent at each step, the most active latent on top. A log "
+        "variance near 0 with a mean near 0 says nothing of the picture.",
+        png(figure),
+    )  # fmt: skip
+
+
+def samples(latent: int, decoder: Decoder) -> Section:
+    """Decodings of latents that no picture stands behind."""
+    normal = np.random.default_rng(0).standard_normal((SHOWN, latent)).astype(np.float32)
+    rows = [(f"N({mean}, 1)", decoder.decode(normal + np.float32(mean))) for mean in (0, -2, 2)]
+    return Section(
+        "samples", "Latents out of nothing",
+        "The decoder's pictures of random latents: where the latents of real pictures lie, N(0, 1) looks like the "
+        "track; far from them it need not.",
+        picture_grid(rows, [""] * SHOWN),
+    )  # fmt: skip
