@@ -30,6 +30,7 @@ class Wanted:
 
     work: Work
     order: int
+    queued: bool = False  # whether the queue names it, so that it does so once whatever its workers do
     holders: set[str] = field(default_factory=set)
     failed: dict[str, str] = field(default_factory=dict)  # worker -> error
     attempts: Counter[str] = field(default_factory=Counter)  # worker -> how often it failed there
@@ -309,7 +310,9 @@ class Fleet:
 
     def _enqueue(self, digest: bytes) -> None:
         wanted = self._wanted[digest]
-        heapq.heappush(self._queue, (wanted.in_slack, wanted.order, digest))
+        if not wanted.queued:
+            wanted.queued = True
+            heapq.heappush(self._queue, (wanted.in_slack, wanted.order, digest))
 
     def _assign(self) -> dict[str, list[Work]]:
         """One job at a time to the least loaded worker with credit, so that a generation's tail is spread evenly."""
@@ -321,8 +324,11 @@ class Fleet:
         while self._queue and loads:
             entry = heapq.heappop(self._queue)
             wanted = self._wanted.get(entry[2])
-            if wanted is None or wanted.holders:
-                continue  # answered meanwhile, or adopted again from a worker that came back
+            if wanted is None:
+                continue  # answered meanwhile
+            wanted.queued = False
+            if wanted.holders:
+                continue  # adopted again from a worker that came back
             if entry[0] and not self.hurry and self._in_slack >= self._slack_slots():
                 passed_over.append(entry)
                 break  # what waits for slack is last in the queue
@@ -339,7 +345,7 @@ class Fleet:
             if len(given[name]) >= self.members[name].credit:
                 del loads[name]
         for entry in passed_over:
-            heapq.heappush(self._queue, entry)
+            self._enqueue(entry[2])
         return given
 
     def _slack_slots(self) -> int:

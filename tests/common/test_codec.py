@@ -4,6 +4,7 @@ A new message's fixture is written by `python -m tests.common.test_codec`; one t
 """
 
 import dataclasses
+import gc
 import tracemalloc
 from pathlib import Path
 
@@ -169,6 +170,7 @@ def test_a_million_damaged_messages_never_raise_are_all_counted_and_leave_nothin
         assert sum(inbox.dropped.values()) + good == count
         assert len(inbox.dropped) < 20
         del inbox
+        gc.collect()
         held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     assert held[1] - held[0] < 100_000

@@ -2,9 +2,6 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import settings
-from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from common.messages import TAG_BYTES, Beat, Result, Running
 from coordinator.fleet import DEPARTURE_GRACE, SILENT_BEATS, Fleet
@@ -295,123 +292,6 @@ def test_the_job_of_a_worker_that_has_gone_quiet_is_copied_before_it_counts_as_l
     fleet.beat(B, beat(seen=9), 3.1)
     assert digests(fleet.dispatch(3.1), B) == [job]
     assert not fleet.members[A].silent
-
-
-@settings(max_examples=60, stateful_step_count=60, deadline=None)
-class AnyOrder(RuleBasedStateMachine):
-    """Workers that hold, lose and finish work while messages vanish; each job must count exactly once."""
-
-    def __init__(self):
-        super().__init__()
-        self.fleet = Fleet(BEAT)
-        self.now = 0.0
-        self.jobs = work(9) + work(3, "evaluate")
-        self.fleet.offer(self.jobs)
-        self.accepted = []
-        self.workers = {}  # name -> [seen, held digests, unacked]
-
-    names = st.sampled_from([A, B, "c/00000003"])
-
-    @rule(name=names)
-    def join(self, name):
-        self.fleet.welcome(name, 2, "f", self.now)
-        self.workers[name] = [0, [], []]
-
-    @rule(name=names)
-    def vanish(self, name):
-        if self.workers.pop(name, None) is not None:
-            self.fleet.depart(name, self.now)
-
-    @rule(name=names, heard=st.booleans(), steps=st.integers(0, 2000), rate=st.sampled_from([0.0, 1.0, 1000.0]))
-    def send_beat(self, name, heard, steps=0, rate=0.0):
-        if name in self.workers and heard:
-            seen, held, unacked = self.workers[name]
-            self.fleet.beat(
-                name,
-                beat(2, seen, queued=held[2:], running=held[:2], unacked=unacked, rate=rate, steps=steps),
-                self.now,
-            )
-
-    @rule(lost=st.sets(st.integers(0, 3)))
-    def dispatch(self, lost):
-        for index, send in enumerate(self.fleet.dispatch(self.now)):
-            worker = self.workers.get(send.identity)
-            if worker is None or index in lost or send.number > worker[0] + 1:
-                continue
-            if send.number == worker[0] + 1:
-                worker[0] += 1
-                worker[1] += [each.job.digest for each in send.content.work if each.job.digest not in worker[1]]
-                judged = {verdict.digest for verdict in send.content.verdicts}
-                worker[1] = [digest for digest in worker[1] if digest not in send.content.cancels]
-                worker[2] = [digest for digest in worker[2] if digest not in judged]
-
-    @rule(name=names, arrives=st.booleans(), twice=st.booleans())
-    def finish(self, name, arrives, twice):
-        if not self.workers.get(name, [0, [], []])[1]:
-            return
-        digest = self.workers[name][1].pop(0)
-        self.workers[name][2].append(digest)
-        for _ in range(arrives + (arrives and twice)):
-            self.deliver(name, digest)
-
-    @rule(name=names)
-    def repeat(self, name):
-        for digest in list(self.workers.get(name, [0, [], []])[2]):
-            self.deliver(name, digest)
-
-    def deliver(self, name, digest):
-        verdict, done = self.fleet.result(name, result(digest), self.now)
-        if verdict == "accepted":
-            self.accepted.append(done.job.digest)
-
-    @rule(seconds=st.floats(0.01, 3.0))
-    def wait(self, seconds):
-        self.now += seconds
-        self.fleet.tick(self.now)
-
-    @invariant()
-    def each_job_counts_at_most_once(self):
-        assert len(self.accepted) == len(set(self.accepted))
-        assert self.fleet.open + len(self.accepted) == len(self.jobs)
-
-    @invariant()
-    def at_most_two_hold_a_job(self):
-        for digest, wanted in self.fleet._wanted.items():
-            assert len(wanted.holders) <= 2
-            assert all(digest in self.fleet.members[holder].leases for holder in wanted.holders)
-
-    @invariant()
-    def held_evaluations_are_counted(self):
-        held = [each for each in self.fleet._wanted.values() if each.holders and each.work.job.kind == "evaluate"]
-        assert self.fleet._in_slack == len(held)
-
-    @invariant()
-    def credit_is_accounted(self):
-        for member in self.fleet.members.values():
-            assert len(member.leases) <= 2 * max(member.capacity, 2)
-            assert all(member.identity in self.fleet._wanted[digest].holders for digest in member.leases)
-
-    @precondition(lambda self: self.fleet.open)
-    @rule()
-    def a_faithful_worker_ends_it(self):
-        """From any state, one worker that loses nothing finishes everything."""
-        name = "z/0000000f"
-        self.join(name)
-        for _ in range(80):
-            self.now += BEAT
-            for other in [each for each in self.fleet.members if each != name]:
-                self.vanish(other)
-                self.fleet.depart(other, self.now)
-            self.send_beat(name, True)
-            self.fleet.tick(self.now)
-            self.dispatch(set())
-            while self.workers[name][1]:
-                self.finish(name, True, False)
-            self.dispatch(set())
-        assert self.fleet.open == 0
-
-
-TestAnyOrder = AnyOrder.TestCase
 
 
 @pytest.mark.parametrize("count", [3000])
