@@ -66,8 +66,8 @@ class Worker:
         self.fill()
 
     def fill(self):
-        while len(self.running) < SLOTS and len(self.outbox) <= 4 * SLOTS and (work := self.backlog.next()):
-            self.running.append(work[0].digest)
+        while len(self.running) < SLOTS and len(self.outbox) <= 4 * SLOTS and (work := self.backlog.take(1)):
+            self.running.append(work[0][0].digest)
 
 
 class AnyOrder(RuleBasedStateMachine):
