@@ -3,9 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from common.errors import BundleError, UsageError
+from common.errors import UsageError
 from common.messages import TaskSpec
-from tests.support.bundles import write_random_bundle
 from worker.dream.environment import CarRacingDream
 from worker.dream.scoring import Dreamer
 from worker.rollout import Course, rollout
@@ -62,9 +61,3 @@ def test_a_vector_that_is_no_controller_is_refused(dreaming, random_bundle):
     for wrong in (vector, vector[:-1]):
         with pytest.raises(UsageError, match="finite parameters"):
             dreaming.score([(wrong, 1)])
-
-
-def test_a_bundle_without_beginnings_is_refused(tmp_path, random_bundle):
-    empty = write_random_bundle(tmp_path / "empty.zip", initial=np.zeros((0, 2, 32), np.float32))
-    with pytest.raises(BundleError, match="a dream begins at recorded latents"):
-        Dreamer(empty, spec(empty))
