@@ -262,6 +262,17 @@ class AnyOrder(RuleBasedStateMachine):
         self.hello(name)
         self.beat(name)
 
+    @rule(finished=st.integers(0, 2))
+    def everybody_reconnects_in_turn(self, finished):
+        """A fleet of three behind a bad switch."""
+        for name in "abc":
+            if name not in self.hosts:
+                self.start_worker(name)
+                self.beat(name)
+        for name in "abc":
+            self.a_calm_second(finished)
+            self.reconnect(name, noticed=True)
+
     @rule(finished=st.integers(0, 2 * SLOTS))
     def a_calm_second(self, finished):
         """Everybody who is there beats, hears and works; what they have done stays on the wire."""
