@@ -14,7 +14,7 @@ from common.errors import NoDisplayError
 from worker.driving.pedals import Pedals
 
 FRAMES_PER_SECOND = 50  # CarRacing's
-BAR, NARROWEST = 64, 560  # pixels: what the text needs
+BAR, NARROWEST = 64, 640  # pixels: what the text needs
 BACKGROUND, INK, FAINT = (18, 20, 24), (235, 235, 235), (150, 155, 165)
 INVISIBLE = ("offscreen", "dummy")  # what SDL falls back to without a screen
 QUIT_KEYS = (pygame.K_ESCAPE, pygame.K_q)
@@ -68,7 +68,7 @@ class Window:
         fitting = picture if picture.get_size() == self._size else pygame.transform.scale(picture, self._size)
         self._screen.blit(fitting, (self._left, 0))
         top, rate = self._size[1], self._clock.get_fps()
-        pace = "over" if told.over else f"{rate:.0f} frames a second, {rate / FRAMES_PER_SECOND:.1f} x time"
+        pace = "over" if told.over else f"{rate:.0f} frames/s, {rate / FRAMES_PER_SECOND:.1f} x time"
         self._text(f"score {told.score:.1f}   step {told.step} of {told.steps}   {pace}", top + 10, self._large, INK)
         self._text("arrows or WASD: drive    R: again    Esc or Q: quit", top + 38, self._small, FAINT)
         caption = f"dreamfleet: {self._name}{', over' if told.over else ''}"

@@ -8,7 +8,7 @@ from common.errors import NoDisplayError, UsageError
 from worker.driving.driving import DrivingConfig, drive
 from worker.driving.pedals import Pedals
 from worker.driving.scene import Dream, Reality
-from worker.driving.window import Told, Window
+from worker.driving.window import BACKGROUND, Told, Window
 
 SEED = 20_003
 
@@ -102,7 +102,15 @@ def test_the_dream_is_shown_with_hard_pixels_and_its_score_below():
         assert pygame.display.get_caption()[0] == "dreamfleet: a dream, over"
         written = pygame.mask.from_threshold(shown.subsurface((0, 800, 800, 64)), (235, 235, 235), (9, 9, 9))
         assert written.count() > 100
-        assert written.get_bounding_rects()[-1].right < 560
+
+
+def test_the_longest_text_fits_the_narrowest_window():
+    with Window("a dream", (64, 64), 1) as window:
+        for _ in range(12):  # the clock tells a rate after ten frames
+            window.show(pygame.Surface((64, 64)), Told(-1234.5, 10_000, 10_000, over=False))
+        shown = pygame.display.get_surface()
+        right = shown.subsurface((shown.get_width() - 12, 64, 12, 64))
+        assert pygame.transform.average_color(right)[:3] == BACKGROUND
 
 
 def test_without_a_screen_it_says_so(monkeypatch, capsys):
