@@ -41,3 +41,7 @@ class RefusedError(DreamfleetError):
 
 class MissingExtraError(DreamfleetError):
     """A verb needs packages of an extra that is not installed."""
+
+
+class NoDisplayError(DreamfleetError):
+    """A verb opens a window, and there is no screen to open it on."""

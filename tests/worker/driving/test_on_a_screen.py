@@ -1,0 +1,58 @@
+"""The verb in a real window, under keys of a real (virtual) keyboard."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from tests.support.processes import DEADLINE, environment
+from worker.render.check import make_car_racing
+
+SEED, STEPS = 20_003, 60
+pytestmark = pytest.mark.skipif(
+    not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Debian's packages xvfb and xdotool"
+)
+
+
+@pytest.fixture
+def screen():
+    """The number of a virtual screen."""
+    read, write = os.pipe()
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x1024x24", "-nolisten", "tcp"]
+    with subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL) as server:
+        os.close(write)
+        with os.fdopen(read) as told:
+            number = told.readline().strip()
+        yield f":{number}"
+        server.terminate()
+
+
+def standing_still():
+    environment = make_car_racing(picture_only=True)
+    environment.reset(seed=SEED)
+    score = sum(float(environment.step([0.0, 0.0, 0.0])[1]) for _ in range(STEPS))
+    environment.close()
+    return score
+
+
+def test_a_person_drives_and_quits(screen, tmp_path):
+    seen = {**environment(tmp_path), "DISPLAY": screen, "SDL_VIDEODRIVER": "x11"}
+
+    def hand(*arguments):
+        subprocess.run(["xdotool", *arguments], env=seen, check=True, timeout=DEADLINE, stdout=subprocess.DEVNULL)
+
+    command = [sys.executable, "-m", "common.cli", "drive", "--seed", str(SEED), "--steps", str(STEPS)]
+    with subprocess.Popen([*command, "--scale", "0.3"], env=seen, stdout=subprocess.PIPE, text=True) as driving:
+        try:
+            hand("search", "--sync", "--onlyvisible", "--class", ".", "windowfocus", "--sync", "keydown", "Up")
+            said = driving.stdout.readline()  # of the episode's end
+            hand("keyup", "Up", "key", "q")
+            assert driving.wait(DEADLINE) == 0
+        finally:
+            driving.kill()
+    score, steps = re.search(r"score (\S+) in (\d+) steps, seed 20003", said).groups()
+    assert int(steps) == STEPS
+    assert float(score) > standing_still() + 5, "the car did not move"

@@ -1,0 +1,1 @@
+"""A person at the wheel, on the track or in the dream."""

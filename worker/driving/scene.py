@@ -1,0 +1,54 @@
+"""What is driven in, and its picture for a person."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+import pygame
+
+from common.bundle import Bundle
+from worker.dream.environment import CarRacingDream
+from worker.render.check import make_car_racing
+
+
+class Scene(Protocol):
+    """An environment that takes CarRacing's actions, and how it looks."""
+
+    name: str
+    scale: float  # that suits a screen
+    environment: gymnasium.Env[Any, Any]
+
+    def surface(self) -> pygame.Surface:
+        """The picture of now."""
+
+
+class Reality:
+    """CarRacing, drawn by gymnasium at the size it shows people: 1000x800."""
+
+    name, scale = "CarRacing", 1.0
+
+    def __init__(self, steps: int) -> None:
+        self.environment = make_car_racing(picture_only=True, render_mode="rgb_array", max_episode_steps=steps)
+
+    def surface(self) -> pygame.Surface:
+        """Gymnasium's own surface; what it returns is a smaller copy."""
+        self.environment.render()
+        inner: Any = self.environment.unwrapped
+        drawn: pygame.Surface = inner.surf
+        return drawn
+
+
+class Dream:
+    """A bundle's dream, decoded: 64x64."""
+
+    name, scale = "a dream", 10.0
+
+    def __init__(self, bundle: Bundle, temperature: float, steps: int) -> None:
+        self.environment: gymnasium.Env[Any, Any] = CarRacingDream(bundle, temperature, steps, "rgb_array")
+
+    def surface(self) -> pygame.Surface:
+        """The decoded latent."""
+        picture: Any = self.environment.render()
+        return pygame.surfarray.make_surface(np.transpose(picture, (1, 0, 2)))

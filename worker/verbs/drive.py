@@ -1,0 +1,41 @@
+"""`dreamfleet drive`: drive yourself."""
+
+from __future__ import annotations
+
+import argparse
+
+from common.errors import UsageError
+
+SUMMARY = "drive yourself by keyboard, on the track or in a world model's dream"
+EXTRAS = ("worker",)
+BUNDLE, TEMPERATURE = "tiny", 1.0
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("--dream", action="store_true", help="drive in the dream instead of in CarRacing")
+    parser.add_argument("--bundle", help=f"the world model that dreams: a file, or one that ships (default {BUNDLE})")
+    parser.add_argument("--temperature", type=float, help=f"of the dream (default {TEMPERATURE})")
+    parser.add_argument("--seed", type=int, help="the track, or the dream (default another each time)")
+    parser.add_argument("--steps", type=int, default=1000, help="steps until it is over (default 1000)")
+    parser.add_argument("--scale", type=float, help="enlarge the picture (default: 10 in the dream, 1 on the track)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Drive, and print each episode's score."""
+    if not args.dream and (args.bundle is not None or args.temperature is not None):
+        raise UsageError("--bundle and --temperature are of a dream: add --dream")
+    from common.bundle import find_bundle
+    from worker.driving.driving import DrivingConfig, drive, some_seed
+    from worker.driving.scene import Dream, Reality, Scene
+
+    config = DrivingConfig(some_seed() if args.seed is None else args.seed, args.steps, args.scale)
+    scene: Scene
+    if args.dream:
+        temperature = TEMPERATURE if args.temperature is None else args.temperature
+        scene = Dream(find_bundle(args.bundle or BUNDLE), temperature, config.steps)
+    else:
+        scene = Reality(config.steps)
+    for driven in drive(scene, config):
+        print(f"score {driven.score:.1f} in {driven.steps} steps, seed {config.seed}", flush=True)
+    return 0
