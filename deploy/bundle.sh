@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# A world model from nothing, in two rounds: random drives first, then drives of means that evolved on the first model,
-# their failures included. `bundle.sh FOLDER`; the amounts of the second round come from the environment.
+# A world model from nothing. `bundle.sh FOLDER` trains on random drives, ROUNDS=2 then on drives of means that evolved
+# on that model too, their failures included. Amounts come from the environment.
 set -euo pipefail
 data=${1:?usage: bundle.sh FOLDER}
 dreamfleet=${DREAMFLEET:-dreamfleet}
@@ -15,6 +15,10 @@ train() {
 
 "$dreamfleet" collect --data "$data" ${COLLECT_FLAGS:-}
 train "$data/first.zip"
+if [ "${ROUNDS:-1}" -lt 2 ]; then
+  mv "$data/first.zip" "$data/tiny.zip"
+  exit
+fi
 
 "$dreamfleet" coordinator --preset dream --bundle "$data/first.zip" --run collected --runs-dir "$data/runs" \
   --listen "$endpoint" --generations "$generations" --collect-every 2 --collect-episodes "$drives" ${RUN_FLAGS:-} &

@@ -21,6 +21,7 @@ def improvement(run):
 def test_the_demo_improves_on_zero_parameters_by_two_standard_errors(processes, seed):
     code, out, err = processes.call(
         "demo", "--run", "demo", "--runs-dir", processes.runs, "--seed", seed, "--port", processes.port, "--tracks", 1,
+        "--dream-minutes", 0,
         timeout=800,
     )  # fmt: skip
     assert code == 0, out + err
