@@ -22,7 +22,7 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     number = np.array([each.number for each in history])
     mean = np.array([each.mean for each in history])
     std = np.array([each.std for each in history])
-    figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
+    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
     dreamt = settings.task.task == DREAM
     axes.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label="± 1 standard deviation")
     axes.plot(number, mean, color="tab:blue", label="mean of the population")
@@ -44,7 +44,8 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     task, size = settings.task, f"{settings.population} candidates x {settings.episodes} episodes"
     axes.set(xlabel="generation", ylabel=f"fitness over {task.horizon} {'dreamt ' * dreamt}steps")
     axes.set_title(f"{run.name}: {task.task}, {size}, seed {settings.seed}", fontsize=11)
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(alpha=0.3)
-    axes.legend(*handles, loc="best", fontsize=9)
+    figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     figure.savefig(path, dpi=120)
     plt.close(figure)
