@@ -10,6 +10,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from common.runs import RunFolder
 
@@ -44,7 +45,7 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     task, size = settings.task, f"{settings.population} candidates x {settings.episodes} episodes"
     axes.set(xlabel="generation", ylabel=f"fitness over {task.horizon} {'dreamt ' * dreamt}steps")
     axes.set_title(f"{run.name}: {task.task}, {size}, seed {settings.seed}", fontsize=11)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     figure.savefig(path, dpi=120)

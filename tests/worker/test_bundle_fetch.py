@@ -4,6 +4,7 @@ import hashlib
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 
 import worker.bundle_fetch
@@ -13,6 +14,7 @@ from common.errors import BundleError
 from common.messages import MAX_PART
 from common.session import Network, open_session
 from tests.support import tasks
+from tests.support.bundles import npy
 from tests.support.hand import DEADLINE, Hand
 from tests.support.processes import free_port
 from worker.bundle_fetch import WINDOW, obtain
@@ -23,7 +25,8 @@ PARTS = 5
 
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory):
-    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "initial_latents.npy"), b"x")
+    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx"), b"x")
+    parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = Manifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
     content = hashlib.sha256(b"a").digest() * ((PARTS - 1) * MAX_PART // 32)
     return write_bundle(tmp_path_factory.mktemp("bundle") / "small.zip", manifest, {**parts, "policy.onnx": content})

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from common.bundle import POLICY, find_bundle
 from common.errors import BundleError, UsageError
 from tests.support.bundles import random_models, write_random_bundle
 from worker.tasks.api import find_task
 from worker.worldmodel import mdnrnn_config as mdnrnn
 from worker.worldmodel import vae_config as vae
-from worker.worldmodel.inference import Decoder, Encoder, PolicyStep, open_part
+from worker.worldmodel.inference import Decoder, Encoder, PolicyStep
 from worker.worldmodel.mdnrnn import MDNRNN, reward_labels
 from worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from worker.worldmodel.vae import VAE
@@ -113,21 +112,3 @@ def test_the_notebooks_label_is_one_where_nothing_is_gained_and_the_episode_goes
 def test_sizes_that_make_no_model_are_refused(make):
     with pytest.raises(UsageError):
         make()
-
-
-def test_a_bundle_of_the_first_format_gives_the_bits_of_its_own_graph():
-    bundle = find_bundle("tiny")
-    if bundle.manifest.models:
-        pytest.skip("what ships has the new graphs")
-    policy, graph, random = PolicyStep(bundle), open_part(bundle, POLICY), np.random.default_rng(5)
-    parameters = random.normal(0, 0.1, (3, 867)).astype(np.float32)
-    state, hidden, cell = policy.zero_state(3), *np.zeros((2, 3, 256), np.float32)
-    for _ in range(20):
-        picture = random.integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
-        action, state, latent = policy.step(picture, parameters, state)
-        names = ["action", "next_hidden", "next_cell", "latent"]
-        feed = {"picture": picture, "parameters": parameters, "hidden": hidden, "cell": cell}
-        expected, hidden, cell, seen = graph.run(names, feed)
-        assert np.array_equal(action, expected)
-        assert np.array_equal(latent, seen)
-        assert np.array_equal(state, np.concatenate([hidden, cell], axis=1))

@@ -65,8 +65,9 @@ class PolicyStep:
             expected = {"picture": [*manifest.picture], "parameters": [self.shape.size], "latent": [manifest.latent]}
             check_sizes(bundle, POLICY, session, expected)
             sizes = {each.name: each.shape for each in session.get_inputs()}
-            self._joined = "state" in sizes  # bundles from before it have `hidden` and `cell`
-            self.state_size = sizes["state"][1] if self._joined else 2 * self.hidden_size
+            if "state" not in sizes:
+                raise BundleError(f"{bundle.path.name} is from before models by configuration: build it again")
+            self.state_size = int(sizes["state"][1])
             self._run = session.run
         else:
             self._encoder, self._controllers = Encoder(bundle), Controllers(bundle)
@@ -79,12 +80,8 @@ class PolicyStep:
             latent, _ = self._encoder.encode(picture)
             action = self._controllers.act(parameters, latent, state)
             return Step(action, self._memory.advance(latent, action, state), latent)
-        feed = {"picture": picture, "parameters": parameters}
-        if self._joined:
-            return Step(*self._run(["action", "next_state", "latent"], {**feed, "state": state}))
-        feed |= {"hidden": state[:, : self.hidden_size], "cell": state[:, self.hidden_size :]}
-        action, hidden, cell, latent = self._run(["action", "next_hidden", "next_cell", "latent"], feed)
-        return Step(action, np.concatenate([hidden, cell], axis=1), latent)
+        feed = {"picture": picture, "parameters": parameters, "state": state}
+        return Step(*self._run(["action", "next_state", "latent"], feed))
 
     def zero_state(self, rows: int) -> Floats:
         """The state before the first step."""
