@@ -251,7 +251,8 @@ class Slot:
         threading.Thread(target=self._read, args=(self._pipe, self._life), daemon=True).start()
         waiting, self._turns = self._turns, deque()
         for turn in waiting:
-            self.submit([work for work in turn.work if work[0].digest not in turn.unwanted] or turn.work)
+            if wanted := [work for work in turn.work if work[0].digest not in turn.unwanted]:
+                self.submit(wanted)
 
     def _read(self, pipe: Connection[Any, Any], life: int) -> None:
         """In a thread of its own: pass on what the child says, until it is gone."""
