@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Not state: options and callbacks come from the constructor; the clock, the logger, archives and the last population,
-# which is large, change no sample.
+# Not state: options and callbacks come from the constructor; the clock, the logger, archives and the last population
+# with its fitness, which are large, change no sample.
 _SKIPPED = frozenset({
     "opts", "inopts", "_es_opts", "logger", "timer", "timer2", "_tell2_args", "sent_solutions", "archive", "randn",
     "repaired_solutions", "_injected_solutions_archive", "_stopdict", "callbackstop", "boundary_handler", "gp",
-    "_parameters", "params", "more_to_write", "best", "ary", "pop_sorted",
+    "_parameters", "params", "more_to_write", "best", "ary", "pop_sorted", "_is_independent_sample",
+    "fit.fit", "fit.bndpen",
 })  # fmt: skip
 _SCALARS = (bool, int, float, str, type(None), np.bool_, np.integer, np.floating)
 _MAX_DEPTH = 6
@@ -83,7 +84,7 @@ def _leaves(value: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str,
     """(path, owner, name, leaf) for every leaf below `value`."""
     for name, child in vars(value).items():
         path = f"{prefix}{name}"
-        if name in _SKIPPED or callable(child):
+        if name in _SKIPPED or path in _SKIPPED or callable(child):
             continue
         if _is_leaf(child):
             yield path, value, name, child

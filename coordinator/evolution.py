@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from common.errors import JournalError, UsageError
 from coordinator import cma_state
 
+CMA_VERSION = version("cma")
 Covariance = Literal["diagonal", "full"]
 
 
@@ -97,15 +98,17 @@ class Evolution:
         """Everything that the next `ask` depends on, as an `.npz`."""
         arrays = cma_state.dump(self._strategy)
         arrays["random"] = np.array(json.dumps(self._normals.generator.bit_generator.state))
-        arrays["cma"] = np.array(version("cma"))
+        arrays["cma"] = np.array(CMA_VERSION)
         return cma_state.pack(arrays)
 
     def restore(self, state: bytes) -> None:
         """Continue from `state`, written by a strategy of the same configuration and pycma version."""
         arrays = cma_state.unpack(state)
-        written, installed = str(arrays.pop("cma")), version("cma")
-        if written != installed:
-            raise JournalError(f"this run was written with cma {written}: pip install cma=={written} (now {installed})")
+        written = str(arrays.pop("cma"))
+        if written != CMA_VERSION:
+            raise JournalError(
+                f"this run was written with cma {written}: pip install cma=={written} (now {CMA_VERSION})"
+            )
         random = json.loads(str(arrays.pop("random")))
         if cma_state.untold(arrays):
             mean, _ = cma_state.mean_and_sigma(arrays)

@@ -174,8 +174,11 @@ class Fleet:
                 self.counts["silences"] += 1
                 self._release(member)
 
-    def dispatch(self, now: float) -> list[Send]:
-        """Batches to send now: verdicts, cancellations, jobs to credit, and what was not seen in time."""
+    def dispatch(self, now: float, *, durable: bool = True) -> list[Send]:
+        """Batches to send now: verdicts, cancellations, jobs to credit, and what was not seen in time.
+
+        Verdicts stay until everything so far is `durable`.
+        """
         given = self._assign()
         if not self._queue and not self.paused:
             for move in self._tail.plan(self._wanted, self.members, given, now):
@@ -189,13 +192,16 @@ class Fleet:
                     sent.at = now
                     self.counts["resent_batches"] += 1
                     sends.append(Send(member.identity, number, sent.content))
-            for content in pack(given.get(member.identity, []), member.cancels, member.verdicts):
+            verdicts = member.verdicts if durable else []
+            for content in pack(given.get(member.identity, []), member.cancels, verdicts):
                 member.number += 1
                 member.unseen[member.number] = Sent(content, now)
                 for work in content.work:
                     self._take(member, work.job.digest, Lease(member.number))
                 sends.append(Send(member.identity, member.number, content))
-            member.cancels, member.verdicts = [], []
+            member.cancels = []
+            if durable:
+                member.verdicts = []
         return sends
 
     @property

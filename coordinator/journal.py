@@ -36,11 +36,11 @@ class OpenGeneration:
 
 
 class Journal:
-    """Writes of one coordinator's life; nothing is durable before `commit`."""
+    """Writes of one coordinator's life: they wait in memory, in order, until `commit` or until something is read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._results: list[tuple[Any, ...]] = []  # accepted since the last commit
+        self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
         with _translated(path):
             self._connection = sqlite3.connect(path, timeout=5)
             try:
@@ -80,24 +80,22 @@ class Journal:
 
     def commit(self) -> None:
         """Make everything written so far durable."""
-        results, self._results = self._results, []
-        if results:
-            self._execute_many("INSERT INTO result VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", results)
+        self._flush()
         with _translated(self.path):
             self._connection.commit()
 
     def fact(self, key: str) -> str | None:
         """One of the run's facts, such as `uid` or `fingerprint`."""
-        row = self._execute("SELECT value FROM run WHERE key = ?", key).fetchone()
+        row = self._read("SELECT value FROM run WHERE key = ?", key).fetchone()
         return None if row is None else str(row[0])
 
     def set_fact(self, key: str, value: str) -> None:
         """Write one of the run's facts."""
-        self._execute("INSERT OR REPLACE INTO run VALUES (?, ?)", key, value)
+        self._write("INSERT OR REPLACE INTO run VALUES (?, ?)", key, value)
 
     def drop_fact(self, key: str) -> None:
         """Forget one of the run's facts."""
-        self._execute("DELETE FROM run WHERE key = ?", key)
+        self._write("DELETE FROM run WHERE key = ?", key)
 
     def begin_incarnation(self) -> int:
         """Number of this life of the coordinator, from 1; durable before anything is published."""
@@ -110,22 +108,22 @@ class Journal:
         self, number: int, state: bytes, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]
     ) -> None:
         """Write a population before it travels, and the strategy's state from before it was asked; two states stay."""
-        self._execute(
+        self._write(
             "INSERT INTO generation (number, seeds, opened, sigma) VALUES (?, ?, ?, ?)",
             number, json.dumps(list(seeds)), time(), sigma,
         )  # fmt: skip
         rows = [(number, index, vector) for index, vector in enumerate(vectors)]
-        self._execute_many("INSERT INTO candidate (generation, number, vector) VALUES (?, ?, ?)", rows)
-        self._execute("INSERT INTO strategy VALUES (?, ?)", number, state)
-        self._execute("DELETE FROM strategy WHERE generation < ?", number - 1)
+        self._write_all("INSERT INTO candidate (generation, number, vector) VALUES (?, ?, ?)", rows)
+        self._write("INSERT INTO strategy VALUES (?, ?)", number, state)
+        self._write("DELETE FROM strategy WHERE generation < ?", number - 1)
 
     def close_generation(self, closed: StoredGeneration, fitness: NDArray[np.float64]) -> None:
         """Write what the strategy is told."""
-        self._execute_many(
+        self._write_all(
             "UPDATE candidate SET fitness = ? WHERE generation = ? AND number = ?",
             [(float(value), closed.number, index) for index, value in enumerate(fitness)],
         )
-        self._execute(
+        self._write(
             "UPDATE generation SET closed = ?, mean = ?, std = ?, best = ?, worst = ?, steps = ?, seconds = ? "
             "WHERE number = ?",
             time(), closed.mean, closed.std, closed.best, closed.worst, closed.steps, closed.seconds, closed.number,
@@ -133,25 +131,26 @@ class Journal:
 
     def add_result(self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int) -> None:
         """Write an accepted result."""
-        self._results.append((
+        self._write(
+            "INSERT INTO result VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], result.fitness,
             result.steps, result.seconds, worker, fingerprint, incarnation,
-        ))  # fmt: skip
+        )  # fmt: skip
 
     def schedule_evaluation(self, evaluation: Evaluation) -> None:
         """Write that the mean of a generation is to be evaluated."""
-        self._execute(
+        self._write(
             "INSERT INTO evaluation (generation, vector, episodes) VALUES (?, ?, ?)",
             evaluation.generation, evaluation.vector, evaluation.episodes,
         )  # fmt: skip
 
     def finish_evaluation(self, generation: int, mean: float, std: float) -> None:
         """Write what an evaluation gave."""
-        self._execute("UPDATE evaluation SET mean = ?, std = ? WHERE generation = ?", mean, std, generation)
+        self._write("UPDATE evaluation SET mean = ?, std = ? WHERE generation = ?", mean, std, generation)
 
     def schedule_collection(self, collection: Collection) -> None:
         """Write that drives of a generation's mean are to be kept."""
-        self._execute(
+        self._write(
             "INSERT INTO collection (generation, vector, episodes) VALUES (?, ?, ?)",
             collection.generation, collection.vector, collection.episodes,
         )  # fmt: skip
@@ -159,16 +158,16 @@ class Journal:
     def collections(self) -> list[Collection]:
         """Everything that was scheduled to be kept, oldest first."""
         query = "SELECT generation, vector, episodes FROM collection ORDER BY generation"
-        return [Collection(*row) for row in self._execute(query)]
+        return [Collection(*row) for row in self._read(query)]
 
     def last_generation(self) -> OpenGeneration | None:
         """The generation that was open when the last incarnation ended; `None` in a new run."""
-        row = self._execute(
+        row = self._read(
             "SELECT number, state, seeds FROM generation JOIN strategy ON number = generation ORDER BY number DESC"
         ).fetchone()
         if row is None:
             return None
-        vectors = self._execute("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", row[0]).fetchall()
+        vectors = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", row[0]).fetchall()
         return OpenGeneration(row[0], row[1], tuple(json.loads(row[2])), tuple(vector for (vector,) in vectors))
 
     def closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
@@ -179,26 +178,38 @@ class Journal:
     def results_of(self, kind: str, generation: int) -> dict[bytes, tuple[float, int]]:
         """Fitness and steps of a generation's accepted results, by digest."""
         query = "SELECT digest, fitness, steps FROM result WHERE kind = ? AND generation = ?"
-        return {digest: (fitness, steps) for digest, fitness, steps in self._execute(query, kind, generation)}
+        return {digest: (fitness, steps) for digest, fitness, steps in self._read(query, kind, generation)}
 
     def pending_evaluations(self) -> list[Evaluation]:
         """Evaluations that were scheduled and not finished, oldest first."""
         query = "SELECT generation, vector, episodes FROM evaluation WHERE mean IS NULL ORDER BY generation"
-        return [Evaluation(*row) for row in self._execute(query)]
+        return [Evaluation(*row) for row in self._read(query)]
 
     def best_evaluation(self) -> tuple[int, float, bytes] | None:
         """(generation, mean, vector) of the best evaluated mean."""
         query = "SELECT generation, mean, vector FROM evaluation WHERE mean IS NOT NULL ORDER BY mean DESC, generation"
-        row: tuple[int, float, bytes] | None = self._execute(query).fetchone()
+        row: tuple[int, float, bytes] | None = self._read(query).fetchone()
         return row
 
-    def _execute(self, query: str, *values: Any) -> sqlite3.Cursor:
+    def _write(self, statement: str, *values: Any) -> None:
+        self._write_all(statement, [values])
+
+    def _write_all(self, statement: str, rows: list[tuple[Any, ...]]) -> None:
+        if self._writes and self._writes[-1][0] == statement:
+            self._writes[-1][1].extend(rows)
+        else:
+            self._writes.append((statement, rows))
+
+    def _flush(self) -> None:
+        writes, self._writes = self._writes, []
+        with _translated(self.path):
+            for statement, rows in writes:
+                self._connection.executemany(statement, rows)
+
+    def _read(self, query: str, *values: Any) -> sqlite3.Cursor:
+        self._flush()
         with _translated(self.path):
             return self._connection.execute(query, values)
-
-    def _execute_many(self, query: str, rows: Sequence[tuple[Any, ...]]) -> None:
-        with _translated(self.path):
-            self._connection.executemany(query, rows)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """A run's life: ask, dispatch, journal, tell. Owns the pure parts; knows no transport.
 
-Everything that happens is written before it counts: `advance` commits, and only then may batches leave.
+Everything that happens is durable before anybody is told that it counts: `commit` comes before the verdicts. The jobs
+of a generation may leave before it: a coordinator that dies in between asks for the same population again.
 """
 
 from __future__ import annotations
@@ -128,8 +129,9 @@ class Run:
             return
         self.uploads.add(worker, part, now)
 
-    def advance(self, now: float) -> None:
-        """Close what is complete, open what follows, and make all of it durable."""
+    def advance(self, now: float) -> bool:
+        """Close what is complete and open what follows; whether a generation was opened."""
+        closed = len(self.history)
         while self.ended is None and self.paused is None and self.generation.complete and not self.fleet.hurry:
             self._close(now)
         poison = self.fleet.poison()
@@ -140,6 +142,10 @@ class Run:
         self.uploads.tick(now)
         if self.fleet.hurry and not self._in_slack and self.ended is None:
             self._end(self._stop_reason() or "stopped")
+        return len(self.history) > closed
+
+    def commit(self) -> None:
+        """Make everything so far durable."""
         self._journal.commit()
 
     def pause(self, why: str) -> None:

@@ -150,15 +150,20 @@ class Service:
             self._drain_events()
             now = monotonic()
             self._run.fleet.tick(now)
-            self._run.advance(now)
-            for send in self._run.fleet.dispatch(now):
-                session.put(keys.job(self._name, send.identity), self._batch(send), encoding=encoding(JobBatch))
+            if self._run.advance(now):
+                self._put(session, self._run.fleet.dispatch(now, durable=False))  # workers need not wait for the disk
+            self._run.commit()
+            self._put(session, self._run.fleet.dispatch(now))
             self._publish_closed(session)
             self._write_notes()
             if self._draining and not self._run.fleet.leased:
                 self.stop()
             if now - taken >= SNAPSHOT_INTERVAL:
                 self._snapshot, taken = self._take_snapshot(), now
+
+    def _put(self, session: zenoh.Session, sends: list[Send]) -> None:
+        for send in sends:
+            session.put(keys.job(self._name, send.identity), self._batch(send), encoding=encoding(JobBatch))
 
     def _write_notes(self) -> None:
         notes = self._run.fleet.notes

@@ -69,6 +69,7 @@ def test_what_was_not_committed_never_happened(folder):
 def test_only_the_last_two_states_stay(journal):
     for number in range(5):
         journal.open_generation(number, b"s", 0.1, [number], VECTORS)
+    journal.commit()
     count = journal._connection.execute("SELECT count(*) FROM strategy").fetchone()[0]
     assert count == 2
 
@@ -122,8 +123,9 @@ def test_a_foreign_or_damaged_journal_is_refused_and_untouched(folder, damage, s
 
 def test_a_full_disk_is_a_clear_error(journal):
     journal._connection.execute("PRAGMA max_page_count = 20")
+    journal.open_generation(0, bytes(400_000), 0.1, [1], VECTORS)
     with pytest.raises(JournalError, match=r"cannot write .* full"):
-        journal.open_generation(0, bytes(400_000), 0.1, [1], VECTORS)
+        journal.commit()
 
 
 def test_an_unknown_run_names_those_that_exist(folder):

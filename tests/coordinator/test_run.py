@@ -36,13 +36,13 @@ class Bench:
     def begin(self):
         self.run = Run(self.journal, SETTINGS, LimitsConfig(generations=1), Fleet(1.0), self.now)
         self.run.advance(self.now)
+        self.run.commit()
         for name in (A, B):
             self.run.admit(HelloRequest(1, 1, "0", name, (SPEC.task,), "f", 1), self.now)
             self.beat(name)
 
     def restart(self):
         """Killed: what was not committed never was."""
-        self.journal._connection.rollback()
         self.journal.close()
         self.journal = Journal(self.path / "journal.sqlite")
         self.begin()
@@ -61,6 +61,7 @@ class Bench:
         batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,))
         self.run.results(name, batch, self.now)
         self.run.advance(self.now)
+        self.run.commit()
 
     def upload(self, name, part):
         self.run.upload(name, part, self.now)
@@ -112,6 +113,26 @@ def bench(tmp_path, random_bundle):
     made = Bench(tmp_path / "night", random_bundle.path)
     yield made
     made.journal.close()
+
+
+def test_a_death_between_the_jobs_and_the_commit_loses_no_bit(bench):
+    results = []
+    for send in bench.run.fleet.dispatch(bench.now):
+        for work in send.content.work:
+            results.append(Result(work.job.digest, float(work.job.candidate), 10, 0.1, None, None))
+            batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(results[-1],))
+            bench.run.results(send.identity, batch, bench.now)
+    assert bench.run.advance(bench.now)
+    early = bench.run.fleet.dispatch(bench.now, durable=False)
+    assert not any(send.content.verdicts for send in early)
+    opened = [work.vector for work in bench.run.generation.work]
+
+    bench.restart()
+    assert bench.run.generation.number == 0, "nothing was durable"
+    for result in results:  # without a verdict a worker says them again
+        bench.deliver(A, result)
+    assert [work.vector for work in bench.run.generation.work] == opened
+    assert {digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"} == {r.digest for r in results}
 
 
 def test_a_result_has_no_verdict_before_its_drive_is_on_disk(bench):
@@ -205,6 +226,7 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
             bench.now += what[0]
             bench.run.fleet.tick(bench.now)
             bench.run.advance(bench.now)
+            bench.run.commit()
         elif kind == "restart" and bench.run.ended is None:
             bench.restart()
         accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
