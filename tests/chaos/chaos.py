@@ -24,6 +24,7 @@ from common.errors import JournalError
 from common.runs import open_run
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
+from tests.support.hosts import new_host
 from tests.support.processes import processes_in
 from tests.support.relay import Relay
 
@@ -34,10 +35,11 @@ CALM = 120.0  # seconds without a new result that mean a hung run
 
 
 class Fleet:
-    """A coordinator and workers, each behind a relay of its own."""
+    """A coordinator and workers, each behind a relay of its own; the last one on a host of its own where allowed."""
 
-    def __init__(self, processes, bundle, generations, seed):
+    def __init__(self, processes, bundle, generations, seed, host):
         self.processes = processes
+        self._host = host
         self.random = random.Random(seed)
         self._settings = (
             "--listen", processes.endpoint, "--beat", "0.2", "--generations", generations, "--runs-dir", processes.runs,
@@ -48,22 +50,32 @@ class Fleet:
         )  # fmt: skip
         self.coordinator = processes.start("coordinator", "--run", "run", *self._settings, *self._first)
         self.coordinator.wait_for("incarnation")
-        self.relays = [Relay(processes.port) for _ in range(WORKERS)]
+        addresses = ["127.0.0.1"] * WORKERS
+        if host:
+            addresses[-1] = host.address
+        self.relays = [Relay(processes.port, address) for address in addresses]
         self.workers = [self._new_worker(number) for number in range(WORKERS)]
         self._healing = []
         self.faults = dict.fromkeys(self.kinds(), 0)
 
     def _new_worker(self, number):
+        inside = self._host.inside if self._host and number == WORKERS - 1 else ()
         return self.processes.worker(
-            "--run", "run", "--name", f"w{number}", "--task", tasks.COUNTED, endpoint=self.relays[number].endpoint
-        )
+            "--run", "run", "--name", f"w{number}", "--task", tasks.COUNTED,
+            endpoint=self.relays[number].endpoint, inside=inside,
+        )  # fmt: skip
 
     def kinds(self):
-        return ("kill_worker", "stop_worker", "cut", "hold", "slow", "kill_coordinator", "stop_coordinator")
+        """Of faults, and how often each comes."""
+        often = {
+            "kill_worker": 4, "stop_worker": 3, "cut": 3, "hold": 2, "slow": 1, "kill_coordinator": 2,
+            "stop_coordinator": 1,
+        }  # fmt: skip
+        return often | ({"unplug": 2} if self._host else {})
 
     def disturb(self):
         """One fault; what it needs to be undone comes later by itself."""
-        kind = self.random.choices(self.kinds(), weights=(4, 3, 3, 2, 1, 2, 1))[0]
+        kind = self.random.choices(*zip(*self.kinds().items(), strict=True))[0]
         number = self.random.randrange(WORKERS)
         getattr(self, kind)(number)
         self.faults[kind] += 1
@@ -101,6 +113,10 @@ class Fleet:
 
     def slow(self, number):
         self.relays[number].delay = self.random.choice([0.0, 0.02, 0.1])
+
+    def unplug(self, _number):
+        self._host.unplug()
+        self._later(self.random.uniform(0.2, 6), self._host.plug)
 
     def kill_coordinator(self, _number):
         self.coordinator.popen.kill()
@@ -140,7 +156,12 @@ def accepted(processes):
 
 def drive(processes, bundle, generations, faults, seed):
     """Run to the end under `faults` faults; what happened."""
-    fleet = Fleet(processes, bundle, generations, seed)
+    with new_host() as host:
+        fleet = Fleet(processes, bundle, generations, seed, host)
+        return _drive(fleet, processes, faults)
+
+
+def _drive(fleet, processes, faults):
     done = next_fault = 0
     moved = time.monotonic()
     try:

@@ -35,8 +35,8 @@ def environment(cache):
 class Process:
     """A verb running; its stderr lines can be waited for."""
 
-    def __init__(self, arguments, cache):
-        command = [sys.executable, "-m", "common.cli", *map(str, arguments)]
+    def __init__(self, arguments, cache, inside=()):
+        command = [*inside, sys.executable, "-m", "common.cli", *map(str, arguments)]
         self.popen = subprocess.Popen(
             command,
             env=environment(cache),
@@ -90,8 +90,9 @@ class Processes:
         self.cache = folder / "cache"
         self._started = []
 
-    def start(self, *arguments):
-        self._started.append(Process(arguments, self.cache))
+    def start(self, *arguments, inside=()):
+        """A verb, `inside` a host of its own if given the words that lead there."""
+        self._started.append(Process(arguments, self.cache, inside))
         return self._started[-1]
 
     def coordinator(self, *arguments, name="test"):
@@ -110,8 +111,9 @@ class Processes:
         process.wait_for("incarnation")
         return process
 
-    def worker(self, *arguments, endpoint=None):
-        return self.start("worker", "--connect", endpoint or self.endpoint, "--slots", "1", *arguments)
+    def worker(self, *arguments, endpoint=None, inside=()):
+        arguments = ("--connect", endpoint or self.endpoint, "--slots", "1", *arguments)
+        return self.start("worker", *arguments, inside=inside)
 
     def call(self, *arguments, timeout=DEADLINE):
         """Run a verb to its end: exit code, stdout, stderr."""

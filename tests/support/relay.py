@@ -14,15 +14,15 @@ RESET_ON_CLOSE = struct.pack("ii", 1, 0)
 class Relay:
     """Passes connections on to a port of this host."""
 
-    def __init__(self, target):
+    def __init__(self, target, address="127.0.0.1"):
         self.delay = 0.0  # seconds that every piece takes
         self._target = target
         self._flowing = threading.Event()
         self._flowing.set()
         self._pairs = []
         self.port = free_port()
-        self.endpoint = f"tcp/127.0.0.1:{self.port}"
-        self._server = socket.create_server(("127.0.0.1", self.port))
+        self.endpoint = f"tcp/{address}:{self.port}"
+        self._server = socket.create_server((address, self.port))
         self._threads = []
         self._run(self._accept)
 

@@ -1,0 +1,61 @@
+"""Workers on hosts of their own, one of whose cables is pulled."""
+
+import time
+
+import pytest
+
+from common.runs import open_run
+from tests.support import tasks
+from tests.support.hosts import new_host
+
+pytestmark = pytest.mark.timeout(300)
+GENERATIONS, POPULATION = 16, 8
+
+
+@pytest.fixture
+def hosts():
+    with new_host() as first, new_host() as second:
+        if second is None:
+            pytest.skip("network namespaces need root and iproute2")
+        yield first, second
+
+
+def fitness(processes, name):
+    with open_run(processes.runs, name) as run:
+        return [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
+
+
+def slots(processes):
+    return sum(status["slots"] for status in processes.statuses())
+
+
+def test_a_host_that_is_cut_off_costs_no_bit_and_comes_back(processes, hosts, random_bundle):
+    settings = (
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", POPULATION, "--episodes", 1,
+        "--generations", GENERATIONS, "--evaluate-every", 0,
+    )  # fmt: skip
+    near = [f"tcp/{host.address}:{processes.port}" for host in hosts]
+    coordinator = processes.start(
+        "coordinator", "--run", "two", "--runs-dir", processes.runs, "--beat", 0.2,
+        "--listen", processes.endpoint, *near, *settings,
+    )  # fmt: skip
+    coordinator.wait_for("incarnation")
+    for number, host in enumerate(hosts):
+        processes.worker(
+            "--run", "two", "--task", tasks.SLOW_TOY, "--name", f"h{number}", endpoint=near[number], inside=host.inside
+        ).wait_for("joined")
+    coordinator.wait_for("generation 1: mean")
+    hosts[0].unplug()
+    coordinator.wait_for("is silent")
+    hosts[0].plug()
+    deadline = time.monotonic() + 30
+    while slots(processes) < len(hosts):
+        assert time.monotonic() < deadline, "the host came back and its worker did not"
+    code, _ = coordinator.finish(120)
+    assert code == 0
+
+    alone = processes.coordinator(*settings, name="alone")
+    processes.worker("--run", "alone", "--task", tasks.SLOW_TOY, "--slots", 4)
+    code, _ = alone.finish(120)
+    assert code == 0
+    assert fitness(processes, "two") == fitness(processes, "alone")
