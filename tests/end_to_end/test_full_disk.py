@@ -1,8 +1,11 @@
 """A disk that fills up in the middle of a run."""
 
 import os
+import re
+import shutil
 import subprocess
 
+import numpy as np
 import pytest
 
 from common.runs import open_run
@@ -12,6 +15,9 @@ pytestmark = [
     pytest.mark.timeout(240),
     pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a small disk"),
 ]
+
+DRIVES = 30
+ROOM = 900_000  # bytes: for a while of journal, and not for a drive
 
 
 @pytest.fixture
@@ -25,6 +31,10 @@ def small_disk(tmp_path):
     subprocess.run(["umount", "--lazy", place], check=True)
 
 
+def resize(place, size):
+    subprocess.run(["mount", "-o", f"remount,size={size}", place], check=True)
+
+
 def test_a_full_disk_is_a_clear_error_and_with_more_room_the_run_goes_on(processes, random_bundle, small_disk):
     flags = ("--task", tasks.TOY, "--population", 64, "--episodes", 1, "--evaluate-every", 0, "--generations", 40)
     processes.runs = small_disk
@@ -36,7 +46,7 @@ def test_a_full_disk_is_a_clear_error_and_with_more_room_the_run_goes_on(process
     with open_run(small_disk, "small") as run:
         before = [(each.number, each.mean) for each in run.history()]
     assert before
-    subprocess.run(["mount", "-o", "remount,size=200m", small_disk], check=True)
+    resize(small_disk, 200 << 20)
     again = processes.start(
         "coordinator", "--resume", "small", "--runs-dir", small_disk, "--listen", processes.endpoint,
         "--beat", "0.2", "--generations", 40,
@@ -51,3 +61,31 @@ def test_a_full_disk_is_a_clear_error_and_with_more_room_the_run_goes_on(process
         history = [(each.number, each.mean) for each in one.history()]
         assert history[: len(before)] == before
         assert history == [(each.number, each.mean) for each in other.history()]
+
+
+def test_a_disk_that_fills_while_a_drive_is_written_keeps_whole_drives_only(processes, random_bundle, small_disk):
+    flags = (
+        "--task", tasks.HEAVY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 1,
+        "--collect-every", 1, "--collect-episodes", DRIVES,
+    )  # fmt: skip
+    processes.runs = small_disk
+    resize(small_disk, 200 << 20)
+    full = processes.coordinator("--bundle", random_bundle.path, *flags, name="small")
+    processes.worker("--task", tasks.HEAVY, "--run", "small")
+    full.wait_for("generation 0: mean")
+    resize(small_disk, shutil.disk_usage(small_disk).used + ROOM)
+    code, _ = full.finish(120)
+    assert code not in (0, 130)
+    assert re.search(r"cannot write .*rollouts/.*: No space left", full.lines[-1])
+    assert not list((small_disk / "small" / "rollouts").glob(".*")), "no half of a drive stays"
+    resize(small_disk, 200 << 20)
+    again = processes.start(
+        "coordinator", "--resume", "small", "--runs-dir", small_disk, "--listen", processes.endpoint, "--beat", "0.2",
+        "--generations", 1,
+    )  # fmt: skip
+    assert again.finish(120)[0] == 0
+    with open_run(small_disk, "small") as run:
+        assert len(run.rollouts()) == DRIVES
+        for path in run.rollouts():
+            with np.load(path) as drive:
+                assert len(drive["picture"]) == len(drive["action"])
