@@ -13,7 +13,7 @@ PIECE = 64  # steps drawn at once: a horizon of any length costs no more memory
 
 @dataclass(frozen=True)
 class Draw:
-    """One step's noise `(rows, latent)`: which mixture is chosen, and where in it."""
+    """Noise `(rows, latent)` of a step, or of steps: which mixture is chosen, and where in it."""
 
     uniform: Floats
     normal: Floats
@@ -34,15 +34,18 @@ class Noise:
         first: Floats = mu + np.exp(0.5 * logvar) * normal
         return first
 
+    def piece(self) -> Draw:
+        """Uniform and normal numbers of the next steps `(PIECE, latent)`."""
+        uniform = self._random.random((PIECE, self._latent), dtype=np.float32)
+        return Draw(uniform, self._random.standard_normal((PIECE, self._latent), dtype=np.float32))
+
     def next(self) -> tuple[Floats, Floats]:
         """Uniform and normal numbers `(latent,)` of the next step."""
         if self._left == 0:
-            self._uniform = self._random.random((PIECE, self._latent), dtype=np.float32)
-            self._normal = self._random.standard_normal((PIECE, self._latent), dtype=np.float32)
-            self._left = PIECE
+            self._piece, self._left = self.piece(), PIECE
         step = PIECE - self._left
         self._left -= 1
-        return self._uniform[step], self._normal[step]
+        return self._piece.uniform[step], self._piece.normal[step]
 
 
 class SharedNoise:
@@ -53,9 +56,15 @@ class SharedNoise:
         unique, self._episode = np.unique(seeds, return_inverse=True)
         self._sources = [Noise(int(seed), latent) for seed in unique]
         self.first = np.stack([source.begin(initial) for source in self._sources])[self._episode]
+        self._left = 0
 
     def next(self, rows: NDArray[np.int64]) -> Draw:
         """The next step's noise of the rows that still dream."""
-        uniform, normal = (np.stack(each) for each in zip(*(source.next() for source in self._sources), strict=True))
-        episode = self._episode[rows]
-        return Draw(uniform[episode], normal[episode])
+        if self._left == 0:
+            pieces = [source.piece() for source in self._sources]
+            self._uniform = np.stack([piece.uniform for piece in pieces], axis=1)
+            self._normal = np.stack([piece.normal for piece in pieces], axis=1)
+            self._left = PIECE
+        step, episode = PIECE - self._left, self._episode[rows]
+        self._left -= 1
+        return Draw(self._uniform[step].take(episode, axis=0), self._normal[step].take(episode, axis=0))
