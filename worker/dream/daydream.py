@@ -32,7 +32,7 @@ class Daydream:
 
     def __init__(self, bundle: Bundle, parameters: Floats, config: DaydreamConfig) -> None:
         self._step = DreamStep(bundle)
-        self._noise = Noise(config.seed, self._step.latent_size)
+        self._noise = Noise(config.seed, self._step.chance)
         self._parameters = parameters.astype(np.float32).reshape(1, -1)
         self._config = config
         self._over = True
@@ -46,9 +46,9 @@ class Daydream:
         if self._over or step - self.since >= self._config.every:
             self._latent, self._state, self.since = latent, state, step
         dreamt = self._latent
-        uniform, normal = self._noise.next()
+        draw = self._noise.next()
         dream = self._step.step(
-            dreamt, self._parameters, self._state, uniform[None], normal[None], self._config.temperature
+            dreamt, self._parameters, self._state, draw.uniform, draw.normal, self._config.temperature, draw.mask
         )
         self._latent, self._state, self._over = dream.latent, dream.state, bool(dream.done[0] > 0.5)
         return dreamt

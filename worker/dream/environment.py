@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from common.bundle import Bundle, find_bundle
-from worker.dream.noise import Draw, Noise
+from worker.dream.noise import Noise, side_by_side
 from worker.dream.world import DreamWorld
 from worker.worldmodel.inference import Decoder
 
@@ -54,14 +54,14 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         self._horizon = horizon
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
-        self.observation_space = latent_space(self._world.latent_size)
+        self.observation_space = latent_space(self._world.chance.latent)
         self.action_space = action_space()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Begin a dream; without a seed, one after the last."""
         super().reset(seed=seed, options=options)
         dream = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._noise = Noise(dream, self._world.latent_size)
+        self._noise = Noise(dream, self._world.chance)
         self._latent = self._noise.begin(self._world.initial)[None]
         self._state = self._world.begin(1)
         self._steps = 0
@@ -72,8 +72,7 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         given = np.asarray(action, dtype=np.float32).reshape(1, 3)
         if not np.isfinite(given).all():
             raise ValueError("an action must be three finite numbers")
-        uniform, normal = self._noise.next()
-        moment = self._world.imagine(self._latent, given, self._state, Draw(uniform[None], normal[None]))
+        moment = self._world.imagine(self._latent, given, self._state, self._noise.next())
         self._latent, self._state = moment.latent, moment.state
         self._steps += 1
         truncated = self._steps >= self._horizon
@@ -102,7 +101,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
-        self.single_observation_space = latent_space(self._world.latent_size)
+        self.single_observation_space = latent_space(self._world.chance.latent)
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -115,9 +114,9 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         seeds: list[int | None] = list(seed) if isinstance(seed, (list, tuple)) else [None] * self.num_envs
         if isinstance(seed, int):
             seeds = [seed + index for index in range(self.num_envs)]
-        self._latent = np.zeros((self.num_envs, self._world.latent_size), dtype=np.float32)
+        self._latent = np.zeros((self.num_envs, self._world.chance.latent), dtype=np.float32)
         self._state = self._world.begin(self.num_envs)
-        self._noise: list[Noise] = [Noise(0, 1)] * self.num_envs
+        self._noise: list[Noise] = [Noise(0, self._world.chance)] * self.num_envs
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.zeros(self.num_envs, dtype=bool)
         for index, each in enumerate(seeds):
@@ -128,8 +127,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self, actions: Floats
     ) -> tuple[Floats, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Dream one step under `actions` `(num_envs, 3)`."""
-        draws = [noise.next() for noise in self._noise]
-        draw = Draw(np.stack([uniform for uniform, _ in draws]), np.stack([normal for _, normal in draws]))
+        draw = side_by_side([noise.next() for noise in self._noise], axis=0).each(np.concatenate)
         given = np.asarray(actions, dtype=np.float32)
         moment = self._world.imagine(self._latent, given, self._state, draw)
         self._latent, self._state = moment.latent.copy(), moment.state.copy()
@@ -147,7 +145,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
 
     def _begin(self, index: int, seed: int | None) -> None:
         dream = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._noise[index] = Noise(dream, self._world.latent_size)
+        self._noise[index] = Noise(dream, self._world.chance)
         self._latent[index] = self._noise[index].begin(self._world.initial)
         self._state[index] = 0
         self._steps[index] = 0

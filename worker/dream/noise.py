@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from worker.worldmodel.inference import Chance
 
 Floats = NDArray[np.float32]
 PIECE = 64  # steps drawn at once: a horizon of any length costs no more memory
@@ -13,58 +17,80 @@ PIECE = 64  # steps drawn at once: a horizon of any length costs no more memory
 
 @dataclass(frozen=True)
 class Draw:
-    """Noise `(rows, latent)` of a step, or of steps: which mixture is chosen, and where in it."""
+    """Noise `(rows, latent)` of a step, or of several: which mixture is chosen, and where in it.
+
+    `mask` `(rows, hidden)` is the dropout of models that were trained with it: 0 or 1 / (1 - rate).
+    """
 
     uniform: Floats
     normal: Floats
+    mask: Floats | None = None
+
+    def each(self, change: Callable[[Floats], Floats]) -> Draw:
+        """Every part of it, changed."""
+        return Draw(change(self.uniform), change(self.normal), None if self.mask is None else change(self.mask))
+
+
+def side_by_side(draws: Sequence[Draw], axis: int) -> Draw:
+    """Draws of as many dreamers, joined along a new axis."""
+
+    def join(*parts: Floats) -> Floats:
+        return np.stack(parts, axis=axis)
+
+    masks: list[Any] = [draw.mask for draw in draws]
+    uniform, normal = join(*(draw.uniform for draw in draws)), join(*(draw.normal for draw in draws))
+    return Draw(uniform, normal, None if masks[0] is None else join(*masks))
 
 
 class Noise:
     """The noise of one episode, step after step, and its beginning."""
 
-    def __init__(self, seed: int, latent: int) -> None:
+    def __init__(self, seed: int, chance: Chance) -> None:
         self._random = np.random.Generator(np.random.PCG64(seed))
-        self._latent = latent
+        self._chance = chance
         self._left = 0
 
     def begin(self, initial: Floats) -> Floats:
         """A first latent `(latent,)` from recorded ones `(N, 2, latent)`, mu and logvar; to be called first."""
         mu, logvar = initial[self._random.integers(len(initial))]
-        normal = self._random.standard_normal(self._latent, dtype=np.float32)
+        normal = self._random.standard_normal(self._chance.latent, dtype=np.float32)
         first: Floats = mu + np.exp(0.5 * logvar) * normal
         return first
 
     def piece(self) -> Draw:
-        """Uniform and normal numbers of the next steps `(PIECE, latent)`."""
-        uniform = self._random.random((PIECE, self._latent), dtype=np.float32)
-        return Draw(uniform, self._random.standard_normal((PIECE, self._latent), dtype=np.float32))
+        """The noise of the next `PIECE` steps, a row each."""
+        latent, hidden, rate = self._chance
+        uniform = self._random.random((PIECE, latent), dtype=np.float32)
+        normal = self._random.standard_normal((PIECE, latent), dtype=np.float32)
+        if not rate:
+            return Draw(uniform, normal)
+        kept = self._random.random((PIECE, hidden), dtype=np.float32) >= rate
+        return Draw(uniform, normal, kept.astype(np.float32) / np.float32(1 - rate))
 
-    def next(self) -> tuple[Floats, Floats]:
-        """Uniform and normal numbers `(latent,)` of the next step."""
+    def next(self) -> Draw:
+        """The next step's noise, one row."""
         if self._left == 0:
             self._piece, self._left = self.piece(), PIECE
         step = PIECE - self._left
         self._left -= 1
-        return self._piece.uniform[step], self._piece.normal[step]
+        return self._piece.each(lambda part: part[step : step + 1])
 
 
 class SharedNoise:
     """The noise of rows that dream few episodes between them: drawn once an episode, given to each of its rows."""
 
-    def __init__(self, seeds: NDArray[np.int64], latent: int, initial: Floats) -> None:
+    def __init__(self, seeds: NDArray[np.int64], chance: Chance, initial: Floats) -> None:
         """`seeds` `(rows,)`: one a row."""
         unique, self._episode = np.unique(seeds, return_inverse=True)
-        self._sources = [Noise(int(seed), latent) for seed in unique]
+        self._sources = [Noise(int(seed), chance) for seed in unique]
         self.first = np.stack([source.begin(initial) for source in self._sources])[self._episode]
         self._left = 0
 
     def next(self, rows: NDArray[np.int64]) -> Draw:
         """The next step's noise of the rows that still dream."""
         if self._left == 0:
-            pieces = [source.piece() for source in self._sources]
-            self._uniform = np.stack([piece.uniform for piece in pieces], axis=1)
-            self._normal = np.stack([piece.normal for piece in pieces], axis=1)
+            self._pieces = side_by_side([source.piece() for source in self._sources], axis=1)
             self._left = PIECE
         step, episode = PIECE - self._left, self._episode[rows]
         self._left -= 1
-        return Draw(self._uniform[step].take(episode, axis=0), self._normal[step].take(episode, axis=0))
+        return self._pieces.each(lambda part: part[step].take(episode, axis=0))

@@ -39,7 +39,7 @@ class Dreamer:
         if parameters.shape[1] != self._size or not np.isfinite(parameters).all():
             raise UsageError(f"a dream needs controllers of {self._size} finite parameters")
         world, rows = self._world, np.arange(len(episodes))
-        noise = SharedNoise(np.array([seed for _, seed in episodes]), world.latent_size, world.initial)
+        noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.initial)
         fitness, steps = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
         latent, state, made = noise.first, world.begin(len(rows)), 0
         for _ in range(self._horizon):

@@ -41,7 +41,7 @@ class DreamWorld:
             raise BundleError(f"{bundle.path.name} predicts no reward: nothing can be scored in its dream")
         self._step = DreamStep(bundle)
         self._temperature = temperature
-        self.latent_size = self._step.latent_size
+        self.chance = self._step.chance
         self.initial = read_initial(bundle)
 
     def begin(self, rows: int) -> Floats:
@@ -50,11 +50,13 @@ class DreamWorld:
 
     def live(self, latent: Floats, parameters: Floats, state: Floats, draw: Draw) -> Moment:
         """Controllers `parameters` `(rows, size)` act on `latent` `(rows, latent)` and `state`; the dream goes on."""
-        return self._judge(self._step.step(latent, parameters, state, draw.uniform, draw.normal, self._temperature))
+        step = self._step.step
+        return self._judge(step(latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask))
 
     def imagine(self, latent: Floats, action: Floats, state: Floats, draw: Draw) -> Moment:
         """The dream goes on under given actions `(rows, actions)`."""
-        return self._judge(self._step.imagine(latent, action, state, draw.uniform, draw.normal, self._temperature))
+        step = self._step.imagine
+        return self._judge(step(latent, action, state, draw.uniform, draw.normal, self._temperature, draw.mask))
 
     def _judge(self, dream: Dream) -> Moment:
         told = dream.reward.astype(np.float64)

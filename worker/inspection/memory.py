@@ -33,12 +33,12 @@ def dream_latents(bundle: Bundle, drive: Drive, temperature: float, seed: int = 
     """The latents `(T, latent)` dreamt from the drive's first one under its actions."""
     check_temperature(temperature)
     model = DreamStep(bundle)
-    noise, latent, state = Noise(seed, model.latent_size), drive.mu[:1], model.zero_state(1)
+    noise, latent, state = Noise(seed, model.chance), drive.mu[:1], model.zero_state(1)
     latents = []
     for action in drive.action:
         latents.append(latent[0])
-        uniform, normal = noise.next()
-        dream = model.imagine(latent, action[None], state, uniform[None], normal[None], temperature)
+        draw = noise.next()
+        dream = model.imagine(latent, action[None], state, draw.uniform, draw.normal, temperature, draw.mask)
         latent, state = dream.latent, dream.state
     return np.stack(latents)
 
@@ -84,10 +84,9 @@ def rewards(bundle: Bundle, drive: Drive) -> Section:
 
 
 def _dreamt_rewards(world: DreamWorld, drive: Drive) -> list[float]:
-    noise, latent, state, told = Noise(0, world.latent_size), drive.mu[:1], world.begin(1), []
+    noise, latent, state, told = Noise(0, world.chance), drive.mu[:1], world.begin(1), []
     for action in drive.action:
-        uniform, normal = noise.next()
-        moment = world.imagine(latent, action[None], state, Draw(uniform[None], normal[None]))
+        moment = world.imagine(latent, action[None], state, noise.next())
         told.append(float(moment.reward[0]))
         latent, state = moment.latent, moment.state
     return told

@@ -144,6 +144,14 @@ class Dream(NamedTuple):
     done: Floats
 
 
+class Chance(NamedTuple):
+    """How much chance one step of a dream takes: numbers a row, and the rate of dropout; 0: none."""
+
+    latent: int
+    hidden: int
+    dropout: float
+
+
 class DreamStep:
     """Controller and MDN-RNN, which dreams the next latent."""
 
@@ -163,7 +171,8 @@ class DreamStep:
         self.hidden_size = bundle.manifest.hidden
         self.state_size: int = sizes["state"][1]
         self.latent_size: int = sizes["latent"][1]
-        self.takes_mask = "mask" in sizes
+        dropout = float(manifest.models["mdnrnn"]["dropout"]) if "mask" in sizes else 0.0
+        self.chance = Chance(self.latent_size, self.hidden_size, dropout)
 
     def step(
         self, latent: Floats, parameters: Floats, state: Floats, uniform: Floats, normal: Floats,
@@ -184,7 +193,7 @@ class DreamStep:
         """Dream on under these actions `(N, actions)`."""
         feed = {"latent": latent, "action": action, "state": state, "uniform": uniform, "normal": normal}
         feed["temperature"] = np.array([temperature], dtype=np.float32)
-        if self.takes_mask:
+        if self.chance.dropout:
             feed["mask"] = np.ones((len(latent), self.hidden_size), np.float32) if mask is None else mask
         given = dict(zip(self._names, self._run(self._names, feed), strict=True))
         none = np.zeros(len(latent), dtype=np.float32)
@@ -204,7 +213,7 @@ class DreamStep:
         if len(self._idle.get("uniform", "")) != len(latent):
             zeros = np.zeros((len(latent), self.latent_size), dtype=np.float32)
             self._idle = {"uniform": zeros, "normal": zeros, "temperature": np.ones(1, np.float32)}
-            if self.takes_mask:
+            if self.chance.dropout:
                 self._idle["mask"] = np.ones((len(latent), self.hidden_size), np.float32)
         feed = {**self._idle, "latent": latent, "action": action, "state": state}
         (found,) = self._run([output], feed, self._only)

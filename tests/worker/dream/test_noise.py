@@ -1,13 +1,18 @@
 import numpy as np
 
 from worker.dream.noise import PIECE, Noise, SharedNoise
+from worker.worldmodel.inference import Chance
 
 INITIAL = np.random.default_rng(0).normal(size=(5, 2, 3)).astype(np.float32)
 
 
 def drawn(seed, steps):
-    noise = Noise(seed, 3)
-    return [noise.begin(INITIAL), *(each for _ in range(steps) for each in noise.next())]
+    noise, drawn = Noise(seed, Chance(3, 4, 0.0)), []
+    drawn.append(noise.begin(INITIAL))
+    for _ in range(steps):
+        draw = noise.next()
+        drawn += [draw.uniform[0], draw.normal[0]]
+    return drawn
 
 
 def test_it_is_a_function_of_the_seed():
@@ -17,19 +22,30 @@ def test_it_is_a_function_of_the_seed():
 
 
 def test_the_choice_of_a_mixture_is_uniform_and_the_rest_normal():
-    noise = Noise(3, 1000)
+    noise = Noise(3, Chance(1000, 1, 0.0))
     noise.begin(np.zeros((1, 2, 1000), np.float32))
-    uniform, normal = noise.next()
-    assert 0 <= uniform.min() < 0.01 < 0.99 < uniform.max() < 1
-    assert abs(normal.mean()) < 0.15
-    assert 0.9 < normal.std() < 1.1
+    draw = noise.next()
+    assert 0 <= draw.uniform.min() < 0.01 < 0.99 < draw.uniform.max() < 1
+    assert abs(draw.normal.mean()) < 0.15
+    assert 0.9 < draw.normal.std() < 1.1
+    assert draw.mask is None
 
 
 def test_rows_of_one_seed_share_their_noise_whichever_rows_still_dream():
-    shared = SharedNoise(np.array([7, 8, 7, 9]), 3, INITIAL)
+    shared = SharedNoise(np.array([7, 8, 7, 9]), Chance(3, 4, 0.0), INITIAL)
     assert np.array_equal(shared.first[0], shared.first[2])
     assert np.array_equal(shared.first[1], drawn(8, 0)[0])
     shared.next(np.arange(4))
     later = shared.next(np.array([1, 2]))
     assert np.array_equal(later.uniform[0], drawn(8, 2)[3])
     assert np.array_equal(later.normal[1], drawn(7, 2)[4])
+
+
+def test_dropout_keeps_the_mean_and_is_shared_too():
+    chance = Chance(3, 1000, 0.25)
+    shared, alone = SharedNoise(np.array([7, 8]), chance, INITIAL), Noise(8, chance)
+    alone.begin(INITIAL)
+    mask = shared.next(np.array([1])).mask
+    assert np.array_equal(mask, alone.next().mask)
+    assert set(np.unique(mask)) == {np.float32(0), np.float32(1) / np.float32(0.75)}
+    assert abs(mask.mean() - 1) < 0.1

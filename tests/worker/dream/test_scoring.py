@@ -5,10 +5,12 @@ import pytest
 
 from common.errors import UsageError
 from common.messages import TaskSpec
+from tests.support.bundles import write_random_bundle
 from worker.dream.environment import CarRacingDream
 from worker.dream.scoring import Dreamer
 from worker.rollout import Course, rollout
 from worker.tasks.dream import DreamPolicy
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
 HORIZON = 20
 
@@ -41,6 +43,17 @@ def test_the_environment_dreams_the_same_bits(dreaming, random_bundle):
     for vector, seed in zip(candidates(random_bundle, 3), (5, 6, 7), strict=True):
         (batched,) = dreaming.score([(vector, seed)])
         assert rollout(environment, DreamPolicy(random_bundle), vector, Course(seed, HORIZON)) == batched
+
+
+def test_dropout_is_part_of_the_dream_and_changes_no_promise(tmp_path):
+    bundle = write_random_bundle(tmp_path / "b.zip", rnn=MDNRNNConfig(dropout=0.3))
+    dreamer, environment = Dreamer(bundle, spec(bundle)), CarRacingDream(bundle, temperature=1.3, horizon=HORIZON)
+    dreams = [(vector, seed) for vector in candidates(bundle, 3) for seed in (1, 2)]
+    together = dreamer.score(dreams)
+    assert [dreamer.score([dream])[0] for dream in dreams] == together
+    assert [
+        rollout(environment, DreamPolicy(bundle), vector, Course(seed, HORIZON)) for vector, seed in dreams
+    ] == together
 
 
 def test_steps_are_told_as_they_are_made(dreaming, random_bundle):
