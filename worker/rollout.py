@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.drive import Drive
-from worker.tasks.api import Policy, Rewarded, Score
+from worker.tasks.api import Policy, Score
 
 IDLE_COST = 0.1  # CarRacing's own cost of a step
 
@@ -43,7 +43,8 @@ def rollout(
         raise ValueError("the controller's parameters hold NaN or infinity")
     observation, _ = environment.reset(seed=course.seed)
     policy.begin(parameters)
-    rewarded = policy if isinstance(policy, Rewarded) else None
+    # Of a `Rewarded` policy; to ask `isinstance` of a protocol takes 70 microseconds, as long as some tasks' steps.
+    tell: Callable[[float], None] | None = getattr(policy, "reward", None)
     fitness, idle, steps, ended = 0.0, 0, 0, False
     while steps < course.horizon and not ended:
         action, seen = policy.act(observation), observation
@@ -51,8 +52,8 @@ def rollout(
         if drive is not None:
             drive.add(seen, action, float(reward))
         fitness += float(reward)
-        if rewarded is not None:
-            rewarded.reward(float(reward))
+        if tell is not None:
+            tell(float(reward))
         steps += 1
         on_step(steps)
         ended = bool(terminated or truncated)

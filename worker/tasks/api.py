@@ -33,7 +33,6 @@ class Policy(Protocol):
         """The environment's next action."""
 
 
-@runtime_checkable
 class Rewarded(Protocol):
     """A policy that also wants to know what its actions bring; a policy need not."""
 
