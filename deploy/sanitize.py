@@ -35,7 +35,8 @@ def drive(steps: int) -> None:
     from worker.render.environment import CarRacing, _native
 
     random = np.random.default_rng(0)
-    environments = [CarRacing(domain_randomize=bool(i % 2), picture_only=i == 2) for i in range(3)]
+    kinds = ("raw-96", "raw-96", "box-64")
+    environments = [CarRacing(domain_randomize=bool(i % 2), preprocessing=kind) for i, kind in enumerate(kinds)]
     done = episode = 0
     while done < steps:
         environment = environments[episode % 3]

@@ -8,7 +8,7 @@ import numpy as np
 import pygame
 from numpy.typing import NDArray
 
-SIDE = 192  # of the small pictures, three times their size
+SIDE = 192  # of the small pictures: three times or twice their size
 MARGIN, LABEL, GAP = 8, 22, 10
 BACKGROUND, INK, FAINT = (18, 20, 24), (235, 235, 235), (150, 155, 165)
 BARS = (("steer", (120, 170, 255)), ("gas", (110, 210, 120)), ("brake", (240, 110, 100)))

@@ -30,7 +30,7 @@ class Drive:
         self._rewards.append(reward)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Of T steps: `picture` (T, 64, 64, 3) before each `action` (T, 3), then `reward` (T,)."""
+        """Of T steps: `picture` (T, side, side, 3) before each `action` (T, 3), then `reward` (T,)."""
         return {
             "picture": np.stack(self._pictures),
             "action": np.stack(self._actions),

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import av
-import gymnasium
 
 from common.bundle import Bundle
 from common.controller import Controller
 from common.errors import DatasetError, UsageError
 from worker.canvas import AWAKE, DREAMING, Canvas, Dreamt, Layout, Moment
 from worker.dream.daydream import Daydream, DaydreamConfig, can_dream
-from worker.tasks.car_racing import ENVIRONMENT, CarRacingPolicy, PictureObservation
+from worker.tasks.car_racing import CarRacing
 from worker.worldmodel.inference import Decoder
 
 FRAMES_PER_SECOND = 50  # CarRacing's own
@@ -32,8 +31,9 @@ def record(
     """
     if controller.task not in TASKS:
         raise UsageError(f"only {' and '.join(TASKS)} can be recorded, not {controller.task}")
-    environment = PictureObservation(gymnasium.make(ENVIRONMENT, render_mode="rgb_array"))
-    policy, decoder = CarRacingPolicy(bundle), Decoder(bundle)
+    task = CarRacing()
+    environment = task.make_judge(bundle, "rgb_array")
+    policy, decoder = task.make_policy(bundle), Decoder(bundle)
     daydream = None
     if can_dream(bundle):
         daydream = Daydream(bundle, controller.parameters, dreaming or DaydreamConfig(seed=seed))

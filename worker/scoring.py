@@ -25,7 +25,7 @@ class Scorer:
         fitting = bundle.under(spec.controller)
         self._spec = spec
         self._batch = task.make_batch(fitting, spec) if isinstance(task, Batched) and not judge else None
-        self._environment = task.make_judge() if judge else task.make_environment()
+        self._environment = task.make_judge(fitting) if judge else task.make_environment(fitting)
         self._policy = task.make_policy(fitting)
         self._preprocessing = bundle.manifest.preprocessing
 

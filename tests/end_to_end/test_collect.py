@@ -14,7 +14,7 @@ from common.runs import open_run
 from common.seeds import collection_seed
 from common.session import Network, open_session
 from tests.support import tasks
-from worker.tasks.preprocessing import PREPROCESSING
+from worker.tasks.preprocessing import BOX
 from worker.training.dataset import episodes, load_pictures
 
 pytestmark = pytest.mark.timeout(240)
@@ -129,9 +129,9 @@ def test_drives_of_the_real_car_are_episodes_that_a_data_set_takes_in_once(proce
         assert [path.read_bytes() for path in run.rollouts()] == [path.read_bytes() for path in episodes(data)]
     for path in episodes(data):
         pictures = load_pictures(path)
-        assert pictures.shape == (30, 64, 64, 3)
+        assert pictures.shape == (30, *BOX.shape)
         assert pictures.dtype == np.uint8
         with np.load(path) as drive:
             assert drive["action"].shape == (30, 3)
-            assert str(drive["preprocessing"]) == PREPROCESSING
+            assert str(drive["preprocessing"]) == BOX.name
             assert not drive["ended"]

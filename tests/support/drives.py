@@ -2,22 +2,22 @@
 
 import numpy as np
 
-from worker.tasks.preprocessing import PREPROCESSING
+from worker.tasks.preprocessing import preprocessing_to
 from worker.training.collect import episode_path
 
 
-def write_drive(folder, number, steps=12):
+def write_drive(folder, number, steps=12, picture=64):
     """One episode of noise under a moving bar, with a tile now and then."""
     random = np.random.default_rng(number)
-    pictures = random.integers(0, 60, (steps, 64, 64, 3), dtype=np.uint8)
+    pictures = random.integers(0, 60, (steps, picture, picture, 3), dtype=np.uint8)
     for step in range(steps):
-        pictures[step, :, (3 * step + number) % 64] = 255
+        pictures[step, :, (3 * step + number) % picture] = 255
     path = episode_path(folder, number)
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
         path, picture=pictures, action=random.uniform(0, 1, (steps, 3)).astype(np.float32),
         reward=np.where(np.arange(steps) % 3 == 0, 3.4, -0.1).astype(np.float32), ended=np.array(False),
-        driver=np.array("held"), preprocessing=np.array(PREPROCESSING),
+        driver=np.array("held"), preprocessing=np.array(preprocessing_to(picture).name),
     )  # fmt: skip
     return path
 

@@ -53,11 +53,11 @@ class Toy:
     width = 1
     seconds = 0.0
 
-    def make_environment(self):
+    def make_environment(self, bundle):
         return ToyEnvironment(self.seconds)
 
-    def make_judge(self):
-        return self.make_environment()
+    def make_judge(self, bundle):
+        return self.make_environment(bundle)
 
     def make_policy(self, bundle):
         return ToyPolicy()
@@ -123,8 +123,8 @@ class Judged(Toy):
 
     name = JUDGED
 
-    def make_judge(self):
-        return gymnasium.wrappers.TransformReward(self.make_environment(), lambda reward: reward + 100)
+    def make_judge(self, bundle):
+        return gymnasium.wrappers.TransformReward(self.make_environment(bundle), lambda reward: reward + 100)
 
 
 class Counted(Toy):
@@ -132,7 +132,7 @@ class Counted(Toy):
 
     name = COUNTED
 
-    def make_environment(self):
+    def make_environment(self, bundle):
         return CountedEnvironment(0.001)
 
 
@@ -154,7 +154,7 @@ class Heavy(Toy):
 
     name = HEAVY
 
-    def make_environment(self):
+    def make_environment(self, bundle):
         return HeavyEnvironment()
 
 

@@ -26,7 +26,9 @@ def controller(random_bundle):
 def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
     task = find_task(tasks.JUDGED)
     alone = {
-        seed: rollout(task.make_judge(), task.make_policy(None), controller().parameters, Course(seed, 10**6)).fitness
+        seed: rollout(
+            task.make_judge(None), task.make_policy(None), controller().parameters, Course(seed, 10**6)
+        ).fitness
         for seed in SEEDS
     }
     for jobs in (1, 2):

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from worker.tasks.preprocessing import picture
+from common.errors import UsageError
+from worker.tasks.preprocessing import BOX, RAW, find_preprocessing, preprocessing_to
 
 
 def overlap(target, step, source, unit):
@@ -21,15 +22,30 @@ def slow_picture(observation):
 @pytest.mark.parametrize("seed", range(5))
 def test_the_picture_is_the_exact_integer_box_filter(seed):
     observation = np.random.default_rng(seed).integers(0, 256, (96, 96, 3), dtype=np.uint8)
-    assert np.array_equal(picture(observation), slow_picture(observation))
+    assert np.array_equal(BOX.picture(observation), slow_picture(observation))
 
 
 @pytest.mark.parametrize("value", [0, 1, 127, 254, 255])
 def test_a_plain_colour_stays(value):
-    assert (picture(np.full((96, 96, 3), value, np.uint8)) == value).all()
+    assert (BOX.picture(np.full((96, 96, 3), value, np.uint8)) == value).all()
 
 
 def test_the_indicator_bar_is_not_seen():
     observation = np.zeros((96, 96, 3), np.uint8)
     observation[84:] = 255
-    assert (picture(observation) == 0).all()
+    assert (BOX.picture(observation) == 0).all()
+
+
+def test_the_raw_picture_is_the_whole_observation():
+    observation = np.random.default_rng(0).integers(0, 256, (96, 96, 3), dtype=np.uint8)
+    assert np.array_equal(RAW.picture(observation), observation)
+
+
+def test_a_preprocessing_is_found_by_name_and_by_size():
+    for each in (BOX, RAW):
+        assert find_preprocessing(each.name) is preprocessing_to(each.size) is each
+        assert each.picture(np.zeros((96, 96, 3), np.uint8)).shape == each.shape
+    with pytest.raises(UsageError, match=r"'bilinear-64'.*box-64, raw-96"):
+        find_preprocessing("bilinear-64")
+    with pytest.raises(UsageError, match="64 or 96 pixels wide, not 32"):
+        preprocessing_to(32)

@@ -26,7 +26,7 @@ def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_
     told = []
     score = record(controller, random_bundle, SEED, STEPS, tmp_path / "new" / "drive.mp4", on_step=told.append)
     task = find_task("car-racing")
-    judge = task.make_judge()
+    judge = task.make_judge(random_bundle)
     driven = rollout(judge, task.make_policy(random_bundle), controller.parameters, Course(SEED, STEPS))
     judge.close()
     assert score == driven.fitness

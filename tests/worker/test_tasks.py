@@ -6,10 +6,12 @@ from common.bundle import Manifest, write_bundle
 from common.errors import BundleError, ControllerError, UsageError
 from common.messages import TaskSpec
 from tests.support import tasks
-from tests.support.bundles import npy
+from tests.support.bundles import npy, write_random_bundle
 from worker.scoring import Scorer
 from worker.tasks.api import find_task, known_tasks
-from worker.tasks.preprocessing import picture
+from worker.tasks.preprocessing import BOX, RAW
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from worker.worldmodel.vae_config import VAEConfig
 
 
 def test_car_racing_is_registered():
@@ -30,24 +32,48 @@ def test_an_unknown_task_is_an_error_that_says_which_there_are(name, says):
         find_task(name)
 
 
-def test_a_bundle_of_another_task_is_refused(tmp_path):
+@pytest.mark.parametrize("task", ["car-racing", "dream"])
+@pytest.mark.parametrize(
+    ("of", "preprocessing", "shape"),
+    [
+        ("moon", "box-64", (64, 64, 3)),
+        ("car-racing", "none", (64, 64, 3)),
+        ("car-racing", "raw-96", (64, 64, 3)),
+        ("car-racing", "box-64", (96, 96, 3)),
+    ],
+)
+def test_a_bundle_of_another_task_or_of_pictures_that_it_does_not_give_is_refused(
+    tmp_path, task, of, preprocessing, shape
+):
     parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "policy.onnx"), b"x")
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
-    manifest = Manifest("moon", "moon", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
-    with pytest.raises(BundleError, match="of task 'moon'"):
-        find_task("car-racing").make_policy(write_bundle(tmp_path / "moon.zip", manifest, parts))
+    manifest = Manifest("moon", of, preprocessing, shape, latent=4, hidden=4, actions=3)
+    bundle, found = write_bundle(tmp_path / "moon.zip", manifest, parts), find_task(task)
+    for make in (found.make_environment, found.make_judge, found.make_policy):
+        with pytest.raises(BundleError, match=f"of task '{of}' and pictures '{preprocessing}'"):
+            make(bundle)
 
 
-def test_the_judge_is_gymnasiums_own_environment_behind_the_preprocessing():
-    judge, plain = find_task("car-racing").make_judge(), gymnasium.make("CarRacing-v3")
-    (seen, _), (observed, _) = judge.reset(seed=10_000), plain.reset(seed=10_000)
+@pytest.mark.parametrize("preprocessing", [BOX, RAW])
+def test_environment_and_judge_observe_gymnasiums_own_environment_behind_the_bundles_preprocessing(
+    tmp_path, preprocessing
+):
+    vae = VAEConfig(picture=preprocessing.size, latent=4, channels=(2, 2, 2, 2))
+    bundle = write_random_bundle(tmp_path / "b.zip", vae=vae, rnn=MDNRNNConfig(latent=4, hidden=4))
+    task, plain = find_task("car-racing"), gymnasium.make("CarRacing-v3")
+    ours = [task.make_environment(bundle), task.make_judge(bundle)]
+    observed, _ = plain.reset(seed=10_000)
+    seen = [each.reset(seed=10_000)[0] for each in ours]
     action = np.array([0.1, 0.5, 0.0], np.float32)
-    for _ in range(3):
-        assert (seen == picture(observed)).all()
-        (seen, mine, *_), (observed, theirs, *_) = judge.step(action), plain.step(action)
-        assert mine == theirs
-    judge.close()
-    plain.close()
+    for _ in range(60):  # past the opening's zoom
+        assert all((each == preprocessing.picture(observed)).all() for each in seen)
+        observed, reward, *_ = plain.step(action)
+        steps = [each.step(action) for each in ours]
+        assert [each[1] for each in steps] == [reward, reward]
+        seen = [each[0] for each in steps]
+    for each in (*ours, plain):
+        assert each.observation_space.contains(each.reset(seed=1)[0])
+        each.close()
 
 
 def test_an_episode_begins_from_nothing_whatever_was_driven_before(random_bundle):

@@ -18,7 +18,8 @@ from common.controller import Controller
 from common.errors import ControllerError
 from common.seeds import VALIDATION
 from worker.render.check import Actions, Difference, compare, leap, make_car_racing
-from worker.tasks.car_racing import CarRacingPolicy, PictureObservation
+from worker.tasks.car_racing import CarRacing, CarRacingPolicy, PictureObservation
+from worker.tasks.preprocessing import BOX
 
 STEPS = 1000
 Policy = Callable[[NDArray[np.uint8]], Any]
@@ -29,17 +30,20 @@ def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
 
     Every kind drives the same actions, which the shipped controller chose on that track beforehand.
     """
+    task = CarRacing()
     cases: dict[str, Callable[[Drive], float]] = {
         "gymnasium": lambda drive: seconds_a_step(gymnasium.make("CarRacing-v3"), drive),
         "observation": lambda drive: seconds_a_step(make_car_racing(), drive),
-        "gymnasium_picture": lambda drive: seconds_a_step(PictureObservation(gymnasium.make("CarRacing-v3")), drive),
-        "picture": lambda drive: seconds_a_step(make_car_racing(picture_only=True), drive),
-        "fitness_step": lambda drive: seconds_a_step(make_car_racing(picture_only=True), drive, policy_of(bundle)),
+        "gymnasium_picture": lambda drive: seconds_a_step(
+            PictureObservation(gymnasium.make("CarRacing-v3"), BOX), drive
+        ),
+        "picture": lambda drive: seconds_a_step(make_car_racing(preprocessing=BOX.name), drive),
+        "fitness_step": lambda drive: seconds_a_step(task.make_environment(bundle), drive, policy_of(bundle)),
     }
     notes = []
     if find_spec("torch"):
         cases["torch_fitness_step"] = lambda drive: seconds_a_step(
-            PictureObservation(gymnasium.make("CarRacing-v3")), drive, torch_policy_of(bundle)
+            task.make_judge(bundle), drive, torch_policy_of(bundle)
         )
     else:
         notes.append("ratio_fitness_step needs torch: pip install 'dreamfleet[train]'")
@@ -79,7 +83,7 @@ class Drive:
 
 def recorded_drive(seed: int) -> Drive:
     """What the shipped controller does on a track; it ends with the lap, or after 1000 steps."""
-    environment, act = make_car_racing(picture_only=True), driver(find_bundle("tiny"))
+    environment, act = make_car_racing(preprocessing=BOX.name), driver(find_bundle("tiny"))
     picture, _ = environment.reset(seed=seed)
     actions: list[NDArray[np.float32]] = []
     random, ended = np.random.default_rng(seed), False
@@ -93,7 +97,7 @@ def recorded_drive(seed: int) -> Drive:
 
 def completed_lap(seed: int) -> Drive:
     """A drive that touches every tile: towards a point ahead on the middle of the road, which the environment knows."""
-    environment = make_car_racing(picture_only=True, max_episode_steps=4 * STEPS)
+    environment = make_car_racing(preprocessing=BOX.name, max_episode_steps=4 * STEPS)
     environment.reset(seed=seed)
     inner: Any = environment.unwrapped
     middle = np.array(inner.track)[:, 2:]

@@ -55,13 +55,13 @@ class Naps:
     width = 1
     seconds = NAP_SECONDS
 
-    def make_environment(self) -> gymnasium.Env[Any, Any]:
+    def make_environment(self, _bundle: Bundle) -> gymnasium.Env[Any, Any]:
         """A nap."""
         return NapEnvironment(self.seconds)
 
-    def make_judge(self) -> gymnasium.Env[Any, Any]:
+    def make_judge(self, bundle: Bundle) -> gymnasium.Env[Any, Any]:
         """The same."""
-        return self.make_environment()
+        return self.make_environment(bundle)
 
     def make_policy(self, _bundle: Bundle) -> Idle:
         """Of any bundle."""

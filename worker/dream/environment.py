@@ -79,7 +79,7 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         return self._latent[0], float(moment.reward[0]), bool(moment.done[0]), truncated, {}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The picture `(64, 64, 3)` that the decoder makes of the latent."""
+        """The picture `(side, side, 3)` that the decoder makes of the latent."""
         return None if self._decoder is None else self._decoder.decode(self._latent)[0]
 
 
@@ -140,7 +140,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         return self._latent.copy(), reward, done, truncated, {}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Each dream's picture `(64, 64, 3)`."""
+        """Each dream's picture `(side, side, 3)`."""
         return None if self._decoder is None else tuple(self._decoder.decode(self._latent))
 
     def _begin(self, index: int, seed: int | None) -> None:

@@ -11,6 +11,9 @@ import pygame
 from common.bundle import Bundle
 from worker.dream.environment import CarRacingDream
 from worker.render.check import make_car_racing
+from worker.tasks.preprocessing import BOX
+
+WIDTH = 640  # pixels of a dream's picture on a screen
 
 
 class Scene(Protocol):
@@ -30,7 +33,7 @@ class Reality:
     name, scale = "CarRacing", 1.0
 
     def __init__(self, steps: int) -> None:
-        self.environment = make_car_racing(picture_only=True, render_mode="rgb_array", max_episode_steps=steps)
+        self.environment = make_car_racing(preprocessing=BOX.name, render_mode="rgb_array", max_episode_steps=steps)
 
     def surface(self) -> pygame.Surface:
         """Gymnasium's own surface; what it returns is a smaller copy."""
@@ -41,11 +44,12 @@ class Reality:
 
 
 class Dream:
-    """A bundle's dream, decoded: 64x64."""
+    """A bundle's dream, decoded."""
 
-    name, scale = "a dream", 10.0
+    name = "a dream"
 
     def __init__(self, bundle: Bundle, temperature: float, steps: int) -> None:
+        self.scale = WIDTH / bundle.manifest.picture[1]
         self.environment: gymnasium.Env[Any, Any] = CarRacingDream(bundle, temperature, steps, "rgb_array")
 
     def surface(self) -> pygame.Surface:

@@ -33,7 +33,7 @@ def png(figure: Figure) -> bytes:
 
 
 def picture_grid(rows: Sequence[tuple[str, Pictures]], columns: Sequence[str]) -> bytes:
-    """Rows of pictures `(N, 64, 64, 3)`, each row with its label, each column with its heading."""
+    """Rows of pictures `(N, side, side, 3)`, each row with its label, each column with its heading."""
     side = (WIDTH - 1.6) / max(len(columns), 5)
     figure, axes = new_figure(len(rows) * (side + 0.05) + 0.35, len(rows), len(columns))
     for (label, pictures), line in zip(rows, axes, strict=True):

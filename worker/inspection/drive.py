@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 
 from common.bundle import Bundle
 from common.controller import Controller
-from common.errors import BundleError
-from worker.render.check import make_car_racing
-from worker.tasks.car_racing import CarRacing, CarRacingPolicy
-from worker.tasks.preprocessing import SIZE
+from worker.tasks.car_racing import CarRacing
 from worker.training.drivers import OrnsteinUhlenbeckDriver
 from worker.worldmodel.inference import Encoder
 
@@ -32,7 +29,7 @@ class DriveConfig:
 
 @dataclass(frozen=True)
 class Drive:
-    """T steps: `picture` (T, 64, 64, 3) and its `mu`, `logvar` (T, latent); then `action` (T, 3), `reward` (T,)."""
+    """T steps: `picture` (T, side, side, 3) and its `mu`, `logvar` (T, latent); then `action` (T, 3), `reward` (T,)."""
 
     picture: Pictures
     mu: Floats
@@ -70,10 +67,7 @@ class Drive:
 
 def drive(bundle: Bundle, controller: Controller | None, config: DriveConfig) -> Drive:
     """Drive one episode: the controller, or without one the random driver that drifts around slight gas."""
-    CarRacing().check(bundle)
-    if bundle.manifest.picture != (SIZE, SIZE, 3):
-        raise BundleError(f"{bundle.path.name} sees pictures of {bundle.manifest.picture}, not those of CarRacing")
-    policy = CarRacingPolicy(bundle)
+    policy = CarRacing().make_policy(bundle)
     if controller is not None:
         policy.begin(controller.parameters)
         return _drive(bundle, policy.act, policy.reward, "the run's controller", config)
@@ -84,7 +78,7 @@ def drive(bundle: Bundle, controller: Controller | None, config: DriveConfig) ->
 def _drive(
     bundle: Bundle, act: Callable[[Pictures], Floats], tell: Callable[[float], None], driver: str, config: DriveConfig
 ) -> Drive:
-    environment = make_car_racing(picture_only=True)
+    environment = CarRacing().make_environment(bundle)
     observation, _ = environment.reset(seed=config.seed)
     pictures: list[Pictures] = []
     actions: list[Floats] = []

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from worker.render import ENVIRONMENT
 from worker.render.environment import CarRacing, available
+from worker.tasks.preprocessing import BOX
 
 _Reference: Any = car_racing.CarRacing  # untyped upstream
 log = logging.getLogger(__name__)
@@ -62,7 +63,7 @@ def compare(seed: int, steps: int, actions: Actions, **settings: Any) -> Differe
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # SWIG's, on first import
         theirs, ours = _Reference(**settings), CarRacing(**settings)
-        small = CarRacing(**settings, picture_only=True)
+        small = CarRacing(**settings, preprocessing=BOX.name)
     random = np.random.default_rng(seed)
     quick = steps <= QUICK_STEPS
     try:
@@ -85,12 +86,10 @@ def compare(seed: int, steps: int, actions: Actions, **settings: Any) -> Differe
 
 def differing(results: list[Any], environments: tuple[Any, ...]) -> str | None:
     """What differs between gymnasium's result and ours."""
-    from worker.tasks.preprocessing import picture
-
     reference, ours, small = results
     if not np.array_equal(reference[0], ours[0]):
         return f"observation, {int((reference[0] != ours[0]).any(axis=-1).sum())} pixels"
-    if not np.array_equal(picture(reference[0]), small[0]):
+    if not np.array_equal(BOX.picture(reference[0]), small[0]):
         return "picture"
     if reference[1:] != ours[1:] or reference[1:] != small[1:]:
         return "reward, flags or info"

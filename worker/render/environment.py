@@ -19,7 +19,7 @@ from gymnasium.error import InvalidAction
 from numpy.typing import NDArray
 
 from worker.render.car import Car
-from worker.tasks import preprocessing
+from worker.tasks.preprocessing import BOX, RAW, find_preprocessing
 
 try:
     from worker.render import _native
@@ -27,24 +27,23 @@ except ImportError:  # no compiler when this was installed
     _native = None  # type: ignore[assignment]
 
 TEXT_WIDTH = 125  # pixels at the window's left end that hold the score
-PICTURE_SHAPE = (64, 64, 3)
 _Base: Any = car_racing.CarRacing  # untyped upstream
 
 
 class CarRacing(_Base):  # type: ignore[misc]
     """CarRacing-v3 with its observation drawn natively.
 
-    `picture_only` observes the 64x64 picture instead; `native` False lets gymnasium draw, as it does anyway where the
-    module was not built. Not thread-safe, as gymnasium's is not: environments of one process share one canvas.
+    `preprocessing` names what it observes: `raw-96`, gymnasium's own, or another of `worker.tasks.preprocessing`.
+    `native` False lets gymnasium draw, as it does anyway where the module was not built. Not thread-safe, as
+    gymnasium's is not: environments of one process share one canvas.
     """
 
-    def __init__(self, *arguments: Any, picture_only: bool = False, native: bool = True, **more: Any) -> None:
+    def __init__(self, *arguments: Any, preprocessing: str = RAW.name, native: bool = True, **more: Any) -> None:
         super().__init__(*arguments, **more)
         self._native = native and available()
-        self._picture_only = picture_only
+        self._preprocessing = find_preprocessing(preprocessing)
         self._fixtures = np.zeros(0)
-        if picture_only:
-            self.observation_space = gymnasium.spaces.Box(0, 255, PICTURE_SHAPE, np.uint8)
+        self.observation_space = gymnasium.spaces.Box(0, 255, self._preprocessing.shape, np.uint8)
 
     @property
     def drawn_by(self) -> str:
@@ -79,13 +78,10 @@ class CarRacing(_Base):  # type: ignore[misc]
     def _render(self, mode: str) -> Any:
         if mode != "state_pixels":
             return super()._render(mode)
-        if self._native:
-            return self._draw()
-        observation = super()._render(mode)
-        return preprocessing.picture(observation) if self._picture_only else observation
+        return self._draw() if self._native else self._preprocessing.picture(super()._render(mode))
 
     def _draw(self) -> NDArray[np.uint8]:
-        """The observation `(96, 96, 3)`, or the picture `(64, 64, 3)`."""
+        """The picture `(size, size, 3)` of the preprocessing."""
         car, t = self.car, self.t
         hull = car.hull
         if not self._fixtures.size:
@@ -99,8 +95,8 @@ class CarRacing(_Base):  # type: ignore[misc]
         sight = array("d", (zoom, -angle, x, y, car_racing.PLAYFIELD))
         out = np.empty((96, 96, 3), np.uint8)
         _native.scene(out, self._road, self._road_colours, GRASS, self._palette, sight, bodies, self._fixtures, WHEEL)
-        if self._picture_only:
-            picture = np.empty(PICTURE_SHAPE, np.uint8)
+        if self._preprocessing is BOX:
+            picture = np.empty(BOX.shape, np.uint8)
             _native.picture(picture, out)
             return picture
         self._draw_bar(out[84:])

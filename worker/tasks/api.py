@@ -58,10 +58,10 @@ class Task(Protocol):
     name: str
     width: int  # episodes that a slot scores at once
 
-    def make_environment(self) -> gymnasium.Env[Any, Any]:
-        """A new environment; its observations are what the policy takes."""
+    def make_environment(self, bundle: Bundle) -> gymnasium.Env[Any, Any]:
+        """A new environment; its observations are what the bundle's policy takes."""
 
-    def make_judge(self) -> gymnasium.Env[Any, Any]:
+    def make_judge(self, bundle: Bundle) -> gymnasium.Env[Any, Any]:
         """The environment that reported scores come from; the same as the other where there is no second one."""
 
     def make_policy(self, bundle: Bundle) -> Policy:

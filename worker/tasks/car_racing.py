@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from common.bundle import Bundle
 from common.errors import BundleError
 from worker.render.check import make_car_racing
-from worker.tasks.preprocessing import PREPROCESSING, SIZE, picture
+from worker.tasks.preprocessing import PREPROCESSINGS, Preprocessing
 from worker.worldmodel.inference import PolicyStep
 
 ENVIRONMENT = "CarRacing-v3"
@@ -24,39 +24,44 @@ class CarRacing:
     name = "car-racing"
     width = 1
 
-    def make_environment(self) -> gymnasium.Env[Any, Any]:
-        """The environment with the native picture, where that is exact; it observes the 64x64 picture."""
-        return make_car_racing(picture_only=True)
+    def make_environment(self, bundle: Bundle) -> gymnasium.Env[Any, Any]:
+        """The environment with the native picture, where that is exact; it observes the bundle's pictures."""
+        return make_car_racing(preprocessing=self.preprocessing(bundle).name)
 
-    def make_judge(self) -> gymnasium.Env[Any, Any]:
+    def make_judge(self, bundle: Bundle, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The unmodified environment of gymnasium, preprocessed here."""
-        return PictureObservation(gymnasium.make(ENVIRONMENT))
+        preprocessing = self.preprocessing(bundle)
+        return PictureObservation(gymnasium.make(ENVIRONMENT, render_mode=render_mode), preprocessing)
 
     def make_policy(self, bundle: Bundle) -> CarRacingPolicy:
         """Encoder, controller and MDN-RNN of a bundle that was trained on this task's pictures."""
-        self.check(bundle)
+        self.preprocessing(bundle)
         return CarRacingPolicy(bundle)
 
-    def check(self, bundle: Bundle) -> None:
-        """`BundleError` unless the bundle was trained on this task's pictures."""
+    def preprocessing(self, bundle: Bundle) -> Preprocessing:
+        """What makes the pictures that the bundle was trained on; `BundleError` if this task does not give them."""
         manifest = bundle.manifest
-        if (manifest.task, manifest.preprocessing) != (self.name, PREPROCESSING):
+        found = PREPROCESSINGS.get(manifest.preprocessing)
+        if manifest.task != self.name or found is None or manifest.picture != found.shape:
+            given = " or ".join(f"{each.name!r} {each.shape}" for each in PREPROCESSINGS.values())
             raise BundleError(
-                f"bundle {manifest.name} is of task {manifest.task!r}, preprocessing {manifest.preprocessing!r}; "
-                f"{self.name} needs {PREPROCESSING!r}"
+                f"bundle {manifest.name} is of task {manifest.task!r} and pictures {manifest.preprocessing!r} "
+                f"{manifest.picture}; {self.name} gives {given}"
             )
+        return found
 
 
 class PictureObservation(gymnasium.ObservationWrapper[NDArray[np.uint8], Any, NDArray[np.uint8]]):
-    """CarRacing's observation as the 64x64x3 picture of `worker.tasks.preprocessing`."""
+    """CarRacing's observation as the picture of a preprocessing."""
 
-    def __init__(self, environment: gymnasium.Env[Any, Any]) -> None:
+    def __init__(self, environment: gymnasium.Env[Any, Any], preprocessing: Preprocessing) -> None:
         super().__init__(environment)
-        self.observation_space = spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)
+        self._preprocessing = preprocessing
+        self.observation_space = spaces.Box(0, 255, preprocessing.shape, np.uint8)
 
     def observation(self, observation: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The picture."""
-        return picture(observation)
+        return self._preprocessing.picture(observation)
 
 
 class CarRacingPolicy:

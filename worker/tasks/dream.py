@@ -27,13 +27,13 @@ class Dream:
     def __init__(self) -> None:
         self.reality = CarRacing()
 
-    def make_environment(self) -> gymnasium.Env[Any, Any]:
+    def make_environment(self, bundle: Bundle) -> gymnasium.Env[Any, Any]:
         """CarRacing with the native picture: evaluations are driven, not dreamt."""
-        return self.reality.make_environment()
+        return self.reality.make_environment(bundle)
 
-    def make_judge(self) -> gymnasium.Env[Any, Any]:
+    def make_judge(self, bundle: Bundle) -> gymnasium.Env[Any, Any]:
         """The unmodified CarRacing of gymnasium."""
-        return self.reality.make_judge()
+        return self.reality.make_judge(bundle)
 
     def make_policy(self, bundle: Bundle) -> Any:
         """The policy that drives."""
@@ -41,7 +41,7 @@ class Dream:
 
     def make_batch(self, bundle: Bundle, spec: TaskSpec) -> Dreamer:
         """What scores candidates."""
-        self.reality.check(bundle)
+        self.reality.preprocessing(bundle)
         return Dreamer(bundle, spec)
 
 

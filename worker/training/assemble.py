@@ -27,7 +27,7 @@ from common.bundle import (
 )
 from common.errors import DatasetError
 from common.fingerprint import package_version
-from worker.tasks.preprocessing import PREPROCESSING, SIZE
+from worker.tasks.preprocessing import preprocessing_to
 from worker.training import train_mdnrnn, train_vae
 from worker.training.checkpoint import load_config, load_weights
 from worker.training.dataset import episodes, load, split
@@ -88,11 +88,12 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundl
 
 def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED) -> Manifest:
     """The manifest of these models."""
+    preprocessing = preprocessing_to(vae.picture)
     return Manifest(
         name=name,
         task="car-racing",
-        preprocessing=PREPROCESSING if vae.picture == SIZE else f"raw-{vae.picture}",  # which no task gives yet
-        picture=(vae.picture, vae.picture, 3),
+        preprocessing=preprocessing.name,
+        picture=preprocessing.shape,
         latent=vae.latent,
         hidden=rnn.hidden,
         actions=rnn.actions,

@@ -18,7 +18,8 @@ from common.files import write_aside
 from common.threads import pin_thread_pools
 from worker.drive import Drive, write_episode
 from worker.render.check import make_car_racing
-from worker.tasks.preprocessing import PREPROCESSING
+from worker.tasks.preprocessing import preprocessing_to
+from worker.training.dataset import check_pictures
 from worker.training.drivers import DRIVERS
 
 
@@ -31,6 +32,7 @@ class CollectConfig:
     seed: int = 0
     anywhere: float = 0.6  # share of episodes that start somewhere on the track instead of at its beginning
     patience: int = 120  # steps after the last new tile before an episode ends
+    picture: int = 64  # height and width of what is recorded: 64, or 96 for the whole observation
 
     def __post_init__(self) -> None:
         for name in ("episodes", "steps", "patience"):
@@ -38,6 +40,7 @@ class CollectConfig:
                 raise UsageError(f"--{name} must be at least 1, not {getattr(self, name)}")
         if self.seed < 0:
             raise UsageError(f"--seed must not be negative, not {self.seed}")
+        preprocessing_to(self.picture)
 
 
 def episode_path(folder: Path, number: int) -> Path:
@@ -45,8 +48,17 @@ def episode_path(folder: Path, number: int) -> Path:
     return folder / "episodes" / f"{number:06d}.npz"
 
 
+def present(folder: Path) -> list[Path]:
+    """The episodes that are there, by number."""
+    return sorted((folder / "episodes").glob("[0-9]*.npz"))
+
+
 def collect(folder: Path, config: CollectConfig, jobs: int) -> Iterator[int]:
-    """Drive the episodes that are not there yet in `jobs` processes; yields the frames of each as it is written."""
+    """Drive the episodes that are not there yet in `jobs` processes; yields the frames of each as it is written.
+
+    `DatasetError` before anything is driven if what is there has other pictures.
+    """
+    check_pictures(present(folder), config.picture)
     missing = [number for number in range(config.episodes) if not episode_path(folder, number).exists()]
     try:
         (folder / "episodes").mkdir(parents=True, exist_ok=True)
@@ -72,15 +84,16 @@ def _collect_one(task: tuple[Path, CollectConfig, int]) -> int:
 
 
 def drive(config: CollectConfig, number: int) -> dict[str, NDArray[Any]]:
-    """One episode of T steps: `picture` (T, 64, 64, 3) before each `action` (T, 3), then `reward` (T,)."""
+    """One episode of T steps: `picture` (T, side, side, 3) before each `action` (T, 3), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
     name = list(DRIVERS)[number % len(DRIVERS)]
     driver = DRIVERS[name](random)
-    environment = make_car_racing(picture_only=True)
+    preprocessing = preprocessing_to(config.picture)
+    environment = make_car_racing(preprocessing=preprocessing.name)
     observation, _ = environment.reset(seed=int(random.integers(2**20, 2**31)))
     if random.random() < config.anywhere:
         observation = _put_anywhere(environment, random)
-    kept, idle = Drive(name, PREPROCESSING), 0
+    kept, idle = Drive(name, preprocessing.name), 0
     while len(kept) < config.steps and idle < config.patience and not kept.ended:
         action, seen = driver.act(), observation
         observation, reward, terminated, truncated, _ = environment.step(action)

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import DatasetError
-from worker.tasks.preprocessing import PREPROCESSING, SIZE
+from worker.tasks.preprocessing import PREPROCESSINGS, preprocessing_to
 
 POOL_EPISODES = 48  # whose frames are shuffled together
-POOL_FRAMES = 16_000  # of them at most, or one episode: 200 MB
+POOL_FRAMES = 16_000  # of them at most, or one episode: 200 MB of 64x64, 440 MB of 96x96
 VALIDATION_EVERY = 20  # every 20th episode is held out, whole
 
 Arrays = dict[str, NDArray[Any]]
@@ -61,11 +61,28 @@ def check_whole(paths: Sequence[Path], *names: str) -> None:
             )
 
 
+def check_pictures(paths: Sequence[Path], size: int) -> None:
+    """`DatasetError` names the first episode whose pictures are of another preprocessing than that to `size`."""
+    wanted = preprocessing_to(size).name
+    for path in paths:
+        if (found := preprocessing_of(path)) != wanted:
+            raise DatasetError(
+                f"{path} holds pictures {found!r}, and {wanted!r} are asked for: a data set and its VAE have one kind; "
+                "choose another --data, or --picture"
+            )
+
+
+def preprocessing_of(path: Path) -> str:
+    """The name of the preprocessing that made an episode's pictures."""
+    return str(load(path, "preprocessing")["preprocessing"])
+
+
 def load_pictures(path: Path) -> NDArray[np.uint8]:
-    """An episode's pictures `(T, 64, 64, 3)`; `DatasetError` if they are of another preprocessing."""
+    """An episode's pictures `(T, side, side, 3)`; `DatasetError` if they are not what its preprocessing makes."""
     arrays = load(path, "picture", "preprocessing")
     pictures: NDArray[np.uint8] = arrays["picture"]
-    if str(arrays["preprocessing"]) != PREPROCESSING or pictures.shape[1:] != (SIZE, SIZE, 3) or not len(pictures):
+    known = PREPROCESSINGS.get(str(arrays["preprocessing"]))
+    if known is None or pictures.shape[1:] != known.shape or not len(pictures):
         raise DatasetError(f"{path} holds pictures of another preprocessing or shape; collect into an empty folder")
     return pictures
 
@@ -73,7 +90,7 @@ def load_pictures(path: Path) -> NDArray[np.uint8]:
 def picture_batches(
     paths: Sequence[Path], batch: int, seed: int, first_pool: int = 0, taken: int = 0
 ) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
-    """Endless shuffled batches `(batch, 64, 64, 3)`, each with its pool and how many of that are taken with it.
+    """Endless shuffled batches `(batch, side, side, 3)`, each with its pool and how many of that are taken with it.
 
     A pure function of its arguments: begin behind a batch with the numbers that came with it.
     """

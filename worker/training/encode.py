@@ -13,7 +13,7 @@ from common.bundle import hash_file
 from common.errors import DatasetError
 from common.files import write_aside
 from worker.training.checkpoint import load_checkpoint, load_config
-from worker.training.dataset import check_whole, episodes, load, load_pictures
+from worker.training.dataset import check_pictures, check_whole, episodes, load, load_pictures
 from worker.training.train_vae import CHECKPOINT, as_tensor
 from worker.worldmodel.vae import VAE
 from worker.worldmodel.vae_config import VAEConfig
@@ -30,6 +30,7 @@ def encode(folder: Path) -> Iterator[int]:
     model.eval()
     vae = hash_file(folder / CHECKPOINT)
     check_whole(episodes(folder), "picture", "preprocessing", "action", "reward", "ended")
+    check_pictures(episodes(folder), model.config.picture)
     for path in episodes(folder):
         target = folder / ENCODED / path.name
         if target.exists() and _is_of(target, vae):

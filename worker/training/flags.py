@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from worker.training.train_config import TrainConfig
 
 T = TypeVar("T")
-FIXED = ("actions", "picture")  # what the task says
+FIXED = ("actions",)  # what the task says
 
 
 def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> None:

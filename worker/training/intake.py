@@ -9,16 +9,23 @@ from pathlib import Path
 from common.bundle import hash_file
 from common.errors import DatasetError
 from common.files import write_aside
-from worker.training.collect import episode_path
-from worker.training.dataset import load, load_pictures
+from worker.training.collect import episode_path, present
+from worker.training.dataset import load, load_pictures, preprocessing_of
 
 
 def take_in(folder: Path, drives: Sequence[Path]) -> Iterator[int]:
-    """Copy the drives that the data set lacks; yields the frames of each. Which it has, their bytes tell."""
-    present = sorted(episode_path(folder, 0).parent.glob("[0-9]*.npz"))
+    """Copy the drives that the data set lacks; yields the frames of each. Which it has, their bytes tell.
+
+    `DatasetError` before anything is copied if not all pictures, the data set's among them, are of one preprocessing.
+    """
+    there = present(folder)
+    kinds = {preprocessing_of(path): path for path in (*there, *drives)}
+    if len(kinds) > 1:
+        told = " and ".join(f"{kind!r} ({path})" for kind, path in kinds.items())
+        raise DatasetError(f"a data set's pictures are of one kind, and these are {told}; choose another --data")
     sizes = {path.stat().st_size for path in drives if path.exists()}
-    known = {hash_file(path) for path in present if path.stat().st_size in sizes}
-    number = int(present[-1].stem) + 1 if present else 0
+    known = {hash_file(path) for path in there if path.stat().st_size in sizes}
+    number = int(there[-1].stem) + 1 if there else 0
     for path in drives:
         frames = _check(path)
         if (identity := hash_file(path)) in known:

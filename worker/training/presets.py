@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from common.errors import UsageError
 from worker.training.collect import CollectConfig
@@ -36,11 +36,10 @@ TINY = Preset(
 _RNN = TrainConfig(updates=4000, batch=100, rate=1e-3, patience=10)
 NOTEBOOK = Preset(
     name="notebook",
-    collect=CollectConfig(episodes=1000, steps=300),
+    collect=CollectConfig(episodes=1000, steps=300, picture=96),  # it sees the whole observation
     vae=TrainConfig(updates=30_000, batch=100, rate=1e-3, patience=10, clip=0),
     mdnrnn=_RNN,
-    # Its pictures are 96 wide; recorded ones are 64.
-    vae_layers=replace(vae_config.NOTEBOOK, picture=64),
+    vae_layers=vae_config.NOTEBOOK,
     mdnrnn_layers=mdnrnn_config.NOTEBOOK,
 )
 ARTICLE = Preset(

@@ -9,10 +9,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.errors import DatasetError
 from common.progress import append_curve
-from worker.tasks.preprocessing import SIZE
-from worker.training.dataset import POOL_EPISODES, check_whole, episodes, load_pictures, picture_batches, split
+from worker.training.dataset import (
+    POOL_EPISODES,
+    check_pictures,
+    check_whole,
+    episodes,
+    load_pictures,
+    picture_batches,
+    split,
+)
 from worker.training.schedule import Schedule
 from worker.training.train_config import TrainConfig
 from worker.worldmodel.vae import VAE
@@ -36,8 +42,7 @@ def train_vae(
     """
     train, held_out = split(episodes(folder))
     check_whole([*train, *held_out], "picture", "preprocessing")
-    if layers.picture != SIZE:
-        raise DatasetError(f"recorded pictures are {SIZE} wide, this VAE's {layers.picture}: choose other layers")
+    check_pictures([*train, *held_out], layers.picture)
     torch.manual_seed(config.seed)
     model = VAE(layers).to(device)
     schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from)
@@ -112,5 +117,5 @@ def quality(model: VAE, held_out: Sequence[Path], device: torch.device | None = 
 
 
 def as_tensor(pictures: NDArray[np.uint8], device: torch.device | None = None) -> torch.Tensor:
-    """Pictures `(N, 64, 64, 3)` uint8 as `(N, 3, 64, 64)` in [0, 1]."""
+    """Pictures `(N, side, side, 3)` uint8 as `(N, 3, side, side)` in [0, 1]."""
     return torch.from_numpy(pictures).to(device).permute(0, 3, 1, 2).float() / 255

@@ -20,6 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", default="tiny", help="how much of everything (default tiny)")
     parser.add_argument("--episodes", type=int, help="episodes in all, instead of the preset's")
     parser.add_argument("--seed", type=int, help="makes the data set, instead of the preset's")
+    parser.add_argument("--picture", type=int, help="64, or 96 for the whole observation, instead of the preset's")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
     parser.add_argument("--from-run", metavar="RUN", help="drive nothing: take in what this run collected, each once")
     parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
@@ -34,7 +35,8 @@ def run(args: argparse.Namespace) -> int:
     from worker.training.presets import find_preset
 
     config = find_preset(args.preset).collect
-    changes = {name: getattr(args, name) for name in ("episodes", "seed") if getattr(args, name) is not None}
+    names = ("episodes", "seed", "picture")
+    changes = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     config = replace(config, **changes)
     frames = done = 0
     with progress_bar("collect", config.episodes, "episodes") as bar:

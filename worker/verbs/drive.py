@@ -18,7 +18,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--temperature", type=float, help=f"of the dream (default {TEMPERATURE})")
     parser.add_argument("--seed", type=int, help="the track, or the dream (default another each time)")
     parser.add_argument("--steps", type=int, default=1000, help="steps until it is over (default 1000)")
-    parser.add_argument("--scale", type=float, help="enlarge the picture (default: 10 in the dream, 1 on the track)")
+    parser.add_argument(
+        "--scale", type=float, help="enlarge the picture (default: a dream to 640 pixels, the track not)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -31,7 +31,7 @@ def screen():
 
 
 def standing_still():
-    environment = make_car_racing(picture_only=True)
+    environment = make_car_racing(preprocessing="box-64")
     environment.reset(seed=SEED)
     score = sum(float(environment.step([0.0, 0.0, 0.0])[1]) for _ in range(STEPS))
     environment.close()

@@ -125,11 +125,12 @@ def test_attention_is_that_of_the_trained_model(attentive):
     np.testing.assert_allclose(DreamStep(attentive).attend(latent, action, state), expected.numpy(), atol=1e-6)
 
 
-def test_a_bundle_of_other_pictures_is_refused(tmp_path):
-    large = VAEConfig(picture=96, padding="same", latent=5, channels=(2, 2, 2, 2))
-    bundle = write_random_bundle(tmp_path / "large.zip", vae=large, rnn=MDNRNNConfig(latent=5, hidden=4))
-    with pytest.raises(BundleError, match="preprocessing 'raw-96'"):
-        drive(bundle, None, SHORT)
+def test_a_drive_is_seen_as_its_bundle_sees(tmp_path):
+    whole = VAEConfig(picture=96, padding="same", latent=5, channels=(2, 2, 2, 2))
+    bundle = write_random_bundle(tmp_path / "whole.zip", vae=whole, rnn=MDNRNNConfig(latent=5, hidden=4))
+    assert drive(bundle, None, SHORT).picture.shape == (12, 96, 96, 3)
+    page = inspect(Subject(bundle), tmp_path / "out", SHORT)
+    assert Links(page.read_text()).sections == [*LOOKS, "dream", "rewards"]
 
 
 @pytest.mark.parametrize("text", ["", "{", '{"error": 1}', '{"update": 1, "a": 2}\n{"update": 2, "b": 2}', "[]"])

@@ -14,7 +14,7 @@ from common.bundle import find_bundle
 from worker.bench.environment import completed_lap, discrete, policy_of
 from worker.render.check import compare, leap, make_car_racing, native_is_exact
 from worker.render.environment import GRASS, WHEEL, CarRacing, _native, available, score_text
-from worker.tasks.preprocessing import picture
+from worker.tasks.preprocessing import BOX
 
 needs_native = pytest.mark.skipif(not available(), reason="no native module was built")
 
@@ -81,8 +81,8 @@ def test_extreme_actions_behave_as_gymnasiums():
 
 @needs_native
 def test_environments_that_take_turns_do_not_see_each_other():
-    alone = [drive_all([CarRacing(picture_only=True)], [seed], 30)[0] for seed in range(8)]
-    together = drive_all([CarRacing(picture_only=True) for _ in range(8)], range(8), 30)
+    alone = [drive_all([CarRacing(preprocessing="box-64")], [seed], 30)[0] for seed in range(8)]
+    together = drive_all([CarRacing(preprocessing="box-64") for _ in range(8)], range(8), 30)
     assert all(np.array_equal(one, other) for one, other in zip(alone, together, strict=True))
 
 
@@ -100,7 +100,7 @@ def drive_all(environments, seeds, steps):
 @needs_native
 def test_one_more_environment_adds_little_memory():
     def drawing():
-        environment = CarRacing(picture_only=True)
+        environment = CarRacing(preprocessing="box-64")
         drive_all([environment], [1], 20)
         return environment
 
@@ -118,7 +118,7 @@ def memory():
 @needs_native
 @pytest.mark.parametrize("x", [np.nan, np.inf, 1e30])
 def test_a_car_that_cannot_be_drawn_is_a_clear_error(x):
-    environment = CarRacing(picture_only=True)
+    environment = CarRacing(preprocessing="box-64")
     environment.reset(seed=1)
     with pytest.raises(ValueError, match="too far away"):
         _native.scene(
@@ -128,10 +128,10 @@ def test_a_car_that_cannot_be_drawn_is_a_clear_error(x):
 
 
 def test_where_it_was_not_built_gymnasium_draws():
-    ours, small = CarRacing(native=False), CarRacing(native=False, picture_only=True)
+    ours, small = CarRacing(native=False), CarRacing(native=False, preprocessing="box-64")
     observation, small_one = ours.reset(seed=1)[0], small.reset(seed=1)[0]
     assert ours.drawn_by == "gymnasium"
-    assert np.array_equal(picture(observation), small_one)
+    assert np.array_equal(BOX.picture(observation), small_one)
 
 
 @pytest.mark.parametrize("action", [np.array([np.nan, 0, 0]), np.array([0, np.inf, 0]), np.zeros(2), np.zeros((1, 3))])
@@ -154,7 +154,7 @@ def test_gymnasium_finds_it_a_well_made_environment():
 
 
 def test_an_episode_ends_after_a_thousand_steps():
-    assert make_car_racing(picture_only=True).spec.max_episode_steps == 1000
+    assert make_car_racing(preprocessing="box-64").spec.max_episode_steps == 1000
 
 
 def test_a_score_is_written_after_somebody_closed_pygame():

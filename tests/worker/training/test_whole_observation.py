@@ -1,0 +1,148 @@
+"""World models of the whole 96x96 observation: from drives in the real CarRacing to scores, and no mixture of kinds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from common.controller import Controller
+from common.errors import DatasetError
+from common.messages import TaskSpec
+from tests.support.drives import write_drive, write_drives
+from worker.drive import write_episode
+from worker.driving.scene import Dream
+from worker.evaluation import evaluate
+from worker.recording import record
+from worker.scoring import Scorer
+from worker.tasks.preprocessing import RAW
+from worker.training import train_mdnrnn, train_vae
+from worker.training.assemble import assemble
+from worker.training.collect import CollectConfig, collect, episode_path
+from worker.training.dataset import load_pictures
+from worker.training.encode import encode
+from worker.training.intake import take_in
+from worker.training.presets import PRESETS
+from worker.training.train_config import TrainConfig
+from worker.worldmodel import vae_config
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig
+
+# SWIG warns as Box2D is imported, and an error there kills the process.
+pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
+COLLECT = CollectConfig(episodes=3, steps=8, picture=96)
+SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
+VAE = replace(vae_config.NOTEBOOK, latent=6, channels=(4, 4, 8, 8))
+RNN = MDNRNNConfig(latent=6, hidden=8, mixtures=2, done=True)
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def ignore(_done, _note):
+    pass
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """A data folder that has been through every stage; read only."""
+    folder = tmp_path_factory.mktemp("data")
+    assert list(collect(folder, COLLECT, jobs=1)) == [8, 8, 8]
+    train_vae.train_vae(folder, SHORT, ignore, VAE)
+    assert list(encode(folder)) == [8, 8, 8]
+    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, RNN)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bundle(data):
+    return assemble(data, data / "whole.zip", "whole", with_weights=False)
+
+
+@pytest.fixture(scope="module")
+def parameters(bundle):
+    return np.random.default_rng(0).normal(size=bundle.controller_shape.size).astype(np.float32)
+
+
+def test_the_bundle_says_what_it_sees(data, bundle):
+    assert (bundle.manifest.preprocessing, bundle.manifest.picture) == (RAW.name, (96, 96, 3))
+    assert load_pictures(episode_path(data, 0)).shape == (8, 96, 96, 3)
+
+
+def test_environment_judge_and_video_score_alike_to_the_bit(bundle, parameters, tmp_path):
+    fitness, spec = [], TaskSpec("car-racing", bundle.sha256, 70, 0)
+    for judge in (False, True):
+        scorer = Scorer(spec, bundle, judge=judge)
+        fitness.append(scorer.score("score", parameters, 20_000).fitness)
+        scorer.close()
+    controller = Controller(bundle.controller_shape, parameters, "car-racing", bundle.sha256)
+    fitness.append(record(controller, bundle, 20_000, 70, tmp_path / "drive.mp4"))
+    assert fitness == fitness[:1] * 3
+
+
+def test_it_dreams_is_driven_in_reality_and_collects_drives_that_its_data_set_takes_in(
+    data, bundle, parameters, tmp_path
+):
+    scorer = Scorer(TaskSpec("dream", bundle.sha256, 20, 0), bundle)
+    assert scorer.score("score", parameters, 2**20).steps <= 20
+    score, kept = scorer.collect(parameters, 2**20)
+    scorer.close()
+    path = tmp_path / "kept.npz"
+    with path.open("wb") as file:
+        write_episode(file, kept.arrays())
+    assert load_pictures(path).shape == (score.steps, 96, 96, 3)
+    (tmp_path / "episodes").mkdir()
+    episode_path(tmp_path, 0).write_bytes(episode_path(data, 0).read_bytes())
+    assert list(take_in(tmp_path, [path])) == [score.steps]
+
+
+def test_a_controller_of_it_is_evaluated(bundle, parameters):
+    straight = Controller(bundle.controller_shape, np.zeros_like(parameters), "dream", bundle.sha256)
+    ((seed, score),) = evaluate(straight, bundle, (10_000,), jobs=1)
+    assert seed == 10_000
+    assert np.isfinite(score)
+
+
+def test_its_dream_is_driven_at_the_size_of_any_other(bundle, random_bundle):
+    sizes = []
+    for each in (bundle, random_bundle):
+        scene = Dream(each, 1.0, 5)
+        scene.environment.reset(seed=1)
+        sizes.append([side * scene.scale for side in scene.surface().get_size()])
+    assert sizes == [[640, 640], [640, 640]]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_records_what_its_vae_sees(name):
+    assert PRESETS[name].collect.picture == PRESETS[name].vae_layers.picture
+
+
+def test_the_notebooks_preset_is_the_notebooks_own_size():
+    assert PRESETS["notebook"].vae_layers == vae_config.NOTEBOOK
+    assert PRESETS["notebook"].vae_layers.picture == 96
+
+
+@pytest.mark.parametrize(("there", "wanted"), [(64, 96), (96, 64)])
+def test_no_folder_gets_two_kinds_of_pictures(tmp_path, there, wanted):
+    path = write_drive(tmp_path, 7, picture=there)
+    with pytest.raises(DatasetError, match=rf"{path.name} holds pictures .*-{there}', and .*-{wanted}'"):
+        list(collect(tmp_path, replace(COLLECT, picture=wanted), jobs=1))
+    drives = [write_drive(tmp_path / "run", 0, picture=wanted)]
+    with pytest.raises(DatasetError, match="of one kind"):
+        list(take_in(tmp_path, drives))
+    with pytest.raises(DatasetError, match="of one kind"):
+        list(take_in(tmp_path / "new", [path, *drives]))
+    assert not (tmp_path / "new").exists()
+    assert [each.name for each in (tmp_path / "episodes").iterdir()] == [path.name]
+
+
+def test_a_vae_of_another_size_than_the_data_is_refused_before_anything_runs(tmp_path):
+    write_drives(tmp_path, episodes=3, steps=4)
+    with pytest.raises(DatasetError, match=r"'box-64', and 'raw-96'.*--picture"):
+        train_vae.train_vae(tmp_path, SHORT, ignore, VAE)
+    assert not (tmp_path / train_vae.CHECKPOINT).exists()
+    train_vae.train_vae(tmp_path, SHORT, ignore, replace(VAE, picture=64))
+    write_drive(tmp_path, 3, picture=96)
+    with pytest.raises(DatasetError, match=r"000003.npz holds pictures 'raw-96'"):
+        list(encode(tmp_path))
+    assert not (tmp_path / "encoded").exists()
