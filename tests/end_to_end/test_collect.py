@@ -14,8 +14,11 @@ from common.runs import open_run
 from common.seeds import collection_seed
 from common.session import Network, open_session
 from tests.support import tasks
-from worker.tasks.preprocessing import BOX
+from tests.support.bundles import write_random_bundle
+from worker.tasks.preprocessing import BOX, RAW
 from worker.training.dataset import episodes, load_pictures
+from worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from worker.worldmodel.vae_config import VAEConfig
 
 pytestmark = pytest.mark.timeout(240)
 GENERATIONS, DRIVES = 4, 3
@@ -111,9 +114,12 @@ def test_what_strangers_upload_is_dropped_and_counted(processes, random_bundle):
 
 
 @pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
-def test_drives_of_the_real_car_are_episodes_that_a_data_set_takes_in_once(processes, tmp_path):
+@pytest.mark.parametrize("preprocessing", [BOX, RAW])
+def test_drives_of_the_real_car_are_episodes_that_a_data_set_takes_in_once(processes, tmp_path, preprocessing):
+    vae = VAEConfig(picture=preprocessing.size, latent=4, channels=(2, 2, 2, 2))
+    bundle = write_random_bundle(tmp_path / "b.zip", vae=vae, rnn=MDNRNNConfig(latent=4, hidden=4))
     coordinator = processes.coordinator(
-        "--bundle", "tiny", "--population", 2, "--episodes", 1, "--horizon", 30, "--evaluate-every", 0,
+        "--bundle", bundle.path, "--population", 2, "--episodes", 1, "--horizon", 30, "--evaluate-every", 0,
         "--collect-every", 1, "--collect-episodes", 2, "--generations", 1,
     )  # fmt: skip
     processes.worker()
@@ -129,9 +135,9 @@ def test_drives_of_the_real_car_are_episodes_that_a_data_set_takes_in_once(proce
         assert [path.read_bytes() for path in run.rollouts()] == [path.read_bytes() for path in episodes(data)]
     for path in episodes(data):
         pictures = load_pictures(path)
-        assert pictures.shape == (30, *BOX.shape)
+        assert pictures.shape == (30, *preprocessing.shape)
         assert pictures.dtype == np.uint8
         with np.load(path) as drive:
             assert drive["action"].shape == (30, 3)
-            assert str(drive["preprocessing"]) == BOX.name
+            assert str(drive["preprocessing"]) == preprocessing.name
             assert not drive["ended"]

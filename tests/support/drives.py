@@ -22,6 +22,6 @@ def write_drive(folder, number, steps=12, picture=64):
     return path
 
 
-def write_drives(folder, episodes=6, steps=12):
+def write_drives(folder, episodes=6, steps=12, picture=64):
     """So many episodes of unequal length."""
-    return [write_drive(folder, number, steps - number % 3) for number in range(episodes)]
+    return [write_drive(folder, number, steps - number % 3, picture) for number in range(episodes)]

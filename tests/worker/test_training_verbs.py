@@ -2,9 +2,10 @@ import argparse
 
 import pytest
 
+from common.errors import DatasetError
 from tests.support.drives import write_drives
 from worker.training.checkpoint import load_config
-from worker.verbs import train_mdnrnn, train_vae
+from worker.verbs import collect, train_mdnrnn, train_vae
 from worker.worldmodel.vae_config import VAEConfig
 
 
@@ -22,6 +23,16 @@ def test_flags_change_what_a_preset_says(tmp_path, capsys):
     )  # fmt: skip
     assert load_config(tmp_path / "vae.safetensors", VAEConfig) == VAEConfig(channels=(2, 2, 4, 4), padding="same")
     assert "reconstruction_error" in capsys.readouterr().out
+
+
+def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):
+    write_drives(tmp_path, episodes=3, steps=4, picture=96)
+    call(train_vae, "--data", str(tmp_path), "--updates", "1", "--picture", "96", "--channels", "2", "2", "4", "4")
+    assert load_config(tmp_path / "vae.safetensors", VAEConfig).picture == 96
+    assert call(collect, "--data", str(tmp_path), "--episodes", "3", "--picture", "96") == 0
+    assert "0 episodes, 0 frames new; 3 episodes in all" in capsys.readouterr().out
+    with pytest.raises(DatasetError, match="or --picture"):
+        call(collect, "--data", str(tmp_path), "--episodes", "4")
 
 
 @pytest.mark.parametrize(("verb", "count"), [(train_vae, "4,348,547"), (train_mdnrnn, "422,368")])
