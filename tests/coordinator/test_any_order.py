@@ -159,13 +159,14 @@ class AnyOrder(RuleBasedStateMachine):
         )  # fmt: skip
         self.fleet.beat(identity, beat, self.now)
 
-    @rule()
-    def dispatch(self):
-        for send in self.fleet.dispatch(self.now):
+    @rule(durable=st.booleans())
+    def dispatch(self, durable=True):
+        for send in self.fleet.dispatch(self.now, durable=durable):
             self.batches.append((send.identity, self.life, send))
             if any(send.content is content for content in self.sent):
                 continue  # sent again
             self.sent.append(send.content)
+            assert durable or not send.content.verdicts, "a verdict before the journal"
             for verdict in send.content.verdicts:
                 self.judged[send.identity, verdict.digest] += 1
             if send.content.work:
