@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,17 @@ _SKIPPED = frozenset({
 _SCALARS = (bool, int, float, str, type(None), np.bool_, np.integer, np.floating)
 _MAX_DEPTH = 6
 _MISSING = object()
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A strategy's state; to pack it takes a while, which can be left for later."""
+
+    arrays: dict[str, NDArray[Any]]
+
+    def packed(self) -> bytes:
+        """As one `.npz`."""
+        return pack(self.arrays)
 
 
 def dump(strategy: Any) -> dict[str, NDArray[Any]]:

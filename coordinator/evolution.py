@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Literal
+from typing import Any, Literal
 
 import cma
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from common.errors import JournalError, UsageError
 from coordinator import cma_state
+from coordinator.cma_state import Checkpoint
 
 CMA_VERSION = version("cma")
 Covariance = Literal["diagonal", "full"]
@@ -36,14 +37,35 @@ class EvolutionConfig:
 
 
 class Normals:
-    """Standard normal samples for pycma, from a generator whose state we can write down."""
+    """Standard normal samples for pycma from a generator whose state can be written down, ahead where there is time."""
 
     def __init__(self, seed: int) -> None:
-        self.generator = np.random.Generator(np.random.PCG64(seed))
+        self._generator = np.random.Generator(np.random.PCG64(seed))
+        self._ahead: tuple[dict[str, Any], NDArray[np.float64]] | None = None  # the state before it, and what was drawn
 
     def __call__(self, *shape: int) -> NDArray[np.float64]:
         """Draw an array of `shape`, as pycma asks for it."""
-        return self.generator.standard_normal(shape)
+        if self._ahead is not None and self._ahead[1].shape == shape:
+            _, drawn = self._ahead
+            self._ahead = None
+            return drawn
+        self.state = self.state
+        return self._generator.standard_normal(shape)
+
+    def draw_ahead(self, *shape: int) -> None:
+        """Draw now what is likely asked for next; no number changes by it."""
+        if self._ahead is None:
+            self._ahead = self.state, self._generator.standard_normal(shape)
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """The generator's state, as if nothing was drawn ahead."""
+        return self._ahead[0] if self._ahead is not None else dict(self._generator.bit_generator.state)
+
+    @state.setter
+    def state(self, state: dict[str, Any]) -> None:
+        self._ahead = None
+        self._generator.bit_generator.state = state
 
 
 class Evolution:
@@ -94,15 +116,19 @@ class Evolution:
         self._strategy.tell(self._asked, [-float(value) for value in fitness])
         self._asked = []
 
-    def state(self) -> bytes:
-        """Everything that the next `ask` depends on, as an `.npz`."""
+    def prepare(self) -> None:
+        """Do now what the next `ask` would do, as far as it does not depend on `tell`."""
+        self._normals.draw_ahead(self._config.population, self._config.dimension)
+
+    def state(self) -> Checkpoint:
+        """Everything that the next `ask` depends on."""
         arrays = cma_state.dump(self._strategy)
-        arrays["random"] = np.array(json.dumps(self._normals.generator.bit_generator.state))
+        arrays["random"] = np.array(json.dumps(self._normals.state))
         arrays["cma"] = np.array(CMA_VERSION)
-        return cma_state.pack(arrays)
+        return Checkpoint(arrays)
 
     def restore(self, state: bytes) -> None:
-        """Continue from `state`, written by a strategy of the same configuration and pycma version."""
+        """Continue from a packed `state`, written by a strategy of the same configuration and pycma version."""
         arrays = cma_state.unpack(state)
         written = str(arrays.pop("cma"))
         if written != CMA_VERSION:
@@ -118,4 +144,4 @@ class Evolution:
             self.ask()
             self.tell(np.arange(self._config.population, dtype=np.float64))
             cma_state.restore(self._strategy, arrays)
-        self._normals.generator.bit_generator.state = random
+        self._normals.state = random

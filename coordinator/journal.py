@@ -21,8 +21,11 @@ from common import schema
 from common.errors import DreamfleetError, JournalError
 from common.messages import Job, Result
 from common.runs import BUNDLE, JOURNAL, RunFolder, RunSettings, StoredEvaluation, StoredGeneration
+from coordinator.cma_state import Checkpoint
 from coordinator.collection import Collection
 from coordinator.evaluation import Evaluation
+
+sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ class Journal:
         return number
 
     def open_generation(
-        self, number: int, state: bytes, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]
+        self, number: int, state: Checkpoint, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]
     ) -> None:
         """Write a population before it travels, and the strategy's state from before it was asked; two states stay."""
         self._write(

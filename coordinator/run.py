@@ -148,6 +148,10 @@ class Run:
         """Make everything so far durable."""
         self._journal.commit()
 
+    def prepare(self) -> None:
+        """Work ahead while workers are busy."""
+        self._evolution.prepare()
+
     def pause(self, why: str) -> None:
         """Dispatch nothing more until the run is resumed."""
         self.paused = why

@@ -154,6 +154,7 @@ class Service:
                 self._put(session, self._run.fleet.dispatch(now, durable=False))  # workers need not wait for the disk
             self._run.commit()
             self._put(session, self._run.fleet.dispatch(now))
+            self._run.prepare()
             self._publish_closed(session)
             self._write_notes()
             if self._draining and not self._run.fleet.leased:

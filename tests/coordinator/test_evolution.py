@@ -3,7 +3,7 @@ import pytest
 
 from common.errors import JournalError, UsageError
 from coordinator import cma_state
-from coordinator.evolution import Evolution, EvolutionConfig
+from coordinator.evolution import Evolution, EvolutionConfig, Normals
 
 
 def config(**changes):
@@ -30,7 +30,7 @@ def test_a_continued_strategy_equals_one_that_never_stopped(covariance, checkpoi
     first = Evolution(config(covariance=covariance))
     run(first, range(checkpoint))
     second = Evolution(config(covariance=covariance))
-    second.restore(first.state())
+    second.restore(first.state().packed())
     run(second, range(checkpoint, 60))
 
     assert np.array_equal(second.mean, uninterrupted.mean)
@@ -44,7 +44,7 @@ def test_a_checkpoint_continues_at_the_real_size(checkpoint):
     run(uninterrupted, range(10))
     run(first, range(checkpoint))
     second = Evolution(config(dimension=867, population=16))
-    second.restore(first.state())
+    second.restore(first.state().packed())
     run(second, range(checkpoint, 10))
     assert np.array_equal(second.mean, uninterrupted.mean)
 
@@ -52,17 +52,31 @@ def test_a_checkpoint_continues_at_the_real_size(checkpoint):
 def test_the_state_is_arrays_and_reading_it_needs_no_pickle():
     evolution = Evolution(config())
     run(evolution, range(3))
-    assert all(array.dtype != object for array in cma_state.unpack(evolution.state()).values())
+    assert all(array.dtype != object for array in cma_state.unpack(evolution.state().packed()).values())
 
 
 def test_asking_again_from_a_state_gives_the_same_population():
     evolution = Evolution(config())
     run(evolution, range(3))
-    state = evolution.state()
+    state = evolution.state().packed()
     asked = evolution.ask()
     other = Evolution(config())
     other.restore(state)
     assert np.array_equal(other.ask(), asked)
+
+
+def test_what_is_drawn_ahead_changes_no_number():
+    ahead, plain = Evolution(config()), Evolution(config())
+    for generation in range(5):
+        ahead.prepare()
+        ahead.prepare()
+        assert ahead.state().packed() == plain.state().packed()
+        run(ahead, [generation])
+        run(plain, [generation])
+    assert np.array_equal(ahead.mean, plain.mean)
+    normals, same = Normals(1), Normals(1)
+    normals.draw_ahead(4, 2)
+    assert np.array_equal(normals(3, 2), same(3, 2)), "pycma may ask for another shape"
 
 
 def test_it_maximises():
@@ -87,7 +101,7 @@ def test_tell_refuses_what_pycma_would_swallow(fitness):
 
 def test_a_state_of_another_pycma_is_refused_with_the_remedy():
     evolution = Evolution(config())
-    arrays = cma_state.unpack(evolution.state())
+    arrays = evolution.state().arrays
     arrays["cma"] = np.array("3.2.1")
     with pytest.raises(JournalError, match=r"pip install cma==3\.2\.1"):
         evolution.restore(cma_state.pack(arrays))
