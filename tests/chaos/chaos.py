@@ -37,7 +37,7 @@ CALM = 120.0  # seconds without a new result that mean a hung run
 class Fleet:
     """A coordinator and workers, each behind a relay of its own; the last one on a host of its own where allowed."""
 
-    def __init__(self, processes, bundle, generations, seed, host):
+    def __init__(self, processes, bundle, generations, seed, host=None):
         self.processes = processes
         self._host = host
         self.random = random.Random(seed)
