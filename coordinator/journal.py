@@ -110,7 +110,7 @@ class Journal:
     def open_generation(
         self, number: int, state: Checkpoint, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]
     ) -> None:
-        """Write a population before it travels, and the strategy's state from before it was asked; two states stay."""
+        """Write a population, and the strategy's state from before it was asked; two states stay."""
         self._write(
             "INSERT INTO generation (number, seeds, opened, sigma) VALUES (?, ?, ?, ?)",
             number, json.dumps(list(seeds)), time(), sigma,
