@@ -1,8 +1,11 @@
-"""Recorded pictures as latents, once, so that the MDN-RNN trains on them many times; each drive also mirrored."""
+"""Recorded pictures as latents, once, so that the MDN-RNN trains on them many times; each drive also mirrored.
+
+By the encoder as bundles carry it: the latents that controllers will see, to the bit.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,33 +15,36 @@ from numpy.typing import NDArray
 from common.bundle import hash_file
 from common.errors import DatasetError
 from common.files import write_aside
-from worker.training.checkpoint import load_checkpoint, load_config
+from worker.training.checkpoint import load_config, load_weights
 from worker.training.dataset import check_pictures, check_whole, episodes, load, load_pictures
-from worker.training.train_vae import CHECKPOINT, as_tensor
-from worker.worldmodel.vae import VAE
+from worker.training.train_vae import CHECKPOINT
+from worker.worldmodel.export import export_encoder
+from worker.worldmodel.inference import open_graph
 from worker.worldmodel.vae_config import VAEConfig
 
 ENCODED = "encoded"
+BATCH = 100  # pictures
+
+Latents = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def encode(folder: Path) -> Iterator[int]:
     """Encode the episodes that are not encoded yet, and all when the VAE is another; yields the frames of each."""
     if not (folder / CHECKPOINT).exists():
         raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
-    model = VAE(load_config(folder / CHECKPOINT, VAEConfig))
-    load_checkpoint(folder / CHECKPOINT, model, None)
-    model.eval()
+    config = load_config(folder / CHECKPOINT, VAEConfig)
+    look = _encoder(folder, config)
     vae = hash_file(folder / CHECKPOINT)
     check_whole(episodes(folder), "picture", "preprocessing", "action", "reward", "ended")
-    check_pictures(episodes(folder), model.config.picture)
+    check_pictures(episodes(folder), config.picture)
     for path in episodes(folder):
         target = folder / ENCODED / path.name
         if target.exists() and _is_of(target, vae):
             continue
         pictures = load_pictures(path)
         drive = load(path, "action", "reward", "ended")
-        mu, logvar = _latents(model, pictures)
-        mirrored_mu, mirrored_logvar = _latents(model, np.ascontiguousarray(pictures[:, :, ::-1]))
+        mu, logvar = look(pictures)
+        mirrored_mu, mirrored_logvar = look(np.ascontiguousarray(pictures[:, :, ::-1]))
         with write_aside(target) as file:
             np.savez(
                 file, mu=mu, logvar=logvar, mirrored_mu=mirrored_mu, mirrored_logvar=mirrored_logvar,
@@ -66,7 +72,15 @@ def _is_of(target: Path, vae: str) -> bool:
         return False
 
 
-def _latents(model: VAE, pictures: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    with torch.no_grad():
-        parts = [model.encode(as_tensor(pictures[start : start + 100])) for start in range(0, len(pictures), 100)]
-    return torch.cat([mu for mu, _ in parts]).numpy(), torch.cat([logvar for _, logvar in parts]).numpy()
+def _encoder(folder: Path, config: VAEConfig) -> Callable[[NDArray[np.uint8]], Latents]:
+    """From pictures `(T, side, side, 3)` to `mu` and `logvar` `(T, latent)`, on as many threads as torch would take."""
+    graph = export_encoder(load_weights(folder / CHECKPOINT), config)
+    session = open_graph(graph, torch.get_num_threads())
+
+    def look(pictures: NDArray[np.uint8]) -> Latents:
+        starts = range(0, len(pictures), BATCH)
+        parts = [session.run(["mu", "logvar"], {"picture": pictures[start : start + BATCH]}) for start in starts]
+        mu, logvar = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return mu, logvar
+
+    return look

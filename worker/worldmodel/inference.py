@@ -19,15 +19,20 @@ ATTENTION = "attention"  # an output of dreams with a window
 
 def open_part(bundle: Bundle, name: str) -> onnxruntime.InferenceSession:
     """A session on one of a bundle's graphs; one thread, because scoring processes are one a core."""
+    try:
+        return open_graph(bundle.read(name), threads=1)
+    except Exception as error:  # the runtime's errors share no public base
+        raise BundleError(f"{bundle.path}: {name} cannot be run ({error})") from error
+
+
+def open_graph(graph: bytes, threads: int) -> onnxruntime.InferenceSession:
+    """A session on an ONNX graph, on so many threads; a row's bits do not depend on their number."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
-    try:
-        return onnxruntime.InferenceSession(bundle.read(name), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # the runtime's errors share no public base
-        raise BundleError(f"{bundle.path}: {name} cannot be run ({error})") from error
+    return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
 
 def check_sizes(
