@@ -9,7 +9,7 @@ from typing import Any, Literal
 from common.bundle import Bundle
 from common.config import option
 from common.errors import UsageError
-from common.messages import TaskSpec
+from common.messages import COLDEST, HOTTEST, TaskSpec
 from common.runs import RunSettings
 
 
@@ -46,10 +46,10 @@ class RunConfig:
                 raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
         if self.racing and self.episodes < 2:
             raise UsageError("--racing needs at least 2 episodes: there is no second half of one")
-        for name in ("sigma0", "temperature"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
-                raise UsageError(f"--{name} must be a positive number, not {value}")
+        if not 0 < self.sigma0 < float("inf"):
+            raise UsageError(f"--sigma0 must be a positive number, not {self.sigma0}")
+        if self.temperature is not None and not COLDEST <= self.temperature <= HOTTEST:
+            raise UsageError(f"--temperature must be from {COLDEST:g} to {HOTTEST:g}, not {self.temperature}")
 
     def settings(self, bundle: Bundle) -> RunSettings:
         """What the journal keeps: the bundle by its hash."""

@@ -51,6 +51,12 @@ def test_a_start_of_another_length_is_refused(random_bundle):
         start.check(random_bundle, random_bundle.shape_of("z"))
 
 
+@pytest.mark.parametrize("temperature", [0.0, -1.0, 5000.0, float("nan"), float("inf")])
+def test_a_temperature_that_a_journal_cannot_keep_is_refused(temperature):
+    with pytest.raises(UsageError, match=r"--temperature must be from 0\.001 to 1000"):
+        RunConfig(temperature=temperature)
+
+
 def test_a_hidden_layer_has_units():
     with pytest.raises(UsageError, match="hidden-units"):
         RunConfig(hidden_units=0)
