@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field
-from functools import cache
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
 from common.controller import ControllerShape
@@ -64,13 +64,17 @@ class TaskSpec:
     controller: ControllerShape | None = field(default=None, metadata=OPTIONAL)  # `None`: linear on z and h
     temperature: Temperature | None = field(default=None, metadata=OPTIONAL)  # of a dream
 
+    def at(self, temperature: float | None) -> TaskSpec:
+        """The same at another temperature; `None`: at its own."""
+        return self if temperature is None else replace(self, temperature=temperature)
+
     def digest(self, kind: Kind, vector: bytes, seeds: tuple[int, ...]) -> bytes:
         """A job's identity: SHA-256 over its kind, this specification, the parameters' hash and the seeds."""
         text = f'{{"kind": "{kind}", "seeds": {list(seeds)}, "spec": {_spec_text(self)}}}'
         return hashlib.sha256(vector + text.encode()).digest()
 
 
-@cache
+@lru_cache  # bounded: a run's temperature may rise again and again
 def _spec_text(spec: TaskSpec) -> str:
     return json.dumps(written(spec), sort_keys=True)
 
@@ -109,6 +113,7 @@ class Job:
     vector: Digest
     digest: Digest
     stall: Seconds  # no step for so long: hung
+    temperature: Temperature | None = field(default=None, metadata=OPTIONAL)  # `None`: the specification's own
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ def test_a_runs_controller_is_as_configured_and_journalled(random_bundle, flags,
 def test_a_default_controller_leaves_the_words_of_the_first_version(random_bundle):
     text = json.loads(RunConfig().settings(random_bundle).to_json())
     assert text["controller"] == {"features": 288, "actions": 3}
-    assert not {"features", "racing"} & text.keys()
+    assert not {"features", "racing", "heat"} & text.keys()
     assert "controller" not in text["task"]
 
 
