@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field
-from functools import cache
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
 from common.controller import ControllerShape
@@ -20,6 +20,7 @@ MAX_PART = 40 * 1024  # room for the envelope around a part's bytes
 MAX_UPLOAD = 32 << 20  # a drive of 1000 steps is 12 MB (64x64) or 28 MB (96x96) before it is compressed
 MAX_LEASES = 1024  # of one worker: so that a beat, which names them all, stays under MAX_MESSAGE
 TAG_BYTES = 8
+COLDEST, HOTTEST = 1e-3, 1e3  # of a dream
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ Tag = Annotated[
 Word = Annotated[str, Length(1, 128)]
 Text = Annotated[str, Length(0, 2000)]
 Part = Annotated[bytes, Length(0, MAX_PART)]
+Temperature = Annotated[float, Between(COLDEST, HOTTEST)]
 Kind = Literal["score", "evaluate", "collect"]
 VerdictWord = Literal["accepted", "duplicate", "obsolete", "refused"]
 
@@ -60,7 +62,11 @@ class TaskSpec:
     horizon: Annotated[int, Between(1, 10**6)]  # an episode's steps at most, when scored for the strategy
     patience: Annotated[int, Between(0, 10**6)]  # steps without reward before a scored episode is cut; 0: never
     controller: ControllerShape | None = field(default=None, metadata=OPTIONAL)  # `None`: linear on z and h
-    temperature: Annotated[float, Between(1e-3, 1e3)] | None = field(default=None, metadata=OPTIONAL)  # of a dream
+    temperature: Temperature | None = field(default=None, metadata=OPTIONAL)  # of a dream
+
+    def at(self, temperature: float | None) -> TaskSpec:
+        """The same at another temperature; `None`: at its own."""
+        return self if temperature is None else replace(self, temperature=temperature)
 
     def digest(self, kind: Kind, vector: bytes, seeds: tuple[int, ...]) -> bytes:
         """A job's identity: SHA-256 over its kind, this specification, the parameters' hash and the seeds."""
@@ -68,7 +74,7 @@ class TaskSpec:
         return hashlib.sha256(vector + text.encode()).digest()
 
 
-@cache
+@lru_cache  # bounded: a run's temperature may rise again and again
 def _spec_text(spec: TaskSpec) -> str:
     return json.dumps(written(spec), sort_keys=True)
 
@@ -107,6 +113,7 @@ class Job:
     vector: Digest
     digest: Digest
     stall: Seconds  # no step for so long: hung
+    temperature: Temperature | None = field(default=None, metadata=OPTIONAL)  # `None`: the specification's own
 
 
 @dataclass(frozen=True)

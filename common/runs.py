@@ -48,6 +48,8 @@ class RunSettings:
     features: Literal["zh", "z"] = field(default="zh", metadata=OPTIONAL)  # what the controller sees
     collect_every: Count = field(default=0, metadata=OPTIONAL)  # generations; 0: never
     collect_episodes: Annotated[int, Between(1, 10**4)] = field(default=1, metadata=OPTIONAL)
+    # What a dream's temperature is multiplied by when evaluations fall; 1: never.
+    heat: float = field(default=1.0, metadata=OPTIONAL)
 
     def to_json(self) -> str:
         """The text kept in the journal."""
@@ -105,6 +107,10 @@ class StoredEvaluation:
     def error(self) -> float:
         """Standard error of the mean."""
         return self.std / math.sqrt(self.episodes)
+
+    def behind(self, other: StoredEvaluation) -> bool:
+        """Whether it lies below the other one by more than two standard errors of the difference."""
+        return other.mean - self.mean > 2 * math.hypot(other.error, self.error)
 
 
 class RunFolder:

@@ -49,8 +49,10 @@ def _facts(status: dict[str, Any]) -> Table:
     grid.add_column()
     grid.add_column(style="dim")
     grid.add_column()
+    temperature = status["generation"].get("temperature")  # which an older coordinator does not tell
+    warm = "" if temperature is None else f", temperature {temperature:g}"
     grid.add_row(
-        "task", f"{task['task']}, {task['horizon']} steps", "population",
+        "task", f"{task['task']}, {task['horizon']} steps{warm}", "population",
         f"{settings['population']} x {settings['episodes']}",
     )  # fmt: skip
     grid.add_row(

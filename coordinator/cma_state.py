@@ -48,7 +48,7 @@ def dump(strategy: Any) -> dict[str, NDArray[Any]]:
     for path, _, _, value in _leaves(strategy):
         if isinstance(value, np.ndarray):
             arrays[path] = value.copy()
-        elif isinstance(value, list):
+        elif isinstance(value, (list, range)):
             about[path] = ["list", len(value), [_tag(item) for item in value]]
             for index, item in enumerate(value):
                 if isinstance(item, np.ndarray):
@@ -105,7 +105,7 @@ def _leaves(value: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str,
 
 
 def _is_leaf(value: Any) -> bool:
-    if type(value) is list:
+    if type(value) in (list, range):  # the indices of mirrored samples are a range
         return all(isinstance(item, (*_SCALARS, np.ndarray)) for item in value)
     return isinstance(value, _SCALARS) or type(value) is np.ndarray
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from common.bundle import Bundle
 from common.config import option
 from common.errors import UsageError
-from common.messages import TaskSpec
+from common.messages import COLDEST, HOTTEST, TaskSpec
 from common.runs import RunSettings
 
 
@@ -30,6 +30,9 @@ class RunConfig:
     horizon: int = option(1000, "steps of a scored episode at most")
     patience: int = option(0, "cut a scored episode after so many steps without reward; 0: never")
     temperature: float | None = option(None, "of a dream's sampling; above 1 it is harder, and harder to exploit")
+    heat: float = option(
+        1.0, "multiply the temperature by this each time that the evaluated mean falls clearly behind; 1: never"
+    )
     seed: int = option(1, "makes the run: population and tracks follow from it")
     evaluate_every: int = option(
         25, "drive the mean in reality every so many generations; 0: never", alias="--reality-check"
@@ -46,10 +49,14 @@ class RunConfig:
                 raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
         if self.racing and self.episodes < 2:
             raise UsageError("--racing needs at least 2 episodes: there is no second half of one")
-        for name in ("sigma0", "temperature"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
-                raise UsageError(f"--{name} must be a positive number, not {value}")
+        if not 0 < self.sigma0 < float("inf"):
+            raise UsageError(f"--sigma0 must be a positive number, not {self.sigma0}")
+        if self.temperature is not None and not COLDEST <= self.temperature <= HOTTEST:
+            raise UsageError(f"--temperature must be from {COLDEST:g} to {HOTTEST:g}, not {self.temperature}")
+        if not 1 <= self.heat < float("inf"):
+            raise UsageError(f"--heat must be a number of at least 1, not {self.heat}")
+        if self.heat > 1 and (self.temperature is None or not self.evaluate_every):
+            raise UsageError("--heat raises --temperature when evaluations fall: give it and --evaluate-every too")
 
     def settings(self, bundle: Bundle) -> RunSettings:
         """What the journal keeps: the bundle by its hash."""
@@ -69,6 +76,7 @@ class RunConfig:
             features=self.features,
             collect_every=self.collect_every,
             collect_episodes=self.collect_episodes,
+            heat=self.heat,
         )
 
 

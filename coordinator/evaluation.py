@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,7 +25,7 @@ class Evaluation:
 
 
 def parted(evaluations: Sequence[StoredEvaluation], count: int) -> bool:
-    """Whether the last `count` evaluations each lie two standard errors of the difference below the best before them.
+    """Whether the last `count` evaluations each lie clearly behind the best before them.
 
     That is how a dream that is being exploited looks: fitness in the dream goes on rising, reality falls.
     """
@@ -34,4 +33,4 @@ def parted(evaluations: Sequence[StoredEvaluation], count: int) -> bool:
     if not before:
         return False
     best = max(before, key=lambda each: each.mean)
-    return all(best.mean - each.mean > 2 * math.hypot(best.error, each.error) for each in last)
+    return all(each.behind(best) for each in last)

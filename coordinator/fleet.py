@@ -66,7 +66,7 @@ class Fleet:
         self._ticked: float | None = None
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
-        self.notes: list[str] = []  # what happened to workers, for whoever writes it down and clears it
+        self.notes: list[str] = []  # what happened, for whoever writes it down and clears it
         self.hurry = False  # nothing but evaluations and collected drives is left to wait for
         self.paused = False
 

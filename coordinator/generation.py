@@ -15,17 +15,20 @@ class Generation:
     """Which candidate's which episode each digest is, and its fitness once known.
 
     With `racing` every candidate drives the first half of the episodes, and after this barrier the better half of the
-    candidates the others; of equals the one with the lower index goes on.
+    candidates the others; of equals the one with the lower index goes on. `temperature` is one other than the
+    specification's.
     """
 
     def __init__(
-        self, number: int, spec: TaskSpec, vectors: Sequence[bytes], seeds: Sequence[int], *, racing: bool = False
-    ) -> None:
+        self, number: int, spec: TaskSpec, vectors: Sequence[bytes], seeds: Sequence[int], *, racing: bool = False,
+        temperature: float | None = None,
+    ) -> None:  # fmt: skip
         self.number = number
+        self.temperature = temperature
         self.work = [
             work
             for candidate, vector in enumerate(vectors)
-            for work in make_work(spec, "score", number, candidate, vector, seeds)
+            for work in make_work(spec, "score", number, candidate, vector, seeds, temperature)
         ]
         # Equal vectors have equal digests: one job then fills the place of each of them.
         self._places: dict[bytes, list[tuple[int, int]]] = {}

@@ -28,10 +28,11 @@ def travelling(vector: NDArray[np.float64]) -> bytes:
 
 
 def make_work(
-    spec: TaskSpec, kind: Kind, generation: int, candidate: int, vector: bytes, seeds: Sequence[int]
-) -> list[Work]:
-    """One job an episode; `seeds` holds one seed an episode."""
-    identity = hashlib.sha256(vector).digest()
+    spec: TaskSpec, kind: Kind, generation: int, candidate: int, vector: bytes, seeds: Sequence[int],
+    temperature: float | None = None,
+) -> list[Work]:  # fmt: skip
+    """One job an episode; `seeds` holds one seed an episode, `temperature` is one other than the specification's."""
+    identity, spec = hashlib.sha256(vector).digest(), spec.at(temperature)
     return [
         Work(
             Job(
@@ -44,6 +45,7 @@ def make_work(
                 vector=identity,
                 digest=spec.digest(kind, identity, (seed,)),
                 stall=STALL_SECONDS,
+                temperature=temperature,
             ),
             vector,
         )

@@ -6,6 +6,7 @@ of a generation may leave before it: a coordinator that dies in between asks for
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from common.controller import Controller
 from common.errors import JournalError
 from common.files import write_aside
+from common.heat import deciding_check, raised_temperature
 from common.messages import HelloRequest, Job, Result, ResultBatch, UploadPart
 from common.runs import CONTROLLER, RunSettings, StoredEvaluation, StoredGeneration, rollout_path
 from common.seeds import training_seed
@@ -62,6 +64,7 @@ class Run:
         self.uploads = Uploads()
         self._collecting: set[bytes] = set()  # digests of the drives that are still to come
         self._collections = 0  # drives that were ever scheduled
+        self._ending = False  # a limit is reached: only evaluations and collected drives are waited for
         self.uid = journal.fact("uid") or ""
         self.fingerprint = journal.fact("fingerprint")
         self.incarnation = journal.begin_incarnation()
@@ -80,6 +83,11 @@ class Run:
     def sigma(self) -> float:
         """The strategy's overall step size."""
         return self._evolution.sigma
+
+    @property
+    def temperature(self) -> float | None:
+        """At which the open generation dreams; `None` where a task has none."""
+        return self.settings.task.at(self.generation.temperature).temperature
 
     def refusal(self, request: HelloRequest, mixed: bool) -> tuple[str, str] | None:
         """Why a worker cannot join and what to do about it; `None` if it may."""
@@ -132,7 +140,7 @@ class Run:
     def advance(self, now: float) -> bool:
         """Close what is complete and open what follows; whether a generation was opened."""
         closed = len(self.history)
-        while self.ended is None and self.paused is None and self.generation.complete and not self.fleet.hurry:
+        while self.ended is None and self.paused is None and self.generation.complete and not self._waiting:
             self._close(now)
         poison = self.fleet.poison()
         if poison is not None and self.paused is None:
@@ -140,7 +148,8 @@ class Run:
             reasons = "; ".join(f"{worker}: {error}" for worker, error in errors.items())
             self.pause(f"candidate {work.job.generation}/{work.job.candidate} failed on two workers ({reasons})")
         self.uploads.tick(now)
-        if self.fleet.hurry and not self._in_slack and self.ended is None:
+        self.fleet.hurry = self._waiting
+        if self._ending and not self._in_slack and self.ended is None:
             self._end(self._stop_reason() or "stopped")
         return len(self.history) > closed
 
@@ -215,7 +224,7 @@ class Run:
                 "journal holds; use the host and package versions that wrote it"
             )
         self.history, self.evaluations = self._journal.closed()
-        generation = Generation(last.number, self.settings.task, last.vectors, last.seeds, racing=self.settings.racing)
+        generation = self._generation(last.number, last.vectors, last.seeds)
         for digest, (fitness, steps) in self._journal.results_of("score", last.number).items():
             generation.record(digest, fitness, steps)
         for evaluation in self._journal.pending_evaluations():
@@ -223,7 +232,7 @@ class Run:
         for collection in self._journal.collections():
             self._collect(collection)
         if (reason := self._stop_reason()) is not None and not generation.done:
-            self.fleet.hurry = self._in_slack
+            self._ending = self._in_slack
             self.ended = None if self._in_slack else reason
         else:
             self._journal.drop_fact("ended")
@@ -235,11 +244,21 @@ class Run:
         vectors = [travelling(x) for x in self._evolution.ask()]
         seeds = [training_seed(self.settings.seed, number, episode) for episode in range(self.settings.episodes)]
         self._journal.open_generation(number, state, sigma, seeds, vectors)
-        generation = Generation(number, self.settings.task, vectors, seeds, racing=self.settings.racing)
+        generation = self._generation(number, vectors, seeds)
+        if number and generation.temperature != self.generation.temperature:
+            self.fleet.notes.append(
+                f"generation {number} dreams at temperature {generation.temperature:g}: the evaluated mean fell"
+            )
         self.opened = now
         self.fleet.forget(before=number - 1)
         self.fleet.offer(generation.missing)
         return generation
+
+    def _generation(self, number: int, vectors: Sequence[bytes], seeds: Sequence[int]) -> Generation:
+        temperature = raised_temperature(number, self.settings, self.evaluations)
+        return Generation(
+            number, self.settings.task, vectors, seeds, racing=self.settings.racing, temperature=temperature
+        )
 
     def _close(self, now: float) -> None:
         fitness = self.generation.fitness()
@@ -269,7 +288,7 @@ class Run:
         self.generation = self._open(closed.number + 1, now)
         if reason:
             self.fleet.withdraw("score")
-            self.fleet.hurry = True
+            self._ending = True
 
     def _evaluate(self, generation: int) -> None:
         evaluation = Evaluation(generation, travelling(self._evolution.mean), self.settings.evaluation_episodes)
@@ -312,6 +331,12 @@ class Run:
                 file.write(data)
         except OSError as error:
             raise JournalError(f"cannot write {path}: {error.strerror}; make room and continue the run") from error
+
+    @property
+    def _waiting(self) -> bool:
+        """Whether the run is ending, or the next generation's temperature hangs on an evaluation in progress."""
+        check = deciding_check(self.settings, self.generation.number + 1)
+        return self._ending or (check in self._evaluating and self.generation.complete)
 
     @property
     def _in_slack(self) -> bool:

@@ -54,6 +54,7 @@ def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float
         "episodes": run.generation.total,
         "seconds": round(now - run.opened, 1),
         "sigma": run.sigma,
+        "temperature": run.temperature,
     }
     last = asdict(run.history[-1]) if run.history else None
     evaluation = asdict(run.evaluations[-1]) if run.evaluations else None

@@ -50,7 +50,8 @@ class Backlog:
             self._jobs.pop(digest, None)
         refused = []
         for job in batch.jobs:
-            if job.digest != self._spec.digest(job.kind, job.vector, job.seeds) or job.task != self._spec.task:
+            spec = self._spec.at(job.temperature)
+            if job.digest != spec.digest(job.kind, job.vector, job.seeds) or job.task != spec.task:
                 refused.append((job, "the job's digest is not of its content"))
             else:
                 self._jobs[job.digest] = job
@@ -58,10 +59,13 @@ class Backlog:
         return refused
 
     def take(self, count: int) -> list[tuple[Job, bytes]]:
-        """The first jobs whose vectors are whole, with them: at most `count` to be scored, or one of another kind."""
+        """The first jobs whose vectors are whole, with them: at most `count` to be scored, or one of another kind.
+
+        They are of one temperature.
+        """
         taken: list[tuple[Job, bytes]] = []
         for digest, job in list(self._jobs.items()):
-            if len(taken) == count or (taken and job.kind != "score"):
+            if len(taken) == count or (taken and (job.kind != "score" or job.temperature != taken[0][0].temperature)):
                 break
             if (vector := self._whole(job.vector)) is not None:
                 taken.append((job, vector))

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from common.bundle import Bundle
+from common.heat import spec_of
 from common.runs import RunFolder
 from common.threads import pin_thread_pools
 
@@ -22,14 +23,14 @@ class Replayed:
 
 
 def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[Replayed]:
-    """Each stored episode of a candidate, scored again under the run's task, bundle and seeds."""
+    """Each stored episode of a candidate, scored again under its generation's task, bundle and seeds."""
     parameters = run.candidate(generation, candidate)
     results = run.results(generation, candidate)
     pin_thread_pools()
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from worker.scoring import Scorer
 
-    scorer = Scorer(run.spec, Bundle.open(run.bundle_path))
+    scorer = Scorer(spec_of(run, generation), Bundle.open(run.bundle_path))
     for result in results:
         yield Replayed(
             result.episode, result.seed, result.fitness, scorer.score("score", parameters, result.seed).fitness

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from common.bundle import Bundle
 from common.messages import Kind, TaskSpec
 from worker.drive import Drive
 from worker.rollout import Course, rollout
-from worker.tasks.api import Batched, Score, find_task
+from worker.tasks.api import Batch, Batched, Score, find_task
 
 DRIVER = "controller"  # as a kept drive names who drove
 FULL_EPISODE = 10**6  # steps: the environment's own limit ends it
@@ -24,29 +25,41 @@ class Scorer:
         task = find_task(spec.task)
         fitting = bundle.under(spec.controller)
         self._spec = spec
-        self._batch = task.make_batch(fitting, spec) if isinstance(task, Batched) and not judge else None
+        self._batch_at: Callable[[float | None], Batch] | None = None
+        if isinstance(task, Batched) and not judge:
+            make = task.make_batch
+            # One is kept: a run's temperature is raised now and then, and making a batch takes milliseconds.
+            self._batch_at = lru_cache(maxsize=1)(lambda temperature: make(fitting, spec.at(temperature)))
+            self._batch_at(None)  # so that what is wrong with it shows at once
         self._environment = task.make_judge(fitting) if judge else task.make_environment(fitting)
         self._policy = task.make_policy(fitting)
         self._preprocessing = bundle.manifest.preprocessing
 
     def score(
-        self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None
-    ) -> Score:
-        """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode."""
-        if kind == "score" and self._batch is not None:
-            return self._batch.score([(parameters, seed)], on_step)[0]
+        self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,
+        temperature: float | None = None,
+    ) -> Score:  # fmt: skip
+        """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode.
+
+        `temperature` is one other than the run's.
+        """
+        if kind == "score" and self._batch_at is not None:
+            return self._batch_at(temperature).score([(parameters, seed)], on_step)[0]
         return rollout(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
 
     def score_all(
-        self, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]], on_step: Callable[[int], None]
-    ) -> list[Score]:
+        self, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]], on_step: Callable[[int], None],
+        temperature: float | None = None,
+    ) -> list[Score]:  # fmt: skip
         """A turn's jobs, as `score` does; `on_step` hears of all steps made so far."""
-        if self._batch is not None and all(kind == "score" for kind, _, _ in jobs):
-            return self._batch.score([(parameters, seed) for _, parameters, seed in jobs], on_step)
+        if self._batch_at is not None and all(kind == "score" for kind, _, _ in jobs):
+            return self._batch_at(temperature).score([(parameters, seed) for _, parameters, seed in jobs], on_step)
         scores: list[Score] = []
         for job in jobs:
             before = sum(each.steps for each in scores)
-            scores.append(self.score(*job, lambda done, before=before: on_step(before + done)))  # type: ignore[misc]
+            scores.append(
+                self.score(*job, lambda done, before=before: on_step(before + done), temperature)  # type: ignore[misc]
+            )
         return scores
 
     def collect(

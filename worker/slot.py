@@ -70,7 +70,7 @@ class SlotEvent:
 
 @dataclass
 class Turn:
-    """Jobs that a child scores together: one, or as many as its task's width."""
+    """Jobs that a child scores together, at one temperature: one, or as many as its task's width."""
 
     number: int
     work: Sequence[Work]
@@ -339,7 +339,7 @@ def _do(scorer: Any, turn: int, work: Sequence[Work], count: Callable[[int], Non
             score, drive = scorer.collect(vector, seed, on_step)
             scores, upload = [score], _packed(drive)
         else:
-            scores = scorer.score_all(episodes, on_step)
+            scores = scorer.score_all(episodes, on_step, work[0][0].temperature)
     except AbandonedError:
         raise
     except Exception as error:

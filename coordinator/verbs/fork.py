@@ -7,7 +7,7 @@ from pathlib import Path
 
 from common.runs import default_runs_dir
 
-SUMMARY = "start a new run from another one's mean and step size; any setting may change"
+SUMMARY = "start a new run from another one's mean, step size and temperature; any setting may change"
 EXTRAS = ()
 
 
@@ -23,6 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the new run until it ends."""
+    from common.heat import spec_of
     from common.runs import open_run
     from coordinator.config import settings_of
     from coordinator.start import latest, start_of
@@ -30,6 +31,7 @@ def run(args: argparse.Namespace) -> int:
 
     with open_run(args.runs_dir, args.source) as stored:
         start, (_, sigma) = start_of(stored), latest(stored)
-        settings = {**settings_of(stored.settings, stored.bundle_path), "sigma0": sigma}
+        present = {"sigma0": sigma, "temperature": spec_of(stored, len(stored.history())).temperature}
+        settings = {**settings_of(stored.settings, stored.bundle_path), **present}
     args.run_name = args.run_name or f"{args.source}-fork"
     return serve(args, settings, start)

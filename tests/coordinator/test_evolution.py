@@ -38,6 +38,18 @@ def test_a_continued_strategy_equals_one_that_never_stopped(covariance, checkpoi
     assert np.array_equal(second.ask(), uninterrupted.ask())
 
 
+@pytest.mark.parametrize("population", [2, 3, 4, 5])
+def test_a_small_population_of_which_pycma_mirrors_some_continues_too(population):
+    uninterrupted, restarted = Evolution(config(population=population)), Evolution(config(population=population))
+    for generation in range(30):
+        run(uninterrupted, [generation])
+        state = restarted.state().packed()
+        restarted = Evolution(config(population=population))
+        restarted.restore(state)
+        run(restarted, [generation])
+        assert np.array_equal(restarted.mean, uninterrupted.mean)
+
+
 @pytest.mark.parametrize("checkpoint", [0, 1, 5])
 def test_a_checkpoint_continues_at_the_real_size(checkpoint):
     uninterrupted, first = (Evolution(config(dimension=867, population=16)) for _ in range(2))

@@ -27,14 +27,15 @@ SETTINGS = RunSettings(
 class Bench:
     """A run in a folder, driven by hand; time stands still unless it is moved."""
 
-    def __init__(self, path, bundle):
+    def __init__(self, path, bundle, settings=SETTINGS, generations=1):
         self.path, self.now = path, 0.0
+        self.settings, self.limits = settings, LimitsConfig(generations=generations)
         path.mkdir(parents=True)
-        self.journal = Journal.create(path, SETTINGS, bundle)
+        self.journal = Journal.create(path, settings, bundle)
         self.begin()
 
     def begin(self):
-        self.run = Run(self.journal, SETTINGS, LimitsConfig(generations=1), Fleet(1.0), self.now)
+        self.run = Run(self.journal, self.settings, self.limits, Fleet(1.0), self.now)
         self.run.advance(self.now)
         self.run.commit()
         for name in (A, B):

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from common.bundle import DREAM, write_bundle
+from common.heat import spec_of
 from common.runs import open_run
+from tests.support import tasks
 
 pytestmark = pytest.mark.timeout(300)
 GENERATIONS, POPULATION, EPISODES = 4, 8, 3
+HEATED_GENERATIONS = 14
 
 
 def begin(processes, bundle, name):
@@ -47,6 +50,48 @@ def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bund
     assert out.count("same bits") == EPISODES
     code, out, err = processes.call("evaluate", "--controller", "alone", "--runs-dir", processes.runs, "--episodes", 1)
     assert code == 0, err
+
+
+def begin_heated(processes, bundle, name):
+    return processes.coordinator(
+        "--bundle", bundle.path, "--task", tasks.OPTIMISTIC, "--population", POPULATION, "--episodes", EPISODES,
+        "--sigma0", 0.5, "--temperature", 1.0, "--heat", 1.5, "--reality-check", 2, "--evaluation-episodes", 8,
+        "--generations", HEATED_GENERATIONS, name=name,
+    )  # fmt: skip
+
+
+def heated_outcome(processes, name):
+    with open_run(processes.runs, name) as run:
+        places = [(g, i) for g in range(HEATED_GENERATIONS) for i in range(POPULATION)]
+        told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
+        temperatures = [spec_of(run, g).temperature for g in range(HEATED_GENERATIONS)]
+        return told, run.evaluations(), temperatures
+
+
+def test_a_heated_run_whose_coordinator_is_killed_raises_at_the_same_generations(processes, random_bundle):
+    coordinator = begin_heated(processes, random_bundle, "calm")
+    worker = processes.worker("--task", tasks.OPTIMISTIC, "--run", "calm")
+    coordinator.wait_for("dreams at temperature")
+    assert coordinator.finish()[0] == 0
+    worker.end()
+    coordinator = begin_heated(processes, random_bundle, "night")
+    processes.worker("--task", tasks.OPTIMISTIC, "--run", "night")
+    for said in ("generation 2: mean", "dreams at temperature"):
+        coordinator.wait_for(said)
+        coordinator.end()
+        coordinator = processes.start(
+            "coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+            "--beat", 0.2, "--generations", HEATED_GENERATIONS,
+        )  # fmt: skip
+    assert coordinator.finish()[0] == 0
+    calm = heated_outcome(processes, "calm")
+    assert calm == heated_outcome(processes, "night")
+    warm = next(g for g, temperature in enumerate(calm[2]) if temperature > 1)
+    for generation in (warm - 1, warm):
+        code, out, err = processes.call(
+            "replay", "night", "--runs-dir", processes.runs, "--candidate", f"{generation}/3"
+        )
+        assert (code, out.count("same bits")) == (0, EPISODES), err
 
 
 def test_a_world_model_without_a_dream_is_refused_by_its_worker(processes, random_bundle, tmp_path):

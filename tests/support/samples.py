@@ -30,10 +30,11 @@ VERDICTS = ("accepted", "duplicate", "obsolete", "refused")
 HEAD = {"run_uid": UID, "incarnation": 3}
 
 
-def job(episode=0, kind="score", candidate=2, spec=SPEC, seed=1048576):
+def job(episode=0, kind="score", candidate=2, spec=SPEC, seed=1048576, temperature=None):
     return Job(
         kind=kind, task=spec.task, generation=7, candidate=candidate, episode=episode, seeds=(seed + episode,),
-        vector=VECTOR_ID, digest=spec.digest(kind, VECTOR_ID, (seed + episode,)), stall=30.0,
+        vector=VECTOR_ID, digest=spec.at(temperature).digest(kind, VECTOR_ID, (seed + episode,)), stall=30.0,
+        temperature=temperature,
     )  # fmt: skip
 
 
@@ -43,6 +44,9 @@ MSGPACK = {
         vectors=(VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR),),
         jobs=(job(), job(1), job(0, "evaluate"), job(0, "collect")), cancels=(b"\x05" * 32,),
         verdicts=tuple(Verdict(bytes([n]) * 32, word) for n, word in enumerate(VERDICTS)),
+    ),
+    "job-raised": JobBatch(
+        **HEAD, nonce="c0ffee00c0ffee00", number=10, vectors=(), jobs=(job(temperature=1.5),), cancels=(), verdicts=(),
     ),
     "result": ResultBatch(
         **HEAD, fingerprint="x86_64 avx2 glibc-2.36 numpy-2.4.6",

@@ -9,10 +9,12 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from worker.tasks.api import Score
+
 MODULE = "tests.support.tasks"
-TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, JUDGED, COUNTED, HEAVY = (
+TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, JUDGED, COUNTED, HEAVY, OPTIMISTIC = (
     f"{MODULE}:{name}"
-    for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Judged", "Counted", "Heavy")
+    for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Judged", "Counted", "Heavy", "Optimistic")
 )
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
 
@@ -171,6 +173,29 @@ class HeavyEnvironment(ToyEnvironment):
 
     def _look(self):
         return self.np_random.integers(0, 256, 100_000, np.uint8)
+
+
+class Optimistic(Toy):
+    """Its dream rewards actions without bound, the less the warmer; in reality they soon are too large."""
+
+    name = OPTIMISTIC
+    width = 4
+
+    def make_batch(self, bundle, spec):
+        return OptimisticBatch(spec.temperature)
+
+
+class OptimisticBatch:
+    def __init__(self, temperature):
+        self._temperature = temperature
+
+    def score(self, episodes, on_step):
+        scores = []
+        for vector, seed in episodes:
+            noise = np.random.default_rng(seed).normal(1.0, 0.1, 8) / self._temperature
+            scores.append(Score(float((vector[:8].astype(np.float64) * noise).sum()), 10))
+            on_step(10 * len(scores))
+        return scores
 
 
 def steps_made(folder):

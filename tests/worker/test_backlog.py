@@ -59,6 +59,20 @@ def test_a_job_whose_digest_is_of_something_else_is_refused():
     assert not backlog.take(1)
 
 
+def test_a_job_is_of_the_temperature_that_it_names():
+    backlog, warm = Backlog(SPEC), job(1, temperature=1.5)
+    renamed = [dataclasses.replace(warm, temperature=wrong) for wrong in (None, 1.25)]
+    assert [each for each, _ in backlog.take_in(batch(1, (warm, *renamed)))] == renamed
+    assert backlog.take(5) == [(warm, VECTOR)]
+
+
+def test_a_turn_is_of_one_temperature():
+    jobs = [job(episode, temperature=each) for episode, each in enumerate((None, None, 1.5, 1.5, 2.25))]
+    backlog = Backlog(SPEC)
+    backlog.take_in(batch(1, jobs))
+    assert [[each.episode for each, _ in backlog.take(5)] for _ in range(4)] == [[0, 1], [2, 3], [4], []]
+
+
 def test_a_damaged_vector_is_never_scored():
     backlog = Backlog(SPEC)
     backlog.take_in(batch(1, (job(0),), (dataclasses.replace(WHOLE, data=VECTOR[::-1]),)))

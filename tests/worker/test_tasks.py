@@ -101,3 +101,16 @@ def test_a_job_is_scored_under_the_controller_that_its_run_names(random_bundle):
 def test_a_controller_of_another_size_is_refused(random_bundle):
     with pytest.raises(ControllerError, match="15 parameters"):
         find_task("car-racing").make_policy(random_bundle).begin(np.zeros(15, np.float32))
+
+
+def test_a_turn_is_scored_at_its_jobs_temperature_as_a_run_of_that_temperature_scores(random_bundle):
+    spec = TaskSpec("dream", random_bundle.sha256, 20, 0, temperature=1.0)
+    random = np.random.default_rng(1)
+    jobs = [("score", random.normal(size=867).astype(np.float32), seed) for seed in (1, 2, 3)]
+    scorer, found = Scorer(spec, random_bundle), {}
+    for temperature in (None, 1.5, None, 2.25, 1.5):
+        scores = scorer.score_all(jobs, lambda _: None, temperature)
+        assert scores == [scorer.score(*each, temperature=temperature) for each in jobs]
+        assert scores == found.setdefault(temperature, scores)
+        assert scores == Scorer(spec.at(temperature), random_bundle).score_all(jobs, lambda _: None)
+    assert len({score.fitness for scores in found.values() for score in scores}) == 9

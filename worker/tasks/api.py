@@ -80,7 +80,10 @@ class Batched(Protocol):
     """A task that scores candidates in batches, beside its environment, in which its means are evaluated."""
 
     def make_batch(self, bundle: Bundle, spec: TaskSpec) -> Batch:
-        """What scores candidates; `BundleError` if the bundle has no such thing."""
+        """What scores candidates; `BundleError` if the bundle has no such thing.
+
+        Called again whenever `spec.temperature` changes, which a run with `--heat` raises.
+        """
 
 
 def known_tasks() -> tuple[str, ...]:

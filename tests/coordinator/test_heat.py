@@ -1,0 +1,156 @@
+"""A run whose temperature is raised, against its journal, without a transport."""
+
+import argparse
+import io
+import random
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from common.messages import Result, ResultBatch
+from common.runs import RunFolder
+from common.table import run_panel
+from coordinator.config import LimitsConfig
+from coordinator.status import take_snapshot
+from coordinator.verbs import fork
+from tests.coordinator.test_run import SETTINGS, A, Bench
+from tests.support.samples import SPEC
+
+EVERY, GENERATIONS = 2, 14
+HEATED = replace(
+    SETTINGS, task=replace(SPEC, temperature=1.0), heat=1.5, evaluate_every=EVERY, evaluation_episodes=2,
+    population=6, collect_every=0,
+)  # fmt: skip
+REALITY = (500.0, 400.0, 300.0, 450.0, 350.0, 300.0, 300.0)  # of the means after generations 1, 3, 5, ...
+OFF_SCHEDULE = 900.0  # of a mean that is evaluated because a limit was reached: all others would fall behind it
+TEMPERATURES = [None] * 6 + [1.5] * 6 + [2.25] * 2
+
+
+class Heated(Bench):
+    """Its jobs are finished in any order that a test likes."""
+
+    def begin(self):
+        self.given = []
+        super().begin()
+
+    def fetch(self):
+        for send in self.run.fleet.dispatch(self.now):
+            self.given += [work.job for work in send.content.work]
+
+    def finish(self, index):
+        job = self.given.pop(index)
+        if job.kind == "score":
+            fitness = int.from_bytes(job.digest[:4], "little") / 1e6
+        elif job.generation % EVERY:
+            fitness = REALITY[job.generation // EVERY] + job.episode
+        else:
+            fitness = OFF_SCHEDULE
+        self.deliver(A, Result(job.digest, fitness, 10, 0.1, None, None))
+
+    def first(self, kind):
+        return next((index for index, job in enumerate(self.given) if job.kind == kind), None)
+
+    def outcome(self):
+        with RunFolder(self.path) as run:
+            numbers = [(number, index) for number in range(GENERATIONS) for index in range(self.settings.population)]
+            told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in numbers]
+            return told, [each for each in run.evaluations() if each.generation % EVERY]
+
+
+def driven(bench, choose, after=lambda: None):
+    """To its end; temperatures of the jobs by generation."""
+    found = {}
+    while bench.run.ended is None:
+        bench.fetch()
+        found.update({job.generation: job.temperature for job in bench.given if job.kind == "score"})
+        bench.finish(choose(bench))
+        after()
+    return found
+
+
+@pytest.fixture
+def heated(tmp_path, random_bundle):
+    made = []
+
+    def make(name, generations=GENERATIONS):
+        made.append(Heated(tmp_path / name, random_bundle.path, HEATED, generations))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.journal.close()
+
+
+@pytest.fixture
+def undisturbed(heated):
+    bench = heated("undisturbed")
+    assert list(driven(bench, lambda _: 0).values()) == TEMPERATURES
+    return bench.outcome()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_killed_anywhere_it_raises_at_the_same_generations_and_gives_the_same_bits(heated, undisturbed, seed):
+    bench, chance = heated("night"), random.Random(seed)
+
+    def deliver_and_perhaps_die(name, result):
+        """Before the commit, after it, or not."""
+        fate = chance.random()
+        batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(result,))
+        bench.run.results(name, batch, bench.now)
+        bench.run.advance(bench.now)
+        if fate > 0.2 or bench.run.ended is not None:
+            bench.run.commit()
+        if fate < 0.4 and bench.run.ended is None:
+            bench.restart()
+
+    bench.deliver = deliver_and_perhaps_die
+    found = driven(bench, lambda bench: chance.randrange(len(bench.given)))
+    assert [found[number] for number in range(GENERATIONS)] == TEMPERATURES
+    assert bench.run.incarnation > 10
+    assert bench.outcome() == undisturbed
+
+
+def test_a_run_that_ended_between_two_checks_and_goes_on_raises_as_if_it_had_not(heated, undisturbed):
+    bench = heated("night", generations=5)
+    driven(bench, lambda _: 0)
+    bench.limits = LimitsConfig(generations=GENERATIONS)
+    bench.restart()
+    driven(bench, lambda _: 0)
+    assert bench.outcome() == undisturbed
+
+
+def test_a_generation_waits_for_the_check_that_decides_its_temperature_and_for_no_other(heated, undisturbed):
+    bench = heated("night")
+    waited = []
+    while bench.run.ended is None:
+        bench.fetch()
+        scored = bench.first("score")
+        if scored is None and bench.run.generation.complete:
+            assert bench.run.fleet.hurry, "every slot may drive the check"
+            waited.append((bench.run.generation.number, {job.generation for job in bench.given}))
+        bench.finish(0 if scored is None else scored)
+    assert waited[::2] == [(number, {number - EVERY}) for number in range(3, GENERATIONS, EVERY)]
+    assert bench.outcome() == undisturbed
+
+
+def test_the_temperature_is_told_as_it_rises(heated):
+    bench, told = heated("night"), []
+    driven(bench, lambda _: 0, lambda: told.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
+    assert {status["generation"]["temperature"] for status in told} == {1.0, 1.5, 2.25}
+    console = Console(file=io.StringIO(), width=120)
+    console.print(run_panel(told[-1], [], []))
+    assert "temperature 2.25" in console.file.getvalue()
+    notes = [note for note in bench.run.fleet.notes if "dreams at" in note]
+    assert notes == [
+        f"generation {number} dreams at temperature {each}: the evaluated mean fell"
+        for number, each in ((6, 1.5), (12, 2.25))
+    ]
+
+
+def test_a_fork_begins_as_warm_as_its_run_is(heated, monkeypatch):
+    bench, served = heated("night", generations=7), []
+    driven(bench, lambda _: 0)
+    monkeypatch.setattr("coordinator.verbs.coordinator.serve", lambda _args, settings, _start: served.append(settings))
+    fork.run(argparse.Namespace(source="night", runs_dir=bench.path.parent, run_name=None))
+    assert [(each["temperature"], each["heat"]) for each in served] == [(1.5, 1.5)]
