@@ -87,9 +87,17 @@ class Fleet:
             if wanted.work.job.kind == kind:
                 self._unwant(digest)
 
-    def forget(self, before: int) -> None:
-        """Drop the memory of accepted results of generations below `before`; late copies are then obsolete."""
-        self._accepted = {digest: number for digest, number in self._accepted.items() if number >= before}
+    def begin(self, generation: int) -> None:
+        """A generation opens: copies from before the last one are obsolete, and one job that waits for slack leads it.
+
+        Where results come so fast that slack is never seen, evaluations would wait until the run's end.
+        """
+        self._accepted = {digest: number for digest, number in self._accepted.items() if number >= generation - 1}
+        waiting = [entry for entry in self._queue if entry[0]]
+        if waiting and not self._in_slack:
+            _, order, digest = first = min(waiting)
+            self._queue[self._queue.index(first)] = (False, order, digest)
+            heapq.heapify(self._queue)
 
     def welcome(self, identity: str, slots: int, fingerprint: str, now: float) -> None:
         """A worker was admitted; it has credit from its first beat on."""

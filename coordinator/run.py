@@ -250,7 +250,7 @@ class Run:
                 f"generation {number} dreams at temperature {generation.temperature:g}: the evaluated mean fell"
             )
         self.opened = now
-        self.fleet.forget(before=number - 1)
+        self.fleet.begin(number)
         self.fleet.offer(generation.missing)
         return generation
 

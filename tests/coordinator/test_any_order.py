@@ -104,7 +104,7 @@ class AnyOrder(RuleBasedStateMachine):
         for work in self.generation.missing:
             if work.job.digest in self.journal:
                 self.generation.record(work.job.digest, self.journal[work.job.digest], 10)
-        self.fleet.forget(before=self.number - 1)
+        self.fleet.begin(self.number)
         assert all(generation >= self.number - 1 for generation in self.fleet._accepted.values())
         self.fleet.offer(self.generation.missing)
 

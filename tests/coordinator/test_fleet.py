@@ -191,6 +191,30 @@ def test_evaluations_wait_for_slack_and_take_a_quarter_of_the_slots():
     assert len(digests(fleet.dispatch(0.1), A)) == 4
 
 
+def test_where_no_slack_is_ever_seen_an_evaluation_leads_each_generation():
+    fleet = fleet_of(A, jobs=0)
+    fleet.offer(work(3, "evaluate"))
+    turns = []
+    for generation in range(1, 4):
+        fleet.begin(generation)
+        fleet.offer(work(3, generation=generation))
+        for _ in range(2):  # two jobs at a time, answered together: none is left when the last two have gone
+            given = [each.job for send in fleet.dispatch(0.0) for each in send.content.work]
+            turns.append([job.kind for job in given])
+            for job in given:
+                fleet.result(A, result(job.digest), 0.0)
+    assert turns == [["evaluate", "score"], ["score", "score"]] * 3
+
+
+def test_an_evaluation_that_is_held_already_is_enough():
+    fleet = fleet_of(A, capacity=4, jobs=0)
+    fleet.offer(work(3, "evaluate"))
+    assert len(digests(fleet.dispatch(0.0), A)) == 1
+    fleet.begin(1)
+    fleet.offer(work(2, generation=1))
+    assert [each.job.kind for send in fleet.dispatch(0.1) for each in send.content.work] == ["score"] * 2
+
+
 def test_evaluations_and_collected_drives_share_the_quarter():
     fleet = fleet_of(A, capacity=8, jobs=0)
     fleet.offer(work(1, "evaluate") + work(5, "collect"))
@@ -298,7 +322,7 @@ def test_the_job_of_a_worker_that_has_gone_quiet_is_copied_before_it_counts_as_l
 def test_memory_of_results_is_bounded(count):
     fleet = fleet_of(A, capacity=4, jobs=0)
     for generation in range(count):
-        fleet.forget(before=generation - 1)
+        fleet.begin(generation)
         fleet.offer(work(1, generation=generation))
         now = generation / 100
         fleet.beat(A, beat(4, seen=10**9), now)
@@ -318,7 +342,7 @@ def test_memory_stays_flat_through_a_hundred_thousand_generations_of_churn():
     held = []
     for generation in range(100_000):
         now = generation / 10
-        fleet.forget(before=generation - 1)
+        fleet.begin(generation)
         fleet.offer(work(2, generation=generation))
         name = f"w/{random.integers(2**32):08x}"
         fleet.welcome(name, 2, "f", now)
