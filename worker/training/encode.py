@@ -5,6 +5,7 @@ By the encoder as bundles carry it: the latents that controllers will see, to th
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,7 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.bundle import hash_file
 from common.errors import DatasetError
 from common.files import write_aside
 from worker.training.checkpoint import load_config, load_weights
@@ -24,6 +24,7 @@ from worker.worldmodel.vae_config import VAEConfig
 
 ENCODED = "encoded"
 BATCH = 100  # pictures
+ENCODER = ("encoder.", "mu.", "logvar.")  # its weights, by name
 
 Latents = tuple[NDArray[np.float32], NDArray[np.float32]]
 
@@ -34,7 +35,7 @@ def encode(folder: Path) -> Iterator[int]:
         raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
     config = load_config(folder / CHECKPOINT, VAEConfig)
     look = _encoder(folder, config)
-    vae = hash_file(folder / CHECKPOINT)
+    vae = _identity(folder)
     check_whole(episodes(folder), "picture", "preprocessing", "action", "reward", "ended")
     check_pictures(episodes(folder), config.picture)
     for path in episodes(folder):
@@ -54,14 +55,24 @@ def encode(folder: Path) -> Iterator[int]:
 
 
 def encoder_of(folder: Path) -> str:
-    """Hash of the VAE checkpoint that a folder's latents come from; `DatasetError` if it is not the folder's own."""
+    """Hash of the encoder that a folder's latents come from; `DatasetError` if it is not the folder's own."""
     if not (folder / CHECKPOINT).exists():
         raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
-    vae = hash_file(folder / CHECKPOINT)
+    vae = _identity(folder)
     for path in episodes(folder, ENCODED):
         if str(load(path, "vae")["vae"]) != vae:
             raise DatasetError(f"{path} is of another VAE: run `dreamfleet encode --data {folder}` again")
     return vae
+
+
+def _identity(folder: Path) -> str:
+    """SHA-256, hexadecimal, of the encoder's weights: a decoder may learn on, the latents stay."""
+    hashed = hashlib.sha256()
+    for name, array in sorted(load_weights(folder / CHECKPOINT).items()):
+        if name.startswith(ENCODER):
+            hashed.update(name.encode())
+            hashed.update(array.tobytes())
+    return hashed.hexdigest()
 
 
 def _is_of(target: Path, vae: str) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from common.errors import UsageError
 from common.progress import append_curve
 from worker.training.dataset import (
     POOL_EPISODES,
@@ -34,17 +35,20 @@ Report = Callable[[int, str], None]
 
 def train_vae(
     folder: Path, config: TrainConfig, report: Report, layers: VAEConfig = PAPER,
-    device: torch.device | None = None, continue_from: Path | None = None,
+    device: torch.device | None = None, continue_from: Path | None = None, decoder_only: bool = False,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
 
-    A stop changes nothing: batches and chance follow from the seed and the update alone.
+    With `decoder_only` the encoder stays as it is, and with it latents, MDN-RNNs and controllers. A stop changes
+    nothing: batches and chance follow from the seed and the update alone.
     """
     train, held_out = split(episodes(folder))
     check_whole([*train, *held_out], "picture", "preprocessing")
     check_pictures([*train, *held_out], layers.picture)
     torch.manual_seed(config.seed)
     model = VAE(layers).to(device)
+    if decoder_only and continue_from is None and not (folder / CHECKPOINT).exists():
+        raise UsageError("--decoder-only needs an encoder that was trained: give --continue-from")
     schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from)
     progress = schedule.progress
     report(schedule.update, "")
@@ -56,6 +60,8 @@ def train_vae(
         schedule.set_rate(pool // epoch_pools)
         torch.manual_seed(config.seed * 1_000_003 + schedule.update)
         model.train()
+        if decoder_only:
+            model.freeze_encoder()
         noise = torch.randn(len(batch), layers.latent).to(device)
         loss, error, divergence = model.loss(as_tensor(batch, device), noise)
         loss.backward()  # type: ignore[no-untyped-call]

@@ -14,6 +14,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     from worker.worldmodel.vae_config import VAEConfig
 
     add_training_flags(parser, VAEConfig)
+    parser.add_argument(
+        "--decoder-only", action="store_true", help="leave the encoder, and so latents and controllers, as they are"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -32,7 +35,8 @@ def run(args: argparse.Namespace) -> int:
         print(summary(VAE(layers)))
         return 0
     with progress_bar("VAE", config.updates, "updates") as bar:
-        figures = train_vae(args.data, config, bar.move, layers, device_of(args.device), args.continue_from)
+        device, other = device_of(args.device), args.continue_from
+        figures = train_vae(args.data, config, bar.move, layers, device, other, args.decoder_only)
     record_quality(args.data, figures)
     print("  ".join(f"{name} {value}" for name, value in figures.items()))
     return 0

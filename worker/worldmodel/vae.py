@@ -36,6 +36,11 @@ class VAE(nn.Module):
         flat = self.encoder(pictures)
         return self.mu(flat), self.logvar(flat)
 
+    def freeze_encoder(self) -> None:
+        """Let only the decoder learn: latents stay as they are, and with them what was trained on them."""
+        for part in (self.encoder, self.mu, self.logvar):
+            part.eval().requires_grad_(requires_grad=False)
+
     def decode(self, latents: Tensor) -> Tensor:
         """Pictures `(N, 3, side, side)` in [0, 1]."""
         pictures: Tensor = self.decoder(self.dense(latents).reshape(-1, *self._start))

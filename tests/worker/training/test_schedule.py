@@ -1,3 +1,4 @@
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 from common.errors import DatasetError, UsageError
 from tests.support.drives import write_drive, write_drives
 from worker.training import train_mdnrnn, train_vae
+from worker.training.assemble import assemble
 from worker.training.checkpoint import load_config, load_progress, load_weights
 from worker.training.drives import load_drives
 from worker.training.encode import encode
@@ -53,6 +55,29 @@ def test_the_vae_goes_on_to_the_same_weights_as_without_a_stop(encoded, tmp_path
     for updates in (stop, 4):
         train_vae.train_vae(tmp_path, replace(SHORT, updates=updates), ignore, LAYERS)
     assert equal(encoded / train_vae.CHECKPOINT, tmp_path / train_vae.CHECKPOINT)
+
+
+def test_a_decoder_that_learns_on_leaves_latents_and_mdnrnn_as_they_are(encoded, tmp_path):
+    before = load_weights(encoded / train_vae.CHECKPOINT)
+    folder = tmp_path / "data"
+    shutil.copytree(encoded, folder)
+    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, SMALL)
+    train_vae.train_vae(folder, replace(SHORT, updates=6), ignore, LAYERS, decoder_only=True)
+    after = load_weights(folder / train_vae.CHECKPOINT)
+    changed = {name for name in before if not np.array_equal(before[name], after[name])}
+    assert changed
+    assert all(name.startswith(("decoder.", "dense.")) for name in changed)
+    assert list(encode(folder)) == []
+    assemble(folder, tmp_path / "b.zip", "b", with_weights=False)
+
+
+def test_a_decoder_alone_needs_an_encoder(encoded, tmp_path):
+    (tmp_path / "episodes").symlink_to(encoded / "episodes")
+    with pytest.raises(UsageError, match="--continue-from"):
+        train_vae.train_vae(tmp_path, SHORT, ignore, LAYERS, decoder_only=True)
+    checkpoint = encoded / train_vae.CHECKPOINT
+    train_vae.train_vae(tmp_path, SHORT, ignore, LAYERS, continue_from=checkpoint, decoder_only=True)
+    assert not equal(checkpoint, tmp_path / train_vae.CHECKPOINT)
 
 
 def test_a_checkpoint_keeps_its_layers_and_refuses_others(encoded):
