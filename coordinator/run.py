@@ -6,6 +6,7 @@ of a generation may leave before it: a coordinator that dies in between asks for
 
 from __future__ import annotations
 
+from bisect import insort
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
@@ -359,7 +360,7 @@ class Run:
         scores = np.array([each.scores[digest] for digest in each.digests])
         finished = StoredEvaluation(generation, len(scores), float(scores.mean()), float(scores.std()))
         self._journal.finish_evaluation(generation, finished.mean, finished.std)
-        self.evaluations.append(finished)
+        insort(self.evaluations, finished, key=lambda other: other.generation)
         del self._evaluating[generation]
 
     def _stop_reason(self) -> str | None:
