@@ -6,6 +6,7 @@ Zenoh; imports neither the run nor the worker.
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -72,7 +73,6 @@ class Demo:
         self._config = config
         self._runs_dir = runs_dir
         self._stages = stages(config, name, runs_dir)
-        self._folder = runs_dir / self._stages[-1].run
         self._endpoint = f"tcp/127.0.0.1:{config.port}"
         self._console = Console()
 
@@ -80,14 +80,23 @@ class Demo:
         """Evolve, judge, draw, record, and say what to try next."""
         for stage in self._stages:
             self._evolve(stage)
+        best = max(reversed(self._stages), key=self._checked)  # of equals the last
+        if len(self._stages) > 1:
+            self._say(f"going on with the mean that drove best when it was checked: run {best.run}'s")
+        folder = self._runs_dir / best.run
         self._say("judging the outcome on unseen tracks, whole episodes, in gymnasium's own environment")
-        controller = str(self._folder / CONTROLLER)
+        controller = str(folder / CONTROLLER)
         self._call("evaluate", "--controller", controller, "--episodes", str(self._config.tracks))
         for stage in self._stages:
             self._plot(stage)
         self._say("recording a drive, and beside it what the model dreams")
-        self._call("record", "--controller", controller, "--out", str(self._folder / VIDEO), "--steps", "1000")
-        self._farewell()
+        self._call("record", "--controller", controller, "--out", str(folder / VIDEO), "--steps", "1000")
+        self._farewell(folder)
+
+    def _checked(self, stage: Stage) -> float:
+        """The best score of a stage's mean in reality, on tracks that are the same in every stage."""
+        with open_run(self._runs_dir, stage.run) as run:
+            return max((each.mean for each in run.evaluations()), default=-math.inf)
 
     def _evolve(self, stage: Stage) -> None:
         workers = self._config.workers or len(os.sched_getaffinity(0))
@@ -160,13 +169,13 @@ class Demo:
             plot_fitness(run, path)
         self._console.print(f"{path}: fitness over generations")
 
-    def _farewell(self) -> None:
-        controller = self._folder / CONTROLLER
+    def _farewell(self, folder: Path) -> None:
+        controller = folder / CONTROLLER
         self._console.print(
-            f"\n[bold]In {self._folder}[/]: the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
+            f"\n[bold]In {folder}[/]: the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
         )
         for command in (
-            f"dreamfleet replay {self._stages[-1].run} --candidate 0/0",
+            f"dreamfleet replay {folder.name} --candidate 0/0",
             f"dreamfleet evaluate --controller {controller} --episodes 100",
             f"dreamfleet coordinator --run mine --preset frugal --listen {self._endpoint}   "
             "# and, on any host: dreamfleet worker --connect tcp/HOST:PORT",

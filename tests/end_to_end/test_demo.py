@@ -21,6 +21,8 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         assert real.history()
         assert dream.evaluations()
         assert Controller.load(real.controller_path).bundle == random_bundle.sha256
-    for made in ("demo/drive.mp4", "demo/fitness.png", "demo-dream/fitness.png"):
+        best = max((real, dream), key=lambda run: max(each.mean for each in run.evaluations())).name
+    assert f"run {best}'s" in out.replace("\n", " ")
+    for made in (f"{best}/drive.mp4", "demo/fitness.png", "demo-dream/fitness.png"):
         assert (processes.runs / made).stat().st_size > 1000
     assert "evolving in the dream" in out
