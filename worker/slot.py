@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
-from time import monotonic, perf_counter
+from time import monotonic, perf_counter, sleep
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ from common.threads import pin_thread_pools
 
 log = logging.getLogger(__name__)
 FAILED_STARTS = 3
+ENDING = 2.0  # seconds between a child's last word and its end
 SHORT = 0.25  # seconds: after turns below it the next one already waits in the child
 SMALL = 64 * 1024  # bytes of vectors that a pipe takes while its child is busy
 _PR_SET_PDEATHSIG = 1
@@ -187,6 +188,7 @@ class Slot:
         self._life += 1
         self._process.kill()
         self._process.join()
+        self._reader.join()  # before its pipe is closed, whose number the next one may have
         self._pipe.close()
 
     def _begin(self) -> None:
@@ -208,6 +210,12 @@ class Slot:
         return done.results
 
     def _replace(self, why: str) -> tuple[Result, ...]:
+        until = monotonic() + ENDING
+        while self._process.is_alive() and monotonic() < until:  # `join` would wait for a child that is only silent
+            sleep(0.005)
+        if self._process.is_alive():
+            self._ended_for = self._ended_for or why
+            self._process.kill()
         self._process.join()
         code = self._process.exitcode or 0
         reason = self._ended_for or (f"signal {-code}" if code < 0 else why)
@@ -248,7 +256,8 @@ class Slot:
         with _signals_held():
             self._process.start()
         theirs.close()
-        threading.Thread(target=self._read, args=(self._pipe, self._life), daemon=True).start()
+        self._reader = threading.Thread(target=self._read, args=(self._pipe, self._life), daemon=True)
+        self._reader.start()
         waiting, self._turns = self._turns, deque()
         for turn in waiting:
             if wanted := [work for work in turn.work if work[0].digest not in turn.unwanted]:

@@ -12,10 +12,12 @@ from gymnasium import spaces
 from worker.tasks.api import Score
 
 MODULE = "tests.support.tasks"
-TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, JUDGED, COUNTED, HEAVY, OPTIMISTIC = (
+TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC = (
     f"{MODULE}:{name}"
-    for name in ("Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Judged", "Counted", "Heavy", "Optimistic")
-)
+    for name in (
+        "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Optimistic",
+    )
+)  # fmt: skip
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
 
 
@@ -117,6 +119,21 @@ class Hanging(Toy):
 
 class HangingPolicy(ToyPolicy):
     def act(self, observation):
+        time.sleep(3600)
+
+
+class Silent(Toy):
+    """Closes every connection of its process, and lives on."""
+
+    name = SILENT
+
+    def make_policy(self, bundle):
+        return SilentPolicy()
+
+
+class SilentPolicy(ToyPolicy):
+    def act(self, observation):
+        os.closerange(3, 1024)
         time.sleep(3600)
 
 

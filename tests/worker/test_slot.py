@@ -6,6 +6,7 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from time import monotonic
 
@@ -119,6 +120,23 @@ def test_a_crash_costs_one_job_and_another_child_takes_its_place(harness):
     for _ in range(2):
         result = slot.score()
         assert (result.fitness, result.error) == (None, f"slot crashed (signal {signal.SIGSEGV.value})")
+
+
+def test_a_child_that_is_heard_no_more_and_lives_on_is_replaced(harness):
+    slot = harness(tasks.SILENT)
+    slot.wait_ready()
+    pid = slot.slot.pid
+    assert slot.score().error == "slot crashed (the child ended)"
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def test_nobody_reads_from_a_slot_that_was_stopped(harness):
+    slot = harness(tasks.TOY)
+    before = threading.active_count()
+    slot.score()
+    slot.slot.stop()
+    assert threading.active_count() == before - 1
 
 
 def test_a_killed_child_is_replaced_alone(harness):
