@@ -55,8 +55,8 @@ sanitize: $(VENV)/.dev  ## 200,000 steps of the native picture under AddressSani
 	LD_PRELOAD=$$(cc -print-file-name=libasan.so) ASAN_OPTIONS=detect_leaks=0 SDL_VIDEODRIVER=dummy \
 	  $(BIN)/python deploy/sanitize.py build/sanitized.so $(or $(STEPS),200000)
 
-bundle: $(VENV)/.dev  ## the shipped world model again, from nothing: about 15 minutes of two cores
-	ROUNDS=1 DREAMFLEET=$(BIN)/dreamfleet deploy/bundle.sh data/tiny
+bundle: $(VENV)/.dev  ## a world model like the shipped one, from nothing: 45 minutes of two cores; ROUNDS=1: 15
+	ROUNDS=$(or $(ROUNDS),2) DREAMFLEET=$(BIN)/dreamfleet deploy/bundle.sh data/tiny
 
 worker-size: $(VENV)/bin/python  ## what a worker's environment weighs
 	$(BIN)/python deploy/worker_size.py

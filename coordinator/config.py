@@ -130,7 +130,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "sigma0": 0.1,
         "covariance": "diagonal",
         "horizon": 400,
-        "temperature": 1.25,
+        "temperature": 1.5,
         "evaluate_every": 5,
         "evaluation_episodes": 16,
     },

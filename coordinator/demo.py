@@ -38,7 +38,7 @@ class DemoConfig:
 
     dream_minutes: float = option(1.5, "dream for so long first; 0: not at all")
     minutes: float = option(3.0, "then evolve in reality for so long; 0: not at all")
-    temperature: float = option(1.25, "of the dream")
+    temperature: float = option(1.5, "of the dream")
     population: int = option(32, "candidates a generation in reality")
     episodes: int = option(2, "episodes a candidate in reality")
     horizon: int = option(1000, "steps of an episode at most in reality")

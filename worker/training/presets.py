@@ -24,8 +24,8 @@ class Preset:
     mdnrnn_layers: MDNRNNConfig = mdnrnn_config.REWARDED
 
 
-# About 12 minutes of two cores. More drives, more updates and half the channels each told pictures apart better and
-# dreamt worse (docs/dreams.md).
+# About 12 minutes of two cores. A VAE that was trained on more, or longer, told pictures apart better and made worse
+# dreams; an MDN-RNN that was made better ones (docs/dreams.md): `make bundle` goes on with it alone.
 TINY = Preset(
     name="tiny",
     collect=CollectConfig(episodes=620, steps=300),
