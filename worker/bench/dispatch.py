@@ -14,6 +14,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ CANDIDATES = 200
 GENERATIONS = 6  # the first is not counted: workers join in it
 NULL_JOBS = 4096  # a generation: 64 candidates x 64 episodes
 RUN_SECONDS = 300.0
+PEER_SECONDS = 120.0
 ROUNDS = -(-CANDIDATES // SLOTS)
 Figures = dict[str, Any]
 
@@ -34,10 +36,10 @@ Figures = dict[str, Any]
 def bench_dispatch(crowd: int) -> Figures:
     """50 ms jobs on 8 real slots, null jobs on simulated workers, `crowd` of these; peers where installed."""
     naps, null = measure_naps(), measure_nulls()
-    peers: dict[str, Figures] = {}
+    peers: dict[str, Figures | None] = {}
     for name, run in (("pool", pool_peer), ("dask", dask_peer), ("ray", ray_peer)):
         if name == "pool" or find_spec({"dask": "distributed"}.get(name, name)):
-            peers[name] = peer_figures(run)
+            peers[name] = in_time(run)
     figures: Figures = {
         "efficiency_50ms": round(naps, 4),
         "null_jobs_per_second": round(null["jobs_per_second"]),
@@ -170,9 +172,30 @@ def nothing(_index: int) -> int:
 
 
 Mapper = Callable[[Callable[[int], int], int], object]
+Peer = Callable[[], AbstractContextManager[Mapper]]
 
 
-def peer_figures(peer: Callable[[], AbstractContextManager[Mapper]]) -> Figures:
+def in_time(peer: Peer) -> Figures | None:
+    """A peer's figures, measured in a process of its own; `None` if it hangs or fails."""
+    ours, theirs = get_context("spawn").Pipe(duplex=False)
+    process = get_context("spawn").Process(target=_tell, args=(theirs, peer))
+    process.start()
+    theirs.close()
+    try:
+        return ours.recv() if ours.poll(PEER_SECONDS) else None
+    except EOFError:
+        return None
+    finally:
+        process.terminate()
+        process.join(5)
+        process.kill()
+
+
+def _tell(pipe: Connection[Figures, Any], peer: Peer) -> None:
+    pipe.send(peer_figures(peer))
+
+
+def peer_figures(peer: Peer) -> Figures:
     """The same two measures of a peer with 8 processes."""
     with peer() as run:
         run(nothing, 100)  # its processes are up
