@@ -37,6 +37,7 @@ def test_evolved_driving_looks_the_same():
 
 
 @needs_native
+@pytest.mark.long
 def test_a_completed_lap_looks_the_same_to_its_end():
     lap = completed_lap(3)
     assert compare(lap.seed, len(lap.actions) + 1, lambda step, _seen, _random: lap.actions[step]) is None
