@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/render/native/*)
 
-.PHONY: demo test setup check wheel long box2d-py chaos sanitize bundle worker-size clean
+.PHONY: demo test setup check wheel long box2d-py chaos sanitize bundle worker-size stranger clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(ARGS)
@@ -57,6 +57,9 @@ sanitize: $(VENV)/.dev  ## 200,000 steps of the native picture under AddressSani
 
 bundle: $(VENV)/.dev  ## a world model like the shipped one, from nothing: 45 minutes of two cores; ROUNDS=1: 15
 	ROUNDS=$(or $(ROUNDS),2) DREAMFLEET=$(BIN)/dreamfleet deploy/bundle.sh data/tiny
+
+stranger:  ## both commands as a stranger runs them: a fresh clone of what is committed, no settings, an empty home
+	deploy/stranger.sh
 
 worker-size: $(VENV)/bin/python  ## what a worker's environment weighs
 	$(BIN)/python deploy/worker_size.py

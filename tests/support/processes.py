@@ -23,8 +23,9 @@ def free_port():
 
 
 def environment(cache):
+    inherited = {name: value for name, value in os.environ.items() if name != "SDL_VIDEODRIVER"}  # as people start it
     return {
-        **os.environ,
+        **inherited,
         "PYTHONPATH": str(ROOT),
         "DREAMFLEET_CACHE": str(cache),
         "PYTHONUNBUFFERED": "1",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal
@@ -85,11 +87,31 @@ class Window:
 def _open(size: tuple[int, int]) -> pygame.Surface:
     """The window's surface; one that nobody sees is none, unless `$SDL_VIDEODRIVER` asks for it."""
     try:
-        pygame.display.init()
-        driver = pygame.display.get_driver()
-        if driver in INVISIBLE and os.environ.get("SDL_VIDEODRIVER") != driver:
-            pygame.display.quit()
-            raise NoDisplayError("no display: no screen answers; drive where there is one, or through `ssh -X`")
-        return pygame.display.set_mode(size)
+        with _plain_display():
+            pygame.display.init()
+            driver = pygame.display.get_driver()
+            if driver in INVISIBLE and os.environ.get("SDL_VIDEODRIVER") != driver:
+                pygame.display.quit()
+                raise NoDisplayError("no display: no screen answers; drive where there is one, or through `ssh -X`")
+            return pygame.display.set_mode(size)
     except pygame.error as error:
         raise NoDisplayError(f"no display: {error}; drive where there is a screen, or through `ssh -X`") from error
+
+
+@contextmanager
+def _plain_display() -> Iterator[None]:
+    """Open a display that a person sees and that is drawn without OpenGL, where the environment does not say otherwise.
+
+    Left alone, SDL falls back to a driver that nobody sees, and draws through OpenGL: both load Mesa and its LLVM into
+    the process, where torch's triton, loaded later, crashes on it.
+    """
+    wanted = {"SDL_FRAMEBUFFER_ACCELERATION": "0"}
+    if sys.platform == "linux":
+        wanted["SDL_VIDEODRIVER"] = "wayland,x11"
+    added = {name: value for name, value in wanted.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ class Schedule:
         """`episodes` to train on, in all; `other` is a checkpoint to begin from where `path` has none."""
         self._path, self._model, self._config, self._episodes = path, model, config, episodes
         self._best_path = path.with_suffix(".best.safetensors")
+        keep_triton_from_mesa()
         self.optimiser = torch.optim.Adam(model.parameters(), lr=config.rate)
         self.progress: dict[str, Any] = {"update": 0}
         if (found := load_checkpoint(path, model, self.optimiser)) is not None:
@@ -109,3 +111,17 @@ def summary(model: torch.nn.Module) -> str:
             rows.append(f"{name:<14} {type(module).__name__:<16} {count:>10,}  {shapes}")
     total = sum(each.numel() for each in model.parameters() if each.requires_grad)
     return "\n".join([*rows, f"{'in all':<31} {total:>10,}"])
+
+
+def keep_triton_from_mesa(maps: Path = Path("/proc/self/maps")) -> None:
+    """Let torch do without triton in a process that has drawn through Mesa: to load it there crashes.
+
+    An optimiser of torch imports triton wherever it is installed, which is in torch's CUDA builds. Triton carries an
+    LLVM of its own, whose start-up code meets the symbols of Mesa's. Nothing here compiles models, so it is not missed.
+    """
+    try:
+        drawn = "libLLVM" in maps.read_text()
+    except OSError:  # not Linux
+        return
+    if drawn and "triton" not in sys.modules:
+        sys.modules["triton"] = None  # type: ignore[assignment] # what an import of it meets: ModuleNotFoundError

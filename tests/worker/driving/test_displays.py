@@ -1,0 +1,71 @@
+"""A display that nobody asked for is not opened, and one that was opened harms nothing that comes after."""
+
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+
+from tests.support.processes import DEADLINE, ROOT
+
+WITHOUT_A_SCREEN = """
+from common.errors import NoDisplayError
+from worker.driving.window import Window
+try:
+    Window("nothing", (64, 64), 1)
+except NoDisplayError:
+    pass
+"""
+DRIVING_UNSEEN = """
+from worker.evaluation import bundle_for
+from worker.render.check import make_car_racing
+environment = make_car_racing(preprocessing="box-64", render_mode="rgb_array")
+environment.reset(seed=1)
+environment.step([0.0, 0.0, 0.0])
+environment.render()
+"""
+WHAT_IS_LOADED = """
+maps = open("/proc/self/maps").read()
+print([name for name in ("libLLVM", "libEGL", "libGLX") if name in maps])
+"""
+OPENED_WHERE_NOBODY_SEES = """
+import pygame
+pygame.display.init()  # as SDL does by itself without a screen, through Mesa
+pygame.display.set_mode((100, 100))
+"""
+AN_OPTIMISER = """
+from pathlib import Path
+import torch
+from worker.training.schedule import Schedule
+from worker.training.train_config import TrainConfig
+Schedule(Path("nothing.safetensors"), torch.nn.Linear(2, 2), TrainConfig(updates=1, batch=1, rate=1e-3), 1)
+print("goes on")
+"""
+
+
+def run(code, folder, **variables):
+    environment = {name: value for name, value in os.environ.items()
+                   if name not in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY")}  # fmt: skip
+    environment |= {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]), **variables}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd=folder, capture_output=True, text=True, timeout=DEADLINE,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.splitlines()[-1]
+
+
+def test_looking_for_a_screen_loads_no_driver_of_graphics(tmp_path):
+    assert run(WITHOUT_A_SCREEN + WHAT_IS_LOADED, tmp_path) == "[]"
+
+
+def test_driving_opens_no_display(tmp_path):
+    assert run(DRIVING_UNSEEN + WHAT_IS_LOADED, tmp_path) == "[]"
+
+
+def test_a_process_that_drew_through_mesa_trains(tmp_path):
+    """The real triton where torch brought it, else one that ends the process as the real one does."""
+    if find_spec("triton") is None:
+        (tmp_path / "triton").mkdir()
+        stand_in = "import os\nif 'libLLVM' in open('/proc/self/maps').read(): os._exit(139)\n"
+        (tmp_path / "triton" / "__init__.py").write_text(stand_in)
+    assert run(OPENED_WHERE_NOBODY_SEES + AN_OPTIMISER, tmp_path) == "goes on"
