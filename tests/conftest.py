@@ -6,7 +6,6 @@ import pytest
 from tests.support.bundles import write_random_bundle
 from tests.support.processes import processes_in
 
-
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # gymnasium's checker opens every kind of window that there is
 
 
