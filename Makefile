@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
-SOURCES := pyproject.toml constraints.txt $(wildcard worker/render/native/*)
+SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
 .PHONY: demo test setup check wheel long box2d-py chaos sanitize bundle worker-size stranger clean
 
@@ -51,7 +51,7 @@ sanitize: $(VENV)/.dev  ## 200,000 steps of the native picture under AddressSani
 	mkdir -p build
 	cc -std=c11 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -ffp-contract=off -fwrapv -shared -fPIC \
 	  -I$$($(BIN)/python -c "import sysconfig; print(sysconfig.get_path('include'))") \
-	  worker/render/native/*.c -lm -o build/sanitized.so
+	  worker/car_racing/native/*.c -lm -o build/sanitized.so
 	LD_PRELOAD=$$(cc -print-file-name=libasan.so) ASAN_OPTIONS=detect_leaks=0 SDL_VIDEODRIVER=dummy \
 	  $(BIN)/python deploy/sanitize.py build/sanitized.so $(or $(STEPS),200000)
 

@@ -19,13 +19,13 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from common.codec import MalformedError, from_plain
-from common.controller import ControllerShape
-from common.errors import BundleError, ControllerError
-from common.fields import OPTIONAL, written
-from common.files import write_aside
-from common.messages import Between, Word
-from common.tensors import read_array, weights_finite
+from dreamfleet.common.codec import MalformedError, from_plain
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.common.fields import OPTIONAL, written
+from dreamfleet.common.files import write_aside
+from dreamfleet.common.messages import Between, Word
+from dreamfleet.common.tensors import read_array, weights_finite
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -192,7 +192,7 @@ def default_cache() -> Path:
 
 def pretrained() -> Path:
     """The folder of what ships: bundles as `NAME.zip`, controllers as `NAME.npz`."""
-    return Path(str(files("common"))) / "pretrained"
+    return Path(str(files("dreamfleet.common"))) / "pretrained"
 
 
 def shipped_bundles() -> dict[str, Path]:

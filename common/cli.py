@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from importlib.metadata import EntryPoint, entry_points, version
 from typing import Protocol
 
-from common.errors import DreamfleetError, MissingExtraError
+from dreamfleet.common.errors import DreamfleetError, MissingExtraError
 
 GROUP = "dreamfleet.verbs"
 INTERRUPTED = 130
@@ -81,7 +81,3 @@ def run_verb(args: argparse.Namespace) -> int:
             f"the package {error.name!r} is not installed; this needs: pip install 'dreamfleet[{wanted}]'"
         ) from error
     return code
-
-
-if __name__ == "__main__":
-    sys.exit(main())

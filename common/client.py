@@ -10,11 +10,11 @@ from typing import Any
 
 import zenoh
 
-from common import keys
-from common.codec import MalformedError, decode_json
-from common.errors import ConnectionFailedError, RefusedError, UsageError
-from common.messages import ControlReply
-from common.session import Network, open_session
+from dreamfleet.common import keys
+from dreamfleet.common.codec import MalformedError, decode_json
+from dreamfleet.common.errors import ConnectionFailedError, RefusedError, UsageError
+from dreamfleet.common.messages import ControlReply
+from dreamfleet.common.session import Network, open_session
 
 QUERY_TIMEOUT = 3.0
 

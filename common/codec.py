@@ -17,9 +17,9 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgpack
 
-from common.fields import optionals
-from common.keys import PROTOCOL_VERSION
-from common.messages import MAX_MESSAGE, Between, Length, Message
+from dreamfleet.common.fields import optionals
+from dreamfleet.common.keys import PROTOCOL_VERSION
+from dreamfleet.common.messages import MAX_MESSAGE, Between, Length, Message
 
 Check = Callable[[Any], Any]
 M = TypeVar("M", bound=Message)

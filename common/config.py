@@ -15,7 +15,7 @@ from dataclasses import MISSING, Field, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from common.errors import UsageError
+from dreamfleet.common.errors import UsageError
 
 T = TypeVar("T")
 Table = Mapping[str, Any]

@@ -17,9 +17,9 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import ControllerError
-from common.fields import OPTIONAL, written
-from common.files import write_aside
+from dreamfleet.common.errors import ControllerError
+from dreamfleet.common.fields import OPTIONAL, written
+from dreamfleet.common.files import write_aside
 
 FORMAT = 1
 

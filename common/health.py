@@ -10,10 +10,10 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
-from common.bundle import Bundle, default_cache, shipped_bundles
-from common.errors import DreamfleetError
-from common.fingerprint import package_version
-from common.runs import default_runs_dir
+from dreamfleet.common.bundle import Bundle, default_cache, shipped_bundles
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.fingerprint import package_version
+from dreamfleet.common.runs import default_runs_dir
 
 GROUP = "dreamfleet.checks"
 # distribution -> (module, extra); the empty extra is what every role needs

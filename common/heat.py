@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from common.messages import HOTTEST, TaskSpec
-from common.runs import RunFolder, RunSettings, StoredEvaluation
+from dreamfleet.common.messages import HOTTEST, TaskSpec
+from dreamfleet.common.runs import RunFolder, RunSettings, StoredEvaluation
 
 
 def deciding_check(settings: RunSettings, generation: int) -> int:

@@ -6,7 +6,7 @@ import re
 import secrets
 import socket
 
-from common.errors import UsageError
+from dreamfleet.common.errors import UsageError
 
 PROTOCOL_VERSION = 1
 ROOT = "dreamfleet"

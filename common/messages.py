@@ -1,7 +1,7 @@
 """Every message of protocol version 1, as frozen dataclasses.
 
-The annotations are the schema: `common.codec` derives its checks from them. A message is at most `MAX_MESSAGE` bytes;
-batches split, long vectors and files travel in parts.
+The annotations are the schema: `dreamfleet.common.codec` derives its checks from them. A message is at
+most `MAX_MESSAGE` bytes; batches split, long vectors and files travel in parts.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
-from common.controller import ControllerShape
-from common.fields import OPTIONAL, written
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.fields import OPTIONAL, written
 
 MAX_MESSAGE = 48 * 1024
 MAX_PART = 40 * 1024  # room for the envelope around a part's bytes

@@ -15,13 +15,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from common import schema
-from common.codec import MalformedError, from_plain
-from common.controller import ControllerShape
-from common.errors import JournalError, UsageError
-from common.fields import OPTIONAL, written
-from common.keys import check_run_name
-from common.messages import Between, Count, TaskSpec
+from dreamfleet.common import schema
+from dreamfleet.common.codec import MalformedError, from_plain
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.fields import OPTIONAL, written
+from dreamfleet.common.keys import check_run_name
+from dreamfleet.common.messages import Between, Count, TaskSpec
 
 JOURNAL = "journal.sqlite"
 BUNDLE = "bundle.zip"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 
-from common.errors import JournalError
+from dreamfleet.common.errors import JournalError
 
 APPLICATION_ID = 0x64666C74  # "dflt": SQLite's own mark of whose file this is
 MIGRATIONS = (

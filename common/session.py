@@ -15,7 +15,7 @@ from typing import Any
 
 import zenoh
 
-from common.errors import ConnectionFailedError, UsageError
+from dreamfleet.common.errors import ConnectionFailedError, UsageError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LEASE_MS = 4000  # announced by each side: after so long without a sign the other side drops its token

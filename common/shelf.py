@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from common.bundle import pretrained
-from common.controller import Controller
-from common.errors import ControllerError
-from common.runs import BUNDLE, CONTROLLER
+from dreamfleet.common.bundle import pretrained
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import ControllerError
+from dreamfleet.common.runs import BUNDLE, CONTROLLER
 
 
 def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common.messages import TaskSpec
-from common.seeds import collection_seed
-from coordinator.jobs import Work, make_work
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.seeds import collection_seed
+from dreamfleet.coordinator.jobs import Work, make_work
 
 
 @dataclass(frozen=True)

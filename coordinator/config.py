@@ -6,11 +6,11 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from common.bundle import Bundle
-from common.config import option
-from common.errors import UsageError
-from common.messages import COLDEST, HOTTEST, TaskSpec
-from common.runs import RunSettings
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.config import option
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.messages import COLDEST, HOTTEST, TaskSpec
+from dreamfleet.common.runs import RunSettings
 
 
 @dataclass(frozen=True)

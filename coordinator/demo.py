@@ -20,11 +20,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.live import Live
 
-from common.client import Client
-from common.config import option
-from common.errors import ConnectionFailedError, DreamfleetError, UsageError
-from common.runs import CONTROLLER, open_run
-from common.table import run_panel
+from dreamfleet.common.client import Client
+from dreamfleet.common.config import option
+from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
+from dreamfleet.common.runs import CONTROLLER, open_run
+from dreamfleet.common.table import run_panel
 
 REFRESH = 0.5
 START_SECONDS = 30.0
@@ -162,7 +162,7 @@ class Demo:
             raise DreamfleetError(f"dreamfleet {verb} failed")
 
     def _plot(self, stage: Stage) -> None:
-        from coordinator.plot import plot_fitness
+        from dreamfleet.coordinator.plot import plot_fitness
 
         path = self._runs_dir / stage.run / PLOT
         with open_run(self._runs_dir, stage.run) as run:
@@ -218,7 +218,7 @@ def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
 
 
 def _command(verb: str, *arguments: str) -> Sequence[str]:
-    return [sys.executable, "-m", "common.cli", verb, *arguments]
+    return [sys.executable, "-m", "dreamfleet", verb, *arguments]
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

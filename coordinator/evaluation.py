@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from common.messages import TaskSpec
-from common.runs import StoredEvaluation
-from common.seeds import validation_seeds
-from coordinator.jobs import Work, make_work
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.runs import StoredEvaluation
+from dreamfleet.common.seeds import validation_seeds
+from dreamfleet.coordinator.jobs import Work, make_work
 
 
 @dataclass(frozen=True)

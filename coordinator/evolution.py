@@ -11,9 +11,9 @@ import cma
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import JournalError, UsageError
-from coordinator import cma_state
-from coordinator.cma_state import Checkpoint
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.coordinator import cma_state
+from dreamfleet.coordinator.cma_state import Checkpoint
 
 CMA_VERSION = version("cma")
 Covariance = Literal["diagonal", "full"]

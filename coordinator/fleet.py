@@ -11,11 +11,11 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from common.messages import TAG_BYTES, Beat, Kind, Result, Verdict, VerdictWord
-from coordinator.jobs import Work
-from coordinator.member import Lease, Member, Sent
-from coordinator.packing import Content, pack
-from coordinator.tail import Move, Tail
+from dreamfleet.common.messages import TAG_BYTES, Beat, Kind, Result, Verdict, VerdictWord
+from dreamfleet.coordinator.jobs import Work
+from dreamfleet.coordinator.member import Lease, Member, Sent
+from dreamfleet.coordinator.packing import Content, pack
+from dreamfleet.coordinator.tail import Move, Tail
 
 DEPARTURE_GRACE = 0.05  # seconds: a token's end overtakes results that are still on their way
 CLOCK_GAP = 2.0  # seconds between ticks that mean a suspended host

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messages import TaskSpec
-from coordinator.jobs import Work, make_work
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.coordinator.jobs import Work, make_work
 
 
 class Generation:

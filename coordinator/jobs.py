@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messages import Job, Kind, TaskSpec
+from dreamfleet.common.messages import Job, Kind, TaskSpec
 
 STALL_SECONDS = 30.0
 

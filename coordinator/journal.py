@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common import schema
-from common.errors import DreamfleetError, JournalError
-from common.messages import Job, Result
-from common.runs import BUNDLE, JOURNAL, RunFolder, RunSettings, StoredEvaluation, StoredGeneration
-from coordinator.cma_state import Checkpoint
-from coordinator.collection import Collection
-from coordinator.evaluation import Evaluation
+from dreamfleet.common import schema
+from dreamfleet.common.errors import DreamfleetError, JournalError
+from dreamfleet.common.messages import Job, Result
+from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.coordinator.cma_state import Checkpoint
+from dreamfleet.coordinator.collection import Collection
+from dreamfleet.coordinator.evaluation import Evaluation
 
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 
-from common.bundle import Bundle, find_bundle
-from common.errors import JournalError
-from common.keys import check_run_name
-from common.messages import Intervals
-from common.runs import BUNDLE, RunSettings, open_run, run_lock
-from common.session import Network
-from coordinator.config import LimitsConfig, RunConfig
-from coordinator.fleet import Fleet
-from coordinator.journal import Journal
-from coordinator.run import Run
-from coordinator.service import Service
-from coordinator.start import Start
+from dreamfleet.common.bundle import Bundle, find_bundle
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.keys import check_run_name
+from dreamfleet.common.messages import Intervals
+from dreamfleet.common.runs import BUNDLE, RunSettings, open_run, run_lock
+from dreamfleet.common.session import Network
+from dreamfleet.coordinator.config import LimitsConfig, RunConfig
+from dreamfleet.coordinator.fleet import Fleet
+from dreamfleet.coordinator.journal import Journal
+from dreamfleet.coordinator.run import Run
+from dreamfleet.coordinator.service import Service
+from dreamfleet.coordinator.start import Start
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from common.messages import MAX_LEASES, Beat, Verdict
-from coordinator.packing import Content
+from dreamfleet.common.messages import MAX_LEASES, Beat, Verdict
+from dreamfleet.coordinator.packing import Content
 
 
 @dataclass

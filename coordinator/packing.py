@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from common.messages import MAX_MESSAGE, MAX_PART, VectorPart, Verdict
-from coordinator.jobs import Work
+from dreamfleet.common.messages import MAX_MESSAGE, MAX_PART, VectorPart, Verdict
+from dreamfleet.coordinator.jobs import Work
 
 # Bytes of msgpack, rounded up: the envelope, and each item beside its variable part.
 _ENVELOPE, _JOB, _VECTOR, _CANCEL, _VERDICT = 1024, 400, 160, 40, 80

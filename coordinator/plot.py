@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from common.runs import RunFolder
+from dreamfleet.common.runs import RunFolder
 
 DREAM = "dream"
 

@@ -12,23 +12,23 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from common.controller import Controller
-from common.errors import JournalError
-from common.files import write_aside
-from common.heat import deciding_check, raised_temperature
-from common.messages import HelloRequest, Job, Result, ResultBatch, UploadPart
-from common.runs import CONTROLLER, RunSettings, StoredEvaluation, StoredGeneration, rollout_path
-from common.seeds import training_seed
-from coordinator.collection import Collection
-from coordinator.config import LimitsConfig
-from coordinator.evaluation import Evaluation, parted
-from coordinator.evolution import Evolution, EvolutionConfig
-from coordinator.fleet import Fleet
-from coordinator.generation import Generation
-from coordinator.jobs import travelling
-from coordinator.journal import Journal
-from coordinator.start import Start
-from coordinator.uploads import Uploads
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.files import write_aside
+from dreamfleet.common.heat import deciding_check, raised_temperature
+from dreamfleet.common.messages import HelloRequest, Job, Result, ResultBatch, UploadPart
+from dreamfleet.common.runs import CONTROLLER, RunSettings, StoredEvaluation, StoredGeneration, rollout_path
+from dreamfleet.common.seeds import training_seed
+from dreamfleet.coordinator.collection import Collection
+from dreamfleet.coordinator.config import LimitsConfig
+from dreamfleet.coordinator.evaluation import Evaluation, parted
+from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.fleet import Fleet
+from dreamfleet.coordinator.generation import Generation
+from dreamfleet.coordinator.jobs import travelling
+from dreamfleet.coordinator.journal import Journal
+from dreamfleet.coordinator.start import Start
+from dreamfleet.coordinator.uploads import Uploads
 
 
 @dataclass

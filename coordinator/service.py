@@ -20,12 +20,12 @@ from typing import Any
 
 import zenoh
 
-from common import keys
-from common.codec import Inbox, encode, encode_json, encoding
-from common.errors import RefusedError
-from common.fields import written
-from common.fingerprint import package_version
-from common.messages import (
+from dreamfleet.common import keys
+from dreamfleet.common.codec import Inbox, encode, encode_json, encoding
+from dreamfleet.common.errors import RefusedError
+from dreamfleet.common.fields import written
+from dreamfleet.common.fingerprint import package_version
+from dreamfleet.common.messages import (
     MAX_PART,
     Beat,
     BundlePart,
@@ -38,11 +38,11 @@ from common.messages import (
     ResultBatch,
     UploadPart,
 )
-from common.runs import BUNDLE
-from common.session import LEASE_MS, Network, enqueue_into, open_session
-from coordinator.fleet import Send
-from coordinator.run import Run
-from coordinator.status import PARTS, Snapshot, take_snapshot
+from dreamfleet.common.runs import BUNDLE
+from dreamfleet.common.session import LEASE_MS, Network, enqueue_into, open_session
+from dreamfleet.coordinator.fleet import Send
+from dreamfleet.coordinator.run import Run
+from dreamfleet.coordinator.status import PARTS, Snapshot, take_snapshot
 
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a loss waits to be acted upon

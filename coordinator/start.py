@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bundle import Bundle
-from common.controller import ControllerShape
-from common.errors import ControllerError, DreamfleetError
-from common.runs import RunFolder, open_run
-from common.shelf import find_controller
-from coordinator import cma_state
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.errors import ControllerError, DreamfleetError
+from dreamfleet.common.runs import RunFolder, open_run
+from dreamfleet.common.shelf import find_controller
+from dreamfleet.coordinator import cma_state
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
-from common.fingerprint import package_version
-from coordinator.member import Member
-from coordinator.run import Run
+from dreamfleet.common.fingerprint import package_version
+from dreamfleet.coordinator.member import Member
+from dreamfleet.coordinator.run import Run
 
 SCHEMA = 1
 PARTS = ("", "generation", "workers", "history", "best")

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from coordinator.jobs import Work
-from coordinator.member import Lease, Member
+from dreamfleet.coordinator.jobs import Work
+from dreamfleet.coordinator.member import Lease, Member
 
 SMOOTHING = 0.1  # weight of the newest episode in the typical one
 QUIET_BEATS = 2  # without a word: a straggler that nothing is known of

@@ -9,7 +9,7 @@ import hashlib
 from collections import Counter
 from dataclasses import dataclass, field
 
-from common.messages import MAX_PART, MAX_UPLOAD, UploadPart
+from dreamfleet.common.messages import MAX_PART, MAX_UPLOAD, UploadPart
 
 
 @dataclass(frozen=True)

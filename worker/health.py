@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from common.health import Finding
+from dreamfleet.common.health import Finding
 
 
 def examine() -> Iterator[Finding]:
     """Whether the native picture was built and equals the installed gymnasium's."""
     remedy = "install a C compiler, then pip install --force-reinstall --no-deps dreamfleet; gymnasium draws until then"
     try:
-        from worker.render.check import native_is_exact
-        from worker.render.environment import available
+        from dreamfleet.worker.car_racing.check import native_is_exact
+        from dreamfleet.worker.car_racing.environment import available
     except ModuleNotFoundError as error:
         yield Finding("native picture", False, False, f"no {error.name}", "worker", "pip install 'dreamfleet[worker]'")
         return

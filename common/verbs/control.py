@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 
-from common.session import DEFAULT_ENDPOINT
+from dreamfleet.common.session import DEFAULT_ENDPOINT
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ControlVerb:
 
     def run(self, args: argparse.Namespace) -> int:
         """Ask, and say what follows."""
-        from common.client import Client
+        from dreamfleet.common.client import Client
 
         with Client(tuple(args.connect)) as client:
             name = args.run_name or client.status()["run"]

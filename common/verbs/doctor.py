@@ -22,8 +22,8 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from common.fingerprint import fingerprint
-    from common.health import examine
+    from dreamfleet.common.fingerprint import fingerprint
+    from dreamfleet.common.health import examine
 
     findings = examine()
     broken = [each for each in findings if each.needed and not each.ok]

@@ -6,8 +6,8 @@ import argparse
 import json
 import time
 
-from common.errors import ConnectionFailedError
-from common.session import DEFAULT_ENDPOINT
+from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.session import DEFAULT_ENDPOINT
 
 SUMMARY = "show how a run is: generation, population, best, workers, throughput, waste"
 EXTRAS = ()
@@ -27,8 +27,8 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.live import Live
 
-    from common.client import Client
-    from common.table import run_panel
+    from dreamfleet.common.client import Client
+    from dreamfleet.common.table import run_panel
 
     with Client(tuple(args.connect)) as client:
         status = client.status(args.run)

@@ -11,16 +11,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from common.config import Table, add_flags, choose_preset, load, read_toml
-from common.errors import UsageError
-from common.runs import default_runs_dir
-from common.session import DEFAULT_ENDPOINT, Network
-from coordinator.config import PRESETS, LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.common.config import Table, add_flags, choose_preset, load, read_toml
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs import default_runs_dir
+from dreamfleet.common.session import DEFAULT_ENDPOINT, Network
+from dreamfleet.coordinator.config import PRESETS, LimitsConfig, NetworkConfig, RunConfig
 
 if TYPE_CHECKING:
-    from coordinator.main import RunRequest
-    from coordinator.run import Run
-    from coordinator.start import Start
+    from dreamfleet.coordinator.main import RunRequest
+    from dreamfleet.coordinator.run import Run
+    from dreamfleet.coordinator.start import Start
 
 SUMMARY = "start a run: CMA-ES decides, workers score"
 EXTRAS = ()
@@ -50,7 +50,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the run until it ends; Ctrl-C leaves it to be continued."""
-    from coordinator.start import find_start
+    from dreamfleet.coordinator.start import find_start
 
     if args.resume and args.init:
         raise UsageError(f"--init: run {args.resume} has begun; `dreamfleet fork {args.resume}` begins another from it")
@@ -60,9 +60,9 @@ def run(args: argparse.Namespace) -> int:
 
 def serve(args: argparse.Namespace, preset: Table, start: Start | None, resume: str | None = None) -> int:
     """Serve a run whose settings begin with `preset`, or continue one."""
-    from coordinator.main import RunRequest, serve_run
+    from dreamfleet.coordinator.main import RunRequest, serve_run
 
-    logging.getLogger("coordinator").setLevel(logging.INFO)
+    logging.getLogger("dreamfleet.coordinator").setLevel(logging.INFO)
     file = read_toml(args.config, SECTIONS)
     sources: Any = {"flags": args, "environment": os.environ, "file": file}
     config = load(RunConfig, "run", preset=preset, **sources)

@@ -8,9 +8,9 @@ from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 
-from common.config import add_flags, load
-from common.runs import default_runs_dir
-from coordinator.demo import Demo, DemoConfig
+from dreamfleet.common.config import add_flags, load
+from dreamfleet.common.runs import default_runs_dir
+from dreamfleet.coordinator.demo import Demo, DemoConfig
 
 SUMMARY = "evolve a controller on this machine in minutes, judge it, plot it and record its drive"
 EXTRAS = ("worker", "views")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from common.runs import default_runs_dir
+from dreamfleet.common.runs import default_runs_dir
 
 SUMMARY = "start a new run from another one's mean, step size and temperature; any setting may change"
 EXTRAS = ()
@@ -13,7 +13,7 @@ EXTRAS = ()
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from coordinator.verbs.coordinator import add_settings
+    from dreamfleet.coordinator.verbs.coordinator import add_settings
 
     parser.add_argument("source", metavar="RUN", help="the run to begin from; it is only read")
     parser.add_argument("--run", dest="run_name", help="name of the new run (default RUN-fork)")
@@ -23,11 +23,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the new run until it ends."""
-    from common.heat import spec_of
-    from common.runs import open_run
-    from coordinator.config import settings_of
-    from coordinator.start import latest, start_of
-    from coordinator.verbs.coordinator import serve
+    from dreamfleet.common.heat import spec_of
+    from dreamfleet.common.runs import open_run
+    from dreamfleet.coordinator.config import settings_of
+    from dreamfleet.coordinator.start import latest, start_of
+    from dreamfleet.coordinator.verbs.coordinator import serve
 
     with open_run(args.runs_dir, args.source) as stored:
         start, (_, sigma) = start_of(stored), latest(stored)

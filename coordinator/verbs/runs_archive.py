@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from common.errors import JournalError
-from common.runs import ARCHIVE, default_runs_dir, open_run, run_lock
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.runs import ARCHIVE, default_runs_dir, open_run, run_lock
 
 SUMMARY = "move a run that nobody serves into the archive"
 EXTRAS = ()

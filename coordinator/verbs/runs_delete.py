@@ -7,8 +7,8 @@ import shutil
 import sys
 from pathlib import Path
 
-from common.errors import UsageError
-from common.runs import default_runs_dir, open_run, run_lock
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs import default_runs_dir, open_run, run_lock
 
 SUMMARY = "delete a run that nobody serves, with its journal, controller and videos"
 EXTRAS = ()

@@ -6,8 +6,8 @@ import argparse
 import json
 from pathlib import Path
 
-from common.errors import JournalError
-from common.runs import ARCHIVE, RunFolder, default_runs_dir, run_paths
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.runs import ARCHIVE, RunFolder, default_runs_dir, run_paths
 
 SUMMARY = "list the runs on this disk"
 EXTRAS = ()

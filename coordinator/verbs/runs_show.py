@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from common.runs import default_runs_dir, open_run
+from dreamfleet.common.runs import default_runs_dir, open_run
 
 SUMMARY = "show one run from its journal: settings, history, evaluations"
 EXTRAS = ()

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from common.errors import JournalError
-from common.runs import open_run
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.runs import open_run
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
 from tests.support.hosts import new_host

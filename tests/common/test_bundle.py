@@ -4,7 +4,7 @@ import zipfile
 
 import pytest
 
-from common.bundle import (
+from dreamfleet.common.bundle import (
     ENCODER,
     MANIFEST,
     Bundle,
@@ -14,7 +14,7 @@ from common.bundle import (
     shipped_bundles,
     write_bundle,
 )
-from common.errors import BundleError
+from dreamfleet.common.errors import BundleError
 from tests.support.bundles import write_random_bundle
 
 LARGEST_SHIPPED = 16_000_000

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.codec import Inbox, MalformedError, decode, decode_json, encode, encode_json, encoding
-from common.messages import MAX_MESSAGE, WIRE, Beat, HelloRequest, JobBatch, ResultBatch
+from dreamfleet.common.codec import Inbox, MalformedError, decode, decode_json, encode, encode_json, encoding
+from dreamfleet.common.messages import MAX_MESSAGE, WIRE, Beat, HelloRequest, JobBatch, ResultBatch
 from tests.support.mutations import mutations
 from tests.support.samples import JSON, MSGPACK, VECTOR_ID
 

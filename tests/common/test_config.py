@@ -4,8 +4,8 @@ from typing import Literal
 
 import pytest
 
-from common.config import add_flags, choose_preset, load, option, read_toml
-from common.errors import UsageError
+from dreamfleet.common.config import add_flags, choose_preset, load, option, read_toml
+from dreamfleet.common.errors import UsageError
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from common.controller import Controller, ControllerShape, act
-from common.errors import ControllerError
+from dreamfleet.common.controller import Controller, ControllerShape, act
+from dreamfleet.common.errors import ControllerError
 
 SHAPE = ControllerShape(features=4)
 

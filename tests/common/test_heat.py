@@ -3,10 +3,10 @@ import itertools
 
 import pytest
 
-from common.controller import ControllerShape
-from common.heat import deciding_check, raised_temperature
-from common.messages import HOTTEST
-from common.runs import RunSettings, StoredEvaluation
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.heat import deciding_check, raised_temperature
+from dreamfleet.common.messages import HOTTEST
+from dreamfleet.common.runs import RunSettings, StoredEvaluation
 from tests.support.samples import SPEC
 
 EVERY = 5

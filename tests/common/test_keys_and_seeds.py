@@ -2,8 +2,8 @@ import re
 
 import pytest
 
-from common import keys, seeds
-from common.errors import UsageError
+from dreamfleet.common import keys, seeds
+from dreamfleet.common.errors import UsageError
 
 
 @pytest.mark.parametrize("name", ["a", "night-run-7", "0", "x" * 63])

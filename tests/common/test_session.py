@@ -1,7 +1,7 @@
 import pytest
 
-from common.errors import ConnectionFailedError, UsageError
-from common.session import Network, check_endpoint, open_session
+from dreamfleet.common.errors import ConnectionFailedError, UsageError
+from dreamfleet.common.session import Network, check_endpoint, open_session
 from tests.support.processes import free_port
 
 

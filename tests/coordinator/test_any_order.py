@@ -11,13 +11,13 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from common.messages import TAG_BYTES, Beat, JobBatch, Result, Running
-from coordinator.fleet import DEPARTURE_GRACE, Fleet
-from coordinator.generation import Generation
-from coordinator.jobs import make_work, travelling
+from dreamfleet.common.messages import TAG_BYTES, Beat, JobBatch, Result, Running
+from dreamfleet.coordinator.fleet import DEPARTURE_GRACE, Fleet
+from dreamfleet.coordinator.generation import Generation
+from dreamfleet.coordinator.jobs import make_work, travelling
+from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.outbox import Outbox
 from tests.support.samples import HEAD, SPEC
-from worker.backlog import Backlog
-from worker.outbox import Outbox
 
 BEAT = 1.0
 GENERATIONS, SLOTS = 3, 2
@@ -47,7 +47,7 @@ def lossless(number):
 
 
 class Worker:
-    """One life of a worker process, as `worker.service` runs it."""
+    """One life of a worker process, as `dreamfleet.worker.service.worker` runs it."""
 
     def __init__(self):
         self.backlog, self.outbox = Backlog(SPEC), Outbox(BEAT)

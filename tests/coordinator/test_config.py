@@ -3,12 +3,12 @@ import json
 import numpy as np
 import pytest
 
-from common.errors import ControllerError, UsageError
-from common.fields import written
-from common.messages import TaskSpec
-from common.runs import RunSettings
-from coordinator.config import RunConfig, settings_of
-from coordinator.start import Start
+from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.fields import written
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.runs import RunSettings
+from dreamfleet.coordinator.config import RunConfig, settings_of
+from dreamfleet.coordinator.start import Start
 
 
 @pytest.mark.parametrize(

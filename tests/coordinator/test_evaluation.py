@@ -1,7 +1,7 @@
 import pytest
 
-from common.runs import StoredEvaluation
-from coordinator.evaluation import parted
+from dreamfleet.common.runs import StoredEvaluation
+from dreamfleet.coordinator.evaluation import parted
 
 
 def evaluations(*means):

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from common.errors import JournalError, UsageError
-from coordinator import cma_state
-from coordinator.evolution import Evolution, EvolutionConfig, Normals
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.coordinator import cma_state
+from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig, Normals
 
 
 def config(**changes):

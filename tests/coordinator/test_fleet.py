@@ -3,10 +3,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from common.messages import TAG_BYTES, Beat, Result, Running
-from coordinator.fleet import DEPARTURE_GRACE, SILENT_BEATS, Fleet
-from coordinator.jobs import make_work, travelling
-from coordinator.tail import UPLOAD_SECONDS
+from dreamfleet.common.messages import TAG_BYTES, Beat, Result, Running
+from dreamfleet.coordinator.fleet import DEPARTURE_GRACE, SILENT_BEATS, Fleet
+from dreamfleet.coordinator.jobs import make_work, travelling
+from dreamfleet.coordinator.tail import UPLOAD_SECONDS
 from tests.support.samples import HEAD, SPEC
 
 A, B = "a/00000001", "b/00000002"

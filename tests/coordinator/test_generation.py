@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from coordinator.generation import Generation
-from coordinator.jobs import make_work, travelling
+from dreamfleet.coordinator.generation import Generation
+from dreamfleet.coordinator.jobs import make_work, travelling
 from tests.support.samples import SPEC
 
 VECTORS = [travelling(np.full(5, value)) for value in (0.0, 1.0, 2.0)]

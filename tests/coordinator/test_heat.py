@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from common.messages import Result, ResultBatch
-from common.runs import RunFolder
-from common.table import run_panel
-from coordinator.config import LimitsConfig
-from coordinator.status import take_snapshot
-from coordinator.verbs import fork
+from dreamfleet.common.messages import Result, ResultBatch
+from dreamfleet.common.runs import RunFolder
+from dreamfleet.common.table import run_panel
+from dreamfleet.coordinator.config import LimitsConfig
+from dreamfleet.coordinator.status import take_snapshot
+from dreamfleet.coordinator.verbs import fork
 from tests.coordinator.test_run import SETTINGS, A, Bench
 from tests.support.samples import SPEC
 
@@ -151,6 +151,8 @@ def test_the_temperature_is_told_as_it_rises(heated):
 def test_a_fork_begins_as_warm_as_its_run_is(heated, monkeypatch):
     bench, served = heated("night", generations=7), []
     driven(bench, lambda _: 0)
-    monkeypatch.setattr("coordinator.verbs.coordinator.serve", lambda _args, settings, _start: served.append(settings))
+    monkeypatch.setattr(
+        "dreamfleet.coordinator.verbs.coordinator.serve", lambda _args, settings, _start: served.append(settings)
+    )
     fork.run(argparse.Namespace(source="night", runs_dir=bench.path.parent, run_name=None))
     assert [(each["temperature"], each["heat"]) for each in served] == [(1.5, 1.5)]

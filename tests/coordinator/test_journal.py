@@ -3,14 +3,14 @@ import sqlite3
 import numpy as np
 import pytest
 
-from common.controller import ControllerShape
-from common.errors import JournalError, UsageError
-from common.messages import Result
-from common.runs import RunFolder, RunSettings, StoredGeneration, open_run, run_lock
-from coordinator.evaluation import Evaluation
-from coordinator.generation import Generation
-from coordinator.jobs import travelling
-from coordinator.journal import Journal
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.messages import Result
+from dreamfleet.common.runs import RunFolder, RunSettings, StoredGeneration, open_run, run_lock
+from dreamfleet.coordinator.evaluation import Evaluation
+from dreamfleet.coordinator.generation import Generation
+from dreamfleet.coordinator.jobs import travelling
+from dreamfleet.coordinator.journal import Journal
 from tests.support.samples import SPEC
 
 SETTINGS = RunSettings(SPEC, ControllerShape(1), 2, 1, 0.1, "diagonal", 1, 5, 2)

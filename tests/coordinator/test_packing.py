@@ -3,10 +3,10 @@ import hashlib
 import numpy as np
 import pytest
 
-from common.codec import encode
-from common.messages import MAX_MESSAGE, JobBatch, Verdict
-from coordinator.jobs import make_work, travelling
-from coordinator.packing import pack
+from dreamfleet.common.codec import encode
+from dreamfleet.common.messages import MAX_MESSAGE, JobBatch, Verdict
+from dreamfleet.coordinator.jobs import make_work, travelling
+from dreamfleet.coordinator.packing import pack
 from tests.support.samples import HEAD, SPEC
 
 RANDOM = np.random.default_rng(0)

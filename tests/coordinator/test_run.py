@@ -7,13 +7,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from common.controller import ControllerShape
-from common.messages import MAX_PART, TAG_BYTES, Beat, HelloRequest, Result, ResultBatch, UploadPart
-from common.runs import RunFolder, RunSettings
-from coordinator.config import LimitsConfig
-from coordinator.fleet import Fleet
-from coordinator.journal import Journal
-from coordinator.run import Run
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.messages import MAX_PART, TAG_BYTES, Beat, HelloRequest, Result, ResultBatch, UploadPart
+from dreamfleet.common.runs import RunFolder, RunSettings
+from dreamfleet.coordinator.config import LimitsConfig
+from dreamfleet.coordinator.fleet import Fleet
+from dreamfleet.coordinator.journal import Journal
+from dreamfleet.coordinator.run import Run
 from tests.support.samples import SPEC
 
 A, B = "a/00000001", "b/00000002"

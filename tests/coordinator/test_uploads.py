@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.messages import MAX_PART, MAX_UPLOAD, UploadPart
-from coordinator.uploads import Uploads, UploadsConfig
+from dreamfleet.common.messages import MAX_PART, MAX_UPLOAD, UploadPart
+from dreamfleet.coordinator.uploads import Uploads, UploadsConfig
 from tests.support.samples import HEAD
 
 A, B = "a/00000001", "b/00000002"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.controller import Controller, ControllerShape
+from dreamfleet.common.controller import Controller, ControllerShape
 from tests.support import tasks
 
 pytestmark = pytest.mark.timeout(120)

@@ -7,18 +7,18 @@ import signal
 import numpy as np
 import pytest
 
-from common import keys
-from common.codec import decode, encode
-from common.messages import MAX_PART, UploadPart
-from common.runs import open_run
-from common.seeds import collection_seed
-from common.session import Network, open_session
+from dreamfleet.common import keys
+from dreamfleet.common.codec import decode, encode
+from dreamfleet.common.messages import MAX_PART, UploadPart
+from dreamfleet.common.runs import open_run
+from dreamfleet.common.seeds import collection_seed
+from dreamfleet.common.session import Network, open_session
+from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
+from dreamfleet.worker.training.dataset import episodes, load_pictures
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
-from worker.tasks.preprocessing import BOX, RAW
-from worker.training.dataset import episodes, load_pictures
-from worker.worldmodel.mdnrnn_config import MDNRNNConfig
-from worker.worldmodel.vae_config import VAEConfig
 
 pytestmark = pytest.mark.timeout(240)
 GENERATIONS, DRIVES = 4, 3

@@ -2,8 +2,8 @@
 
 import pytest
 
-from common.controller import Controller
-from common.runs import open_run
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.runs import open_run
 
 pytestmark = pytest.mark.timeout(240)
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from common.bundle import DREAM, write_bundle
-from common.heat import spec_of
-from common.runs import open_run
+from dreamfleet.common.bundle import DREAM, write_bundle
+from dreamfleet.common.heat import spec_of
+from dreamfleet.common.runs import open_run
 from tests.support import tasks
 
 pytestmark = pytest.mark.timeout(300)

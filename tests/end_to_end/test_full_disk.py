@@ -8,7 +8,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from common.runs import open_run
+from dreamfleet.common.runs import open_run
 from tests.support import tasks
 
 pytestmark = [

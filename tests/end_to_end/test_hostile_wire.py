@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from common import keys
-from common.codec import encode
-from common.messages import MAX_MESSAGE
-from common.session import Network, open_session
+from dreamfleet.common import keys
+from dreamfleet.common.codec import encode
+from dreamfleet.common.messages import MAX_MESSAGE
+from dreamfleet.common.session import Network, open_session
 from tests.support import tasks
 from tests.support.mutations import mutations
 from tests.support.samples import MSGPACK

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from common.runs import open_run
+from dreamfleet.common.runs import open_run
 from tests.support import tasks
 from tests.support.hosts import new_host
 

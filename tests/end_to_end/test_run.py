@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.runs import open_run
-from coordinator.start import latest
+from dreamfleet.common.runs import open_run
+from dreamfleet.coordinator.start import latest
 from tests.support import tasks
 from tests.support.processes import environment, free_port
 
@@ -115,8 +115,8 @@ def test_a_worker_with_another_fingerprint_is_refused_with_the_remedy(processes,
     processes.worker("--task", tasks.SLOW_TOY).wait_for("joined")
     stranger = tmp_path / "stranger.py"
     stranger.write_text(
-        "import sys, common.fingerprint, worker.admission\n"
-        "worker.admission.fingerprint = lambda: 'riscv64 other'\n"
+        "import sys, dreamfleet.common.fingerprint, dreamfleet.worker.service.admission\n"
+        "dreamfleet.worker.service.admission.fingerprint = lambda: 'riscv64 other'\n"
         "from common.cli import main\nsys.exit(main(sys.argv[1:]))\n"
     )
     command = [sys.executable, stranger, "worker", "--connect", processes.endpoint, "--task", tasks.SLOW_TOY]

@@ -6,7 +6,7 @@ import signal
 import numpy as np
 import pytest
 
-from common.runs import open_run
+from dreamfleet.common.runs import open_run
 
 pytestmark = pytest.mark.timeout(300)
 GENERATIONS, POPULATION, EPISODES = 4, 6, 2

@@ -5,12 +5,12 @@ import io
 import numpy as np
 import torch
 
-from common.bundle import write_bundle
-from worker.training.assemble import graphs, manifest
-from worker.worldmodel.mdnrnn import MDNRNN
-from worker.worldmodel.mdnrnn_config import REWARDED
-from worker.worldmodel.vae import VAE
-from worker.worldmodel.vae_config import PAPER
+from dreamfleet.common.bundle import write_bundle
+from dreamfleet.worker.training.assemble import graphs, manifest
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
+from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED
+from dreamfleet.worker.worldmodel.vae import VAE
+from dreamfleet.worker.worldmodel.vae_config import PAPER
 
 
 def random_models(seed=0, vae=PAPER, rnn=REWARDED):

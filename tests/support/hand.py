@@ -6,9 +6,9 @@ from dataclasses import asdict
 
 import zenoh
 
-from common import keys
-from common.codec import decode, decode_json, encode, encode_json
-from common.messages import (
+from dreamfleet.common import keys
+from dreamfleet.common.codec import decode, decode_json, encode, encode_json
+from dreamfleet.common.messages import (
     MAX_PART,
     TAG_BYTES,
     Beat,
@@ -23,7 +23,7 @@ from common.messages import (
     VectorPart,
     Verdict,
 )
-from common.session import Network, open_session
+from dreamfleet.common.session import Network, open_session
 from tests.support import samples
 
 DEADLINE = 30

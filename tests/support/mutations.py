@@ -2,7 +2,7 @@
 
 import random
 
-from common.codec import encode
+from dreamfleet.common.codec import encode
 from tests.support.samples import MSGPACK
 
 WHOLE = [encode(message) for message in MSGPACK.values()]

@@ -10,7 +10,7 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-from common.client import Client
+from dreamfleet.common.client import Client
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 60
@@ -37,7 +37,7 @@ class Process:
     """A verb running; its stderr lines can be waited for."""
 
     def __init__(self, arguments, cache, inside=()):
-        command = [*inside, sys.executable, "-m", "common.cli", *map(str, arguments)]
+        command = [*inside, sys.executable, "-m", "dreamfleet", *map(str, arguments)]
         self.popen = subprocess.Popen(
             command,
             env=environment(cache),
@@ -118,7 +118,7 @@ class Processes:
 
     def call(self, *arguments, timeout=DEADLINE):
         """Run a verb to its end: exit code, stdout, stderr."""
-        command = [sys.executable, "-m", "common.cli", *map(str, arguments)]
+        command = [sys.executable, "-m", "dreamfleet", *map(str, arguments)]
         done = subprocess.run(
             command, env=environment(self.cache), capture_output=True, check=False, text=True, timeout=timeout
         )

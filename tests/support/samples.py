@@ -2,7 +2,7 @@
 
 import hashlib
 
-from common.messages import (
+from dreamfleet.common.messages import (
     Beat,
     BundlePart,
     ControlReply,

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from worker.tasks.api import Score
+from dreamfleet.worker.tasks.api import Score
 
 MODULE = "tests.support.tasks"
 TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC = (

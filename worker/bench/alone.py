@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from common.bundle import Bundle
+    from dreamfleet.common.bundle import Bundle
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -21,8 +21,8 @@ def print_figures(measure: Callable[[Bundle], dict[str, Any]], args: argparse.Na
     """Measure a bundle and print what comes of it."""
     from multiprocessing import get_context
 
-    from common.bundle import find_bundle
-    from common.threads import pin_thread_pools
+    from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.common.threads import pin_thread_pools
 
     bundle = find_bundle(args.bundle)
     pin_thread_pools()

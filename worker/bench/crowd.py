@@ -9,16 +9,16 @@ from typing import Any
 
 import zenoh
 
-from common import keys
-from common.codec import Inbox, encode, encoding
-from common.errors import ConnectionFailedError
-from common.fingerprint import fingerprint
-from common.messages import MAX_LEASES, TAG_BYTES, Beat, JobBatch, Result, ResultBatch
-from common.session import Network, enqueue_into, open_session
-from worker.admission import Admission, ask, make_request
-from worker.backlog import Backlog
-from worker.bench.naps import NULLS
-from worker.outbox import Outbox
+from dreamfleet.common import keys
+from dreamfleet.common.codec import Inbox, encode, encoding
+from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.fingerprint import fingerprint
+from dreamfleet.common.messages import MAX_LEASES, TAG_BYTES, Beat, JobBatch, Result, ResultBatch
+from dreamfleet.common.session import Network, enqueue_into, open_session
+from dreamfleet.worker.bench.naps import NULLS
+from dreamfleet.worker.service.admission import Admission, ask, make_request
+from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.outbox import Outbox
 
 
 @dataclass

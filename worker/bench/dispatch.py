@@ -18,10 +18,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from common.errors import DreamfleetError
-from common.runs import open_run
-from worker.bench.crowd import serve_crowd
-from worker.bench.naps import NAP_SECONDS, NAPS, NULLS
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.runs import open_run
+from dreamfleet.worker.bench.crowd import serve_crowd
+from dreamfleet.worker.bench.naps import NAP_SECONDS, NAPS, NULLS
 
 SLOTS = 8
 CANDIDATES = 200
@@ -137,7 +137,7 @@ class BenchRun:
 
 @contextmanager
 def _process(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "common.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "dreamfleet", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603 - our own
     try:
         yield process

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from common.bundle import Bundle
-from common.messages import TaskSpec
-from worker.bench.blocks import Measured, alternate
-from worker.dream.scoring import Dreamer
-from worker.tasks.api import Episode
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.worker.bench.blocks import Measured, alternate
+from dreamfleet.worker.dream.batch import Dreamer
+from dreamfleet.worker.tasks.api import Episode
 
 BATCHES = (1, 256, 1024)
 CANDIDATES = 64  # of a batch, where it has room for so many
@@ -37,7 +37,7 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
     cases["floor"] = _products(bundle, random)
     note = ""
     try:
-        from worker.worldmodel.eager import make_torch_dream
+        from dreamfleet.worker.bench.eager import make_torch_dream
 
         cases["torch"] = make_torch_dream(bundle, TILE)
     except ModuleNotFoundError as error:

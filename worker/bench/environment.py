@@ -13,13 +13,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bundle import Bundle, find_bundle, pretrained
-from common.controller import Controller
-from common.errors import ControllerError
-from common.seeds import VALIDATION
-from worker.render.check import Actions, Difference, compare, leap, make_car_racing
-from worker.tasks.car_racing import CarRacing, CarRacingPolicy, PictureObservation
-from worker.tasks.preprocessing import BOX
+from dreamfleet.common.bundle import Bundle, find_bundle, pretrained
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import ControllerError
+from dreamfleet.common.seeds import VALIDATION
+from dreamfleet.worker.car_racing.check import Actions, Difference, compare, leap, make_car_racing
+from dreamfleet.worker.car_racing.preprocessing import BOX
+from dreamfleet.worker.car_racing.task import CarRacing, CarRacingPolicy, PictureObservation
 
 STEPS = 1000
 Policy = Callable[[NDArray[np.uint8]], Any]
@@ -143,7 +143,7 @@ def policy_of(bundle: Bundle) -> Policy:
 
 def torch_policy_of(bundle: Bundle) -> Policy:
     """The same work in torch, one operation at a time, on a picture of its own."""
-    from worker.worldmodel.eager import make_torch_step
+    from dreamfleet.worker.bench.eager import make_torch_step
 
     parameters = np.zeros((1, bundle.controller_shape.size), np.float32)
     step_once = make_torch_step(bundle, np.zeros((1, *bundle.manifest.picture), np.uint8), parameters)

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bundle import Bundle
+from dreamfleet.common.bundle import Bundle
 
 NAP_SECONDS = 0.05
 NAPS, NULLS = (f"{__name__}:{name}" for name in ("Naps", "Nulls"))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.bundle import Bundle
-from worker.bench.blocks import Measured, alternate
-from worker.worldmodel.inference import PolicyStep
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.worker.bench.blocks import Measured, alternate
+from dreamfleet.worker.worldmodel.inference import PolicyStep
 
 MATRIX = 768  # large enough to be all arithmetic, small enough for many blocks
 
@@ -25,7 +25,7 @@ def bench_policy(bundle: Bundle) -> dict[str, float | str | None]:
     }
     note = ""
     try:
-        from worker.worldmodel.eager import make_torch_step
+        from dreamfleet.worker.bench.eager import make_torch_step
 
         cases["torch"] = make_torch_step(bundle, picture, parameters)
     except ModuleNotFoundError as error:

@@ -2,7 +2,7 @@
 
 Importing this registers `dreamfleet/CarRacingDream-v0`, also for `gymnasium.make_vec`.
 
->>> import gymnasium, worker.dream
+>>> import gymnasium, dreamfleet.worker.dream
 >>> environment = gymnasium.make("dreamfleet/CarRacingDream-v0")
 """
 
@@ -14,7 +14,7 @@ ENVIRONMENT = "dreamfleet/CarRacingDream-v0"
 
 gymnasium.register(
     id=ENVIRONMENT,
-    entry_point="worker.dream.environment:CarRacingDream",
-    vector_entry_point="worker.dream.environment:CarRacingDreams",
+    entry_point="dreamfleet.worker.dream.environment:CarRacingDream",
+    vector_entry_point="dreamfleet.worker.dream.environment:CarRacingDreams",
     kwargs={"bundle": "tiny"},
 )

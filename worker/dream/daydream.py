@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bundle import DREAM, Bundle
-from worker.dream.noise import Noise
-from worker.dream.world import check_temperature
-from worker.worldmodel.inference import DreamStep
+from dreamfleet.common.bundle import DREAM, Bundle
+from dreamfleet.worker.dream.noise import Noise
+from dreamfleet.worker.dream.world import check_temperature
+from dreamfleet.worker.worldmodel.inference import DreamStep
 
 Floats = NDArray[np.float32]
 

@@ -10,10 +10,10 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from common.bundle import Bundle, find_bundle
-from worker.dream.noise import Noise, side_by_side
-from worker.dream.world import DreamWorld
-from worker.worldmodel.inference import Decoder
+from dreamfleet.common.bundle import Bundle, find_bundle
+from dreamfleet.worker.dream.noise import Noise, side_by_side
+from dreamfleet.worker.dream.world import DreamWorld
+from dreamfleet.worker.worldmodel.inference import Decoder
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]

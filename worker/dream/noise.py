@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.worldmodel.inference import Chance
+from dreamfleet.worker.worldmodel.inference import Chance
 
 Floats = NDArray[np.float32]
 PIECE = 64  # steps drawn at once: a horizon of any length costs no more memory

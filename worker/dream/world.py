@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bundle import DREAM, INITIAL, Bundle
-from common.errors import BundleError, UsageError
-from worker.dream.noise import Draw
-from worker.worldmodel.inference import Dream, DreamStep
+from dreamfleet.common.bundle import DREAM, INITIAL, Bundle
+from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.worker.dream.noise import Draw
+from dreamfleet.worker.worldmodel.inference import Dream, DreamStep
 
 Floats = NDArray[np.float32]
 

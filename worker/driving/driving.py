@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.errors import UsageError
-from worker.driving.scene import Scene
-from worker.driving.window import Told, Window
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.driving.scene import Scene
+from dreamfleet.worker.driving.window import Told, Window
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ import gymnasium
 import numpy as np
 import pygame
 
-from common.bundle import Bundle
-from worker.dream.environment import CarRacingDream
-from worker.render.check import make_car_racing
-from worker.tasks.preprocessing import BOX
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.worker.car_racing.check import make_car_racing
+from dreamfleet.worker.car_racing.preprocessing import BOX
+from dreamfleet.worker.dream.environment import CarRacingDream
 
 WIDTH = 640  # pixels of a dream's picture on a screen
 

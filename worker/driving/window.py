@@ -12,8 +12,8 @@ from typing import Literal
 
 import pygame
 
-from common.errors import NoDisplayError
-from worker.driving.pedals import Pedals
+from dreamfleet.common.errors import NoDisplayError
+from dreamfleet.worker.driving.pedals import Pedals
 
 FRAMES_PER_SECOND = 50  # CarRacing's
 BAR, NARROWEST = 64, 640  # pixels: what the text needs

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-from common.errors import DatasetError
-from common.runs import RunFolder
-from worker.inspection.charts import FONT, new_figure, png
-from worker.inspection.section import Section
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.runs import RunFolder
+from dreamfleet.worker.inspection.charts import FONT, new_figure, png
+from dreamfleet.worker.inspection.section import Section
 
 Points = list[dict[str, float]]
 LOSSES = (("vae", "the VAE"), ("mdnrnn", "the MDN-RNN"))

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bundle import Bundle
-from common.controller import Controller
-from worker.tasks.car_racing import CarRacing
-from worker.training.drivers import OrnsteinUhlenbeckDriver
-from worker.worldmodel.inference import Encoder
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.worker.car_racing.drivers import OrnsteinUhlenbeckDriver
+from dreamfleet.worker.car_racing.task import CarRacing
+from dreamfleet.worker.worldmodel.inference import Encoder
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]

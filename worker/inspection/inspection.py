@@ -7,16 +7,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.bundle import Bundle, find_bundle, shipped_bundles
-from common.controller import Controller
-from common.errors import BundleError, DatasetError, JournalError
-from common.runs import RunFolder, open_run
-from worker.dream.daydream import can_dream
-from worker.inspection import curves, memory, vision
-from worker.inspection.drive import Drive, DriveConfig, drive
-from worker.inspection.page import Page
-from worker.inspection.section import Section
-from worker.worldmodel.inference import Decoder
+from dreamfleet.common.bundle import Bundle, find_bundle, shipped_bundles
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import BundleError, DatasetError, JournalError
+from dreamfleet.common.runs import RunFolder, open_run
+from dreamfleet.worker.dream.daydream import can_dream
+from dreamfleet.worker.inspection import curves, memory, vision
+from dreamfleet.worker.inspection.drive import Drive, DriveConfig, drive
+from dreamfleet.worker.inspection.page import Page
+from dreamfleet.worker.inspection.section import Section
+from dreamfleet.worker.worldmodel.inference import Decoder
 
 PAGE = "index.html"
 DRIVEN = ("episodes", "frames", "held_out_episodes")  # of a bundle's provenance

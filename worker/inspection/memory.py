@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bundle import Bundle
-from worker.dream.noise import Draw, Noise
-from worker.dream.world import DreamWorld, check_temperature
-from worker.inspection.charts import FONT, heat, new_figure, picture_grid, png
-from worker.inspection.drive import Drive
-from worker.inspection.section import Section
-from worker.worldmodel.inference import Decoder, DreamStep, RewardLabel
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.worker.dream.noise import Draw, Noise
+from dreamfleet.worker.dream.world import DreamWorld, check_temperature
+from dreamfleet.worker.inspection.charts import FONT, heat, new_figure, picture_grid, png
+from dreamfleet.worker.inspection.drive import Drive
+from dreamfleet.worker.inspection.section import Section
+from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, RewardLabel
 
 Floats = NDArray[np.float32]
 STEPS = (0, 5, 10, 20, 50, 100)  # shown of a dream

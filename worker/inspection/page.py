@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from worker.inspection.section import Section
+from dreamfleet.worker.inspection.section import Section
 
 STYLE = """
 body { margin: 2.5rem auto; max-width: 1100px; padding: 0 1.5rem; color: #1c2026; background: #fff;

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from worker.inspection.charts import FONT, heat, new_figure, picture_grid, png
-from worker.inspection.drive import Drive
-from worker.inspection.section import Section
-from worker.worldmodel.inference import Decoder
+from dreamfleet.worker.inspection.charts import FONT, heat, new_figure, picture_grid, png
+from dreamfleet.worker.inspection.drive import Drive
+from dreamfleet.worker.inspection.section import Section
+from dreamfleet.worker.worldmodel.inference import Decoder
 
 SHOWN = 8  # pictures a row, latents a table
 TRAVERSED = np.linspace(-3, 3, 7)

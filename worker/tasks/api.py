@@ -16,9 +16,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bundle import Bundle
-from common.errors import UsageError
-from common.messages import TaskSpec
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.messages import TaskSpec
 
 GROUP = "dreamfleet.tasks"
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from common.bundle import (
+from dreamfleet.common.bundle import (
     DECODER,
     DREAM,
     ENCODER,
@@ -25,14 +25,14 @@ from common.bundle import (
     Manifest,
     write_bundle,
 )
-from common.errors import DatasetError
-from common.fingerprint import package_version
-from worker.tasks.preprocessing import preprocessing_to
-from worker.training import train_mdnrnn, train_vae
-from worker.training.checkpoint import load_config, load_weights
-from worker.training.dataset import episodes, load, split
-from worker.training.encode import ENCODED, encoder_of
-from worker.worldmodel.export import (
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.fingerprint import package_version
+from dreamfleet.worker.car_racing.preprocessing import preprocessing_to
+from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training.checkpoint import load_config, load_weights
+from dreamfleet.worker.training.dataset import episodes, load, split
+from dreamfleet.worker.training.encode import ENCODED, encoder_of
+from dreamfleet.worker.worldmodel.export import (
     Weights,
     export_controller,
     export_decoder,
@@ -40,8 +40,8 @@ from worker.worldmodel.export import (
     export_encoder,
     export_policy,
 )
-from worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
-from worker.worldmodel.vae_config import PAPER, VAEConfig
+from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 
 QUALITY = "quality.json"
 INITIAL_LATENTS = 256

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from common.codec import MalformedError, from_plain
-from common.errors import DatasetError, UsageError
-from common.files import write_aside
+from dreamfleet.common.codec import MalformedError, from_plain
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.files import write_aside
 
 T = TypeVar("T")
 

@@ -13,14 +13,14 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import DatasetError, UsageError
-from common.files import write_aside
-from common.threads import pin_thread_pools
-from worker.drive import Drive, write_episode
-from worker.render.check import make_car_racing
-from worker.tasks.preprocessing import preprocessing_to
-from worker.training.dataset import check_pictures
-from worker.training.drivers import DRIVERS
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.files import write_aside
+from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.worker.car_racing.check import make_car_racing
+from dreamfleet.worker.car_racing.drivers import DRIVERS
+from dreamfleet.worker.car_racing.preprocessing import preprocessing_to
+from dreamfleet.worker.scoring.rollout import Drive, write_episode
+from dreamfleet.worker.training.dataset import check_pictures
 
 
 @dataclass(frozen=True)

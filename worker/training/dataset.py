@@ -11,8 +11,8 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import DatasetError
-from worker.tasks.preprocessing import PREPROCESSINGS, preprocessing_to
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS, preprocessing_to
 
 POOL_EPISODES = 48  # whose frames are shuffled together
 POOL_FRAMES = 16_000  # of them at most, or one episode: 200 MB of 64x64, 440 MB of 96x96

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from worker.training.dataset import load, pad
-from worker.worldmodel.mdnrnn import reward_labels
-from worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.training.dataset import load, pad
+from dreamfleet.worker.worldmodel.mdnrnn import reward_labels
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
 FLIP = np.array([-1, 1, 1], dtype=np.float32)  # a mirrored drive steers the other way
 CHUNK_STEPS = 10_000  # that go through a model at once: about 300 MB

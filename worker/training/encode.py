@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.errors import DatasetError
-from common.files import write_aside
-from worker.training.checkpoint import load_config, load_weights
-from worker.training.dataset import check_pictures, check_whole, episodes, load, load_pictures
-from worker.training.train_vae import CHECKPOINT
-from worker.worldmodel.export import export_encoder
-from worker.worldmodel.inference import open_graph
-from worker.worldmodel.vae_config import VAEConfig
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.files import write_aside
+from dreamfleet.worker.training.checkpoint import load_config, load_weights
+from dreamfleet.worker.training.dataset import check_pictures, check_whole, episodes, load, load_pictures
+from dreamfleet.worker.training.train_vae import CHECKPOINT
+from dreamfleet.worker.worldmodel.export import export_encoder
+from dreamfleet.worker.worldmodel.inference import open_graph
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
 ENCODED = "encoded"
 BATCH = 100  # pictures

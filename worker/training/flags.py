@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.train_config import TrainConfig
 
 T = TypeVar("T")
 FIXED = ("actions",)  # what the task says

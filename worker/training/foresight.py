@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from worker.training.drives import Drives, load_drives
-from worker.worldmodel.mdnrnn import MDNRNN, Prediction, reward_labels
+from dreamfleet.worker.training.drives import Drives, load_drives
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction, reward_labels
 
 AHEAD = (1, 10, 50)  # steps of dreaming
 EVERY = 25  # a dream begins behind so many recorded steps more

@@ -6,11 +6,11 @@ import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from common.bundle import hash_file
-from common.errors import DatasetError
-from common.files import write_aside
-from worker.training.collect import episode_path, present
-from worker.training.dataset import load, load_pictures, preprocessing_of
+from dreamfleet.common.bundle import hash_file
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.files import write_aside
+from dreamfleet.worker.training.collect import episode_path, present
+from dreamfleet.worker.training.dataset import load, load_pictures, preprocessing_of
 
 
 def take_in(folder: Path, drives: Sequence[Path]) -> Iterator[int]:

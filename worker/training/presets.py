@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common.errors import UsageError
-from worker.training.collect import CollectConfig
-from worker.training.train_config import TrainConfig
-from worker.worldmodel import mdnrnn_config, vae_config
-from worker.worldmodel.mdnrnn_config import MDNRNNConfig
-from worker.worldmodel.vae_config import VAEConfig
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.training.collect import CollectConfig
+from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.worldmodel import mdnrnn_config, vae_config
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
 
 @dataclass(frozen=True)

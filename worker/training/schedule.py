@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
-from common.errors import DatasetError, UsageError
-from worker.training.checkpoint import load_checkpoint, save_checkpoint
-from worker.training.train_config import TrainConfig
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.worker.training.checkpoint import load_checkpoint, save_checkpoint
+from dreamfleet.worker.training.train_config import TrainConfig
 
 
 class Schedule:

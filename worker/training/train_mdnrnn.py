@@ -9,18 +9,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from common.errors import DatasetError
-from common.progress import append_curve
-from worker.training.checkpoint import load_progress
-from worker.training.dataset import episodes, load, split
-from worker.training.drives import Drives, inputs_of, load_drives
-from worker.training.encode import ENCODED, encoder_of
-from worker.training.foresight import foresight
-from worker.training.schedule import Schedule
-from worker.training.train_config import TrainConfig
-from worker.training.train_vae import Report
-from worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss, reward_labels, reward_loss
-from worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.progress import append_curve
+from dreamfleet.worker.training.checkpoint import load_progress
+from dreamfleet.worker.training.dataset import episodes, load, split
+from dreamfleet.worker.training.drives import Drives, inputs_of, load_drives
+from dreamfleet.worker.training.encode import ENCODED, encoder_of
+from dreamfleet.worker.training.foresight import foresight
+from dreamfleet.worker.training.schedule import Schedule
+from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.train_vae import Report
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss, reward_labels, reward_loss
+from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
 
 CHECKPOINT = "mdnrnn.safetensors"
 VALIDATION_DRIVES = 20  # for the curve while training

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.errors import UsageError
-from common.progress import append_curve
-from worker.training.dataset import (
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.progress import append_curve
+from dreamfleet.worker.training.dataset import (
     POOL_EPISODES,
     check_pictures,
     check_whole,
@@ -20,10 +20,10 @@ from worker.training.dataset import (
     picture_batches,
     split,
 )
-from worker.training.schedule import Schedule
-from worker.training.train_config import TrainConfig
-from worker.worldmodel.vae import VAE
-from worker.worldmodel.vae_config import PAPER, VAEConfig
+from dreamfleet.worker.training.schedule import Schedule
+from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.worldmodel.vae import VAE
+from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 
 CHECKPOINT = "vae.safetensors"
 VALIDATION_PICTURES = 2000

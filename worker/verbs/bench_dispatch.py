@@ -19,7 +19,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure."""
-    from worker.bench.dispatch import bench_dispatch
+    from dreamfleet.worker.bench.dispatch import bench_dispatch
 
     figures = bench_dispatch(max(0, args.workers))
     if args.json:

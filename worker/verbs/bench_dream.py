@@ -10,14 +10,14 @@ EXTRAS = ("worker",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from worker.bench import alone
+    from dreamfleet.worker.bench import alone
 
     alone.configure(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure on one thread and print."""
-    from worker.bench.alone import print_figures
-    from worker.bench.dream import bench_dream
+    from dreamfleet.worker.bench.alone import print_figures
+    from dreamfleet.worker.bench.dream import bench_dream
 
     return print_figures(bench_dream, args)

@@ -22,14 +22,14 @@ def run(args: argparse.Namespace) -> int:
     """Measure on one thread, or compare; exit 1 if anything differs."""
     from multiprocessing import get_context
 
-    from common.bundle import find_bundle
-    from common.threads import pin_thread_pools
+    from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.common.threads import pin_thread_pools
 
     bundle = find_bundle(args.bundle)
     pin_thread_pools()
     if args.exact:
         return _compare(bundle, args.json)
-    from worker.bench.environment import bench_env
+    from dreamfleet.worker.bench.environment import bench_env
 
     # A child, for numpy's library reads its thread count once, as it loads, and the command line has loaded it.
     with get_context("spawn").Pool(1) as pool:
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _compare(bundle: object, as_json: bool) -> int:
-    from worker.bench.environment import prove_exact
+    from dreamfleet.worker.bench.environment import prove_exact
 
     differences = 0
     done = []

@@ -18,7 +18,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Build the bundle and print its identity."""
-    from worker.training.assemble import assemble
+    from dreamfleet.worker.training.assemble import assemble
 
     bundle = assemble(args.data, args.out, args.out.stem, with_weights=args.with_weights)
     size = bundle.path.stat().st_size / 1e6

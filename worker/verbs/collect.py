@@ -7,8 +7,8 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from common.errors import UsageError
-from common.runs import default_runs_dir
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs import default_runs_dir
 
 SUMMARY = "drive at random, or take in what a run collected, as training data for a world model"
 EXTRAS = ("worker",)
@@ -30,9 +30,9 @@ def run(args: argparse.Namespace) -> int:
     """Collect what is missing."""
     if args.from_run is not None:
         return _take_in(args)
-    from common.progress import progress_bar
-    from worker.training.collect import collect
-    from worker.training.presets import find_preset
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.training.collect import collect
+    from dreamfleet.worker.training.presets import find_preset
 
     config = find_preset(args.preset).collect
     names = ("episodes", "seed", "picture")
@@ -48,8 +48,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _take_in(args: argparse.Namespace) -> int:
-    from common.runs import open_run
-    from worker.training.intake import take_in
+    from dreamfleet.common.runs import open_run
+    from dreamfleet.worker.training.intake import take_in
 
     with open_run(args.runs_dir, args.from_run) as stored:
         drives = stored.rollouts()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from common.errors import UsageError
+from dreamfleet.common.errors import UsageError
 
 SUMMARY = "drive yourself by keyboard, on the track or in a world model's dream"
 EXTRAS = ("worker",)
@@ -27,9 +27,9 @@ def run(args: argparse.Namespace) -> int:
     """Drive, and print each episode's score."""
     if not args.dream and (args.bundle is not None or args.temperature is not None):
         raise UsageError("--bundle and --temperature are of a dream: add --dream")
-    from common.bundle import find_bundle
-    from worker.driving.driving import DrivingConfig, drive, some_seed
-    from worker.driving.scene import Dream, Reality, Scene
+    from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.worker.driving.driving import DrivingConfig, drive, some_seed
+    from dreamfleet.worker.driving.scene import Dream, Reality, Scene
 
     config = DrivingConfig(some_seed() if args.seed is None else args.seed, args.steps, args.scale)
     scene: Scene

@@ -16,9 +16,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Encode what is not encoded yet."""
-    from common.progress import progress_bar
-    from worker.training.dataset import episodes
-    from worker.training.encode import encode
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.training.dataset import episodes
+    from dreamfleet.worker.training.encode import encode
 
     total = len(episodes(args.data))
     frames = 0

@@ -8,9 +8,9 @@ import os
 import sys
 from pathlib import Path
 
-from common.errors import UsageError
-from common.runs import default_runs_dir
-from common.seeds import TEST
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs import default_runs_dir
+from dreamfleet.common.seeds import TEST
 
 SUMMARY = "judge a controller on unseen tracks, in gymnasium's own unmodified environment"
 EXTRAS = ("worker",)
@@ -29,9 +29,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Drive and print the scores."""
-    from common.progress import progress_bar
-    from common.shelf import find_controller
-    from worker.evaluation import Evaluated, bundle_for, evaluate
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.common.shelf import find_controller
+    from dreamfleet.worker.tools.evaluation import Evaluated, bundle_for, evaluate
 
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")

@@ -6,9 +6,9 @@ import argparse
 import os
 from pathlib import Path
 
-from common.errors import UsageError
-from common.runs import default_runs_dir
-from common.seeds import VALIDATION
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs import default_runs_dir
+from dreamfleet.common.seeds import VALIDATION
 
 SUMMARY = "look into a world model: what it sees, keeps and dreams, as pictures and one page"
 EXTRAS = ("worker", "views")
@@ -31,9 +31,9 @@ def run(args: argparse.Namespace) -> int:
     if args.steps < 2 or args.seed < 0:
         raise UsageError("--steps must be at least 2 and --seed at least 0")
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from common.progress import progress_bar
-    from worker.inspection.drive import DriveConfig
-    from worker.inspection.inspection import find_subject, inspect
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.inspection.drive import DriveConfig
+    from dreamfleet.worker.inspection.inspection import find_subject, inspect
 
     with find_subject(args.subject, args.runs_dir) as subject, progress_bar("inspect", SECTIONS, "sections") as bar:
         page = inspect(subject, args.out, DriveConfig(args.seed, args.steps), args.data, bar.move)

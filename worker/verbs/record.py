@@ -6,9 +6,9 @@ import argparse
 import os
 from pathlib import Path
 
-from common.errors import UsageError
-from common.runs import default_runs_dir
-from common.seeds import TEST
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs import default_runs_dir
+from dreamfleet.common.seeds import TEST
 
 SUMMARY = "record a drive as an mp4: the track, what the model sees, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")
@@ -32,11 +32,11 @@ def run(args: argparse.Namespace) -> int:
     if args.out.suffix != ".mp4":
         raise UsageError(f"--out {args.out}: give a name that ends in .mp4")
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from common.progress import progress_bar
-    from common.shelf import find_controller
-    from worker.dream.daydream import DaydreamConfig
-    from worker.evaluation import bundle_for
-    from worker.recording import record
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.common.shelf import find_controller
+    from dreamfleet.worker.dream.daydream import DaydreamConfig
+    from dreamfleet.worker.tools.evaluation import bundle_for
+    from dreamfleet.worker.tools.recording import record
 
     daydream = DaydreamConfig(args.temperature, seed=args.seed)
     controller, beside = find_controller(args.controller, args.runs_dir)

@@ -8,8 +8,8 @@ import re
 import sys
 from pathlib import Path
 
-from common.errors import JournalError, UsageError
-from common.runs import default_runs_dir
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.runs import default_runs_dir
 
 SUMMARY = "score a candidate of a run again and compare with the journal, to the bit"
 EXTRAS = ("worker",)
@@ -27,9 +27,9 @@ def run(args: argparse.Namespace) -> int:
     """Replay each episode; exit 1 if one differs."""
     import numpy as np
 
-    from common.fingerprint import fingerprint
-    from common.runs import open_run
-    from worker.replay import replay
+    from dreamfleet.common.fingerprint import fingerprint
+    from dreamfleet.common.runs import open_run
+    from dreamfleet.worker.tools.replay import replay
 
     found = re.fullmatch(r"(\d+)/(\d+)", args.candidate)
     if not found:

@@ -10,21 +10,21 @@ EXTRAS = ("train",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from worker.training.flags import add_training_flags
-    from worker.worldmodel.mdnrnn_config import MDNRNNConfig
+    from dreamfleet.worker.training.flags import add_training_flags
+    from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
     add_training_flags(parser, MDNRNNConfig)
 
 
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
-    from common.progress import progress_bar
-    from worker.training.assemble import record_quality
-    from worker.training.flags import changed
-    from worker.training.presets import find_preset
-    from worker.training.schedule import device_of, summary
-    from worker.training.train_mdnrnn import train_mdnrnn
-    from worker.worldmodel.mdnrnn import MDNRNN
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.training.assemble import record_quality
+    from dreamfleet.worker.training.flags import changed
+    from dreamfleet.worker.training.presets import find_preset
+    from dreamfleet.worker.training.schedule import device_of, summary
+    from dreamfleet.worker.training.train_mdnrnn import train_mdnrnn
+    from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 
     preset = find_preset(args.preset)
     config, layers = changed(preset.mdnrnn, args), changed(preset.mdnrnn_layers, args)

@@ -10,8 +10,8 @@ EXTRAS = ("train",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from worker.training.flags import add_training_flags
-    from worker.worldmodel.vae_config import VAEConfig
+    from dreamfleet.worker.training.flags import add_training_flags
+    from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
     add_training_flags(parser, VAEConfig)
     parser.add_argument(
@@ -21,13 +21,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
-    from common.progress import progress_bar
-    from worker.training.assemble import record_quality
-    from worker.training.flags import changed
-    from worker.training.presets import find_preset
-    from worker.training.schedule import device_of, summary
-    from worker.training.train_vae import train_vae
-    from worker.worldmodel.vae import VAE
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.training.assemble import record_quality
+    from dreamfleet.worker.training.flags import changed
+    from dreamfleet.worker.training.presets import find_preset
+    from dreamfleet.worker.training.schedule import device_of, summary
+    from dreamfleet.worker.training.train_vae import train_vae
+    from dreamfleet.worker.worldmodel.vae import VAE
 
     preset = find_preset(args.preset)
     config, layers = changed(preset.vae, args), changed(preset.vae_layers, args)

@@ -8,9 +8,9 @@ import os
 import signal
 from pathlib import Path
 
-from common.config import add_flags, load, read_toml
-from common.session import DEFAULT_ENDPOINT, Network
-from worker.config import WorkerConfig
+from dreamfleet.common.config import add_flags, load, read_toml
+from dreamfleet.common.session import DEFAULT_ENDPOINT, Network
+from dreamfleet.worker.service.config import WorkerConfig
 
 SUMMARY = "score candidates for a run; needs no files and no display, and may start before its coordinator"
 EXTRAS = ("worker",)
@@ -26,9 +26,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until stopped; the first Ctrl-C drains, the second leaves at once."""
-    from worker.service import Worker
+    from dreamfleet.worker.service.worker import Worker
 
-    logging.getLogger("worker").setLevel(logging.INFO)
+    logging.getLogger("dreamfleet.worker").setLevel(logging.INFO)
     config = load(WorkerConfig, "worker", flags=args, environment=os.environ, file=read_toml(args.config, ["worker"]))
     worker = Worker(config, Network(connect=tuple(args.connect)), tuple(args.task))
     for number in (signal.SIGINT, signal.SIGTERM):

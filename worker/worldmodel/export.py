@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from onnx import TensorProto
 
-from worker.worldmodel.graph import GraphBuilder
-from worker.worldmodel.mdnrnn_config import MDNRNNConfig
-from worker.worldmodel.recurrent import Recurrent, Weights, export_dream
-from worker.worldmodel.vae_config import LEAK, VAEConfig
+from dreamfleet.worker.worldmodel.graph import GraphBuilder
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.recurrent import Recurrent, Weights, export_dream
+from dreamfleet.worker.worldmodel.vae_config import LEAK, VAEConfig
 
 __all__ = ["Weights", "export_controller", "export_decoder", "export_dream", "export_encoder", "export_policy"]
 EPSILON = 1e-5  # of torch's batch normalisation

@@ -8,8 +8,8 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from common.bundle import DECODER, DREAM, ENCODER, LAYERED, LINEAR, POLICY, Bundle
-from common.errors import BundleError
+from dreamfleet.common.bundle import DECODER, DREAM, ENCODER, LAYERED, LINEAR, POLICY, Bundle
+from dreamfleet.common.errors import BundleError
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from worker.worldmodel.mdnrnn_config import MDNRNNConfig, Reward
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig, Reward
 
 
 class Prediction(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from common.errors import UsageError
+from dreamfleet.common.errors import UsageError
 
 Reward = Literal["none", "positive", "notebook", "value"]
 

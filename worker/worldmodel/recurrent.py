@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from onnx import TensorProto
 
-from worker.worldmodel.graph import GraphBuilder
-from worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.graph import GraphBuilder
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
 Weights = Mapping[str, NDArray[np.float32]]
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from worker.worldmodel.vae_config import KERNEL, LEAK, VAEConfig
+from dreamfleet.worker.worldmodel.vae_config import KERNEL, LEAK, VAEConfig
 
 
 class VAE(nn.Module):

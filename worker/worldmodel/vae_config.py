@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
-from common.errors import UsageError
+from dreamfleet.common.errors import UsageError
 
 LEAK = 0.2  # slope of the leaky activation below zero
 KERNEL = 4

@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 import torch
 
-from common.bundle import write_bundle
-from common.errors import UsageError
+from dreamfleet.common.bundle import write_bundle
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.dream.daydream import Daydream, DaydreamConfig
+from dreamfleet.worker.training.assemble import graphs, manifest
+from dreamfleet.worker.worldmodel.inference import DreamStep
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae import VAEConfig
 from tests.support.bundles import random_models, weights, write_random_bundle
-from worker.dream.daydream import Daydream, DaydreamConfig
-from worker.training.assemble import graphs, manifest
-from worker.worldmodel.inference import DreamStep
-from worker.worldmodel.mdnrnn import MDNRNNConfig
-from worker.worldmodel.vae import VAEConfig
 
 TINY = VAEConfig(latent=3, channels=(2, 2, 2, 2))
 

@@ -3,15 +3,15 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import worker.dream
-from common.errors import UsageError
-from worker.dream.environment import CarRacingDream, CarRacingDreams
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.dream import ENVIRONMENT
+from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreams
 
 ACTION = np.array([0.1, 0.5, 0.0], np.float32)
 
 
 def test_gymnasium_accepts_it(random_bundle):
-    made = gymnasium.make(worker.dream.ENVIRONMENT, bundle=random_bundle, render_mode="rgb_array")
+    made = gymnasium.make(ENVIRONMENT, bundle=random_bundle, render_mode="rgb_array")
     check_env(made.unwrapped)
     made.reset(seed=1)
     assert made.render().shape == (64, 64, 3)
@@ -35,7 +35,7 @@ def test_a_dream_is_a_function_of_seed_and_actions(random_bundle):
 
 def test_many_dreams_are_the_single_ones(random_bundle):
     many = gymnasium.make_vec(
-        worker.dream.ENVIRONMENT, num_envs=3, bundle=random_bundle, vectorization_mode="vector_entry_point", horizon=4
+        ENVIRONMENT, num_envs=3, bundle=random_bundle, vectorization_mode="vector_entry_point", horizon=4
     )
     assert isinstance(many.unwrapped, CarRacingDreams)
     single = [CarRacingDream(random_bundle, horizon=4) for _ in range(3)]

@@ -1,7 +1,7 @@
 import numpy as np
 
-from worker.dream.noise import PIECE, Noise, SharedNoise
-from worker.worldmodel.inference import Chance
+from dreamfleet.worker.dream.noise import PIECE, Noise, SharedNoise
+from dreamfleet.worker.worldmodel.inference import Chance
 
 INITIAL = np.random.default_rng(0).normal(size=(5, 2, 3)).astype(np.float32)
 

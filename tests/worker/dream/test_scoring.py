@@ -3,14 +3,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from common.errors import UsageError
-from common.messages import TaskSpec
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.worker.dream.batch import Dreamer
+from dreamfleet.worker.dream.environment import CarRacingDream
+from dreamfleet.worker.dream.task import DreamPolicy
+from dreamfleet.worker.scoring.episode import Course, rollout
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from tests.support.bundles import write_random_bundle
-from worker.dream.environment import CarRacingDream
-from worker.dream.scoring import Dreamer
-from worker.rollout import Course, rollout
-from worker.tasks.dream import DreamPolicy
-from worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
 HORIZON = 20
 

@@ -8,16 +8,16 @@ from importlib.util import find_spec
 from tests.support.processes import DEADLINE, ROOT
 
 WITHOUT_A_SCREEN = """
-from common.errors import NoDisplayError
-from worker.driving.window import Window
+from dreamfleet.common.errors import NoDisplayError
+from dreamfleet.worker.driving.window import Window
 try:
     Window("nothing", (64, 64), 1)
 except NoDisplayError:
     pass
 """
 DRIVING_UNSEEN = """
-from worker.evaluation import bundle_for
-from worker.render.check import make_car_racing
+from dreamfleet.worker.tools.evaluation import bundle_for
+from dreamfleet.worker.car_racing.check import make_car_racing
 environment = make_car_racing(preprocessing="box-64", render_mode="rgb_array")
 environment.reset(seed=1)
 environment.step([0.0, 0.0, 0.0])
@@ -35,8 +35,8 @@ pygame.display.set_mode((100, 100))
 AN_OPTIMISER = """
 from pathlib import Path
 import torch
-from worker.training.schedule import Schedule
-from worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.schedule import Schedule
+from dreamfleet.worker.training.train_config import TrainConfig
 Schedule(Path("nothing.safetensors"), torch.nn.Linear(2, 2), TrainConfig(updates=1, batch=1, rate=1e-3), 1)
 print("goes on")
 """

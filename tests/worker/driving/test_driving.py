@@ -3,12 +3,12 @@ import os
 import pygame
 import pytest
 
-from common.cli import main
-from common.errors import NoDisplayError, UsageError
-from worker.driving.driving import DrivingConfig, drive
-from worker.driving.pedals import Pedals
-from worker.driving.scene import Dream, Reality
-from worker.driving.window import BACKGROUND, Told, Window
+from dreamfleet.common.cli import main
+from dreamfleet.common.errors import NoDisplayError, UsageError
+from dreamfleet.worker.driving.driving import DrivingConfig, drive
+from dreamfleet.worker.driving.pedals import Pedals
+from dreamfleet.worker.driving.scene import Dream, Reality
+from dreamfleet.worker.driving.window import BACKGROUND, Told, Window
 
 SEED = 20_003
 

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
+from dreamfleet.worker.car_racing.check import make_car_racing
 from tests.support.processes import DEADLINE, environment
-from worker.render.check import make_car_racing
 
 SEED, STEPS = 20_003, 60
 pytestmark = pytest.mark.skipif(
@@ -44,7 +44,7 @@ def test_a_person_drives_and_quits(screen, tmp_path):
     def hand(*arguments):
         subprocess.run(["xdotool", *arguments], env=seen, check=True, timeout=DEADLINE, stdout=subprocess.DEVNULL)
 
-    command = [sys.executable, "-m", "common.cli", "drive", "--seed", str(SEED), "--steps", str(STEPS)]
+    command = [sys.executable, "-m", "dreamfleet", "drive", "--seed", str(SEED), "--steps", str(STEPS)]
     with subprocess.Popen([*command, "--scale", "0.3"], env=seen, stdout=subprocess.PIPE, text=True) as driving:
         try:
             hand("search", "--sync", "--onlyvisible", "--class", ".", "windowfocus", "--sync", "keydown", "Up")

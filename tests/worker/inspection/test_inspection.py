@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from common.bundle import DREAM, write_bundle
-from common.errors import BundleError, DatasetError
+from dreamfleet.common.bundle import DREAM, write_bundle
+from dreamfleet.common.errors import BundleError, DatasetError
+from dreamfleet.worker.inspection import curves, memory
+from dreamfleet.worker.inspection.drive import DriveConfig, drive
+from dreamfleet.worker.inspection.inspection import Subject, facts, find_subject, inspect
+from dreamfleet.worker.inspection.page import Page
+from dreamfleet.worker.inspection.section import Section
+from dreamfleet.worker.worldmodel.inference import DreamStep
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae import VAEConfig
 from tests.support.bundles import random_models, write_random_bundle
-from worker.inspection import curves, memory
-from worker.inspection.drive import DriveConfig, drive
-from worker.inspection.inspection import Subject, facts, find_subject, inspect
-from worker.inspection.page import Page
-from worker.inspection.section import Section
-from worker.worldmodel.inference import DreamStep
-from worker.worldmodel.mdnrnn import MDNRNNConfig
-from worker.worldmodel.vae import VAEConfig
 
 PNG = b"\x89PNG\r\n\x1a\n"
 VAE = VAEConfig(latent=5, channels=(4, 4, 4, 8))

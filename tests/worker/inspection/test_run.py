@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from common.controller import Controller
-from common.runs import CONTROLLER, RunSettings, StoredGeneration, run_paths
-from coordinator.evaluation import Evaluation
-from coordinator.jobs import travelling
-from coordinator.journal import Journal
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.runs import CONTROLLER, RunSettings, StoredGeneration, run_paths
+from dreamfleet.coordinator.evaluation import Evaluation
+from dreamfleet.coordinator.jobs import travelling
+from dreamfleet.coordinator.journal import Journal
+from dreamfleet.worker.inspection.drive import DriveConfig
+from dreamfleet.worker.inspection.inspection import find_subject, inspect
 from tests.support.samples import SPEC
-from worker.inspection.drive import DriveConfig
-from worker.inspection.inspection import find_subject, inspect
 
 
 @pytest.fixture

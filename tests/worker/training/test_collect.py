@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from common.errors import DatasetError, UsageError
-from worker.training.collect import CollectConfig, collect, drive, episode_path
-from worker.training.dataset import load_pictures
-from worker.training.drivers import DRIVERS
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.worker.car_racing.drivers import DRIVERS
+from dreamfleet.worker.training.collect import CollectConfig, collect, drive, episode_path
+from dreamfleet.worker.training.dataset import load_pictures
 
 # SWIG warns as Box2D is imported, and an error there kills the process.
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")

@@ -3,9 +3,9 @@ import itertools
 import numpy as np
 import pytest
 
-from common.errors import DatasetError
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.training.dataset import episodes, load, load_pictures, pad, picture_batches, split
 from tests.support.drives import write_drive, write_drives
-from worker.training.dataset import episodes, load, load_pictures, pad, picture_batches, split
 
 NAMES = ("picture", "action", "reward", "preprocessing")
 
@@ -113,10 +113,10 @@ def test_fewer_pictures_than_a_batch_make_a_smaller_batch(tmp_path):
 
 
 def test_memory_holds_a_pool_and_not_the_data_set(tmp_path, monkeypatch):
-    monkeypatch.setattr("worker.training.dataset.POOL_EPISODES", 2)
+    monkeypatch.setattr("dreamfleet.worker.training.dataset.POOL_EPISODES", 2)
     loaded = []
     monkeypatch.setattr(
-        "worker.training.dataset.load_pictures", lambda path: loaded.append(path) or load_pictures(path)
+        "dreamfleet.worker.training.dataset.load_pictures", lambda path: loaded.append(path) or load_pictures(path)
     )
     next(picture_batches(write_drives(tmp_path), 4, seed=0))
     assert len(loaded) == 2

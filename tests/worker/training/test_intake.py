@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from common.errors import DatasetError
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.training.collect import episode_path
+from dreamfleet.worker.training.dataset import episodes
+from dreamfleet.worker.training.intake import take_in
 from tests.support.drives import write_drive, write_drives
-from worker.training.collect import episode_path
-from worker.training.dataset import episodes
-from worker.training.intake import take_in
 
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 

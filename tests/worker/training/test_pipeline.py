@@ -3,18 +3,18 @@ import shutil
 import numpy as np
 import pytest
 
-from common.bundle import WEIGHTS
-from common.errors import DatasetError, UsageError
+from dreamfleet.common.bundle import WEIGHTS
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training.assemble import assemble
+from dreamfleet.worker.training.checkpoint import load_weights
+from dreamfleet.worker.training.dataset import load
+from dreamfleet.worker.training.encode import encode
+from dreamfleet.worker.training.foresight import area_under_curve
+from dreamfleet.worker.training.presets import find_preset
+from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.worldmodel.inference import Encoder, PolicyStep
 from tests.support.drives import write_drive, write_drives
-from worker.training import train_mdnrnn, train_vae
-from worker.training.assemble import assemble
-from worker.training.checkpoint import load_weights
-from worker.training.dataset import load
-from worker.training.encode import encode
-from worker.training.foresight import area_under_curve
-from worker.training.presets import find_preset
-from worker.training.train_config import TrainConfig
-from worker.worldmodel.inference import Encoder, PolicyStep
 
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
 

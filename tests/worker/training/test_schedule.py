@@ -5,20 +5,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.errors import DatasetError, UsageError
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training.assemble import assemble
+from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
+from dreamfleet.worker.training.drives import load_drives
+from dreamfleet.worker.training.encode import encode
+from dreamfleet.worker.training.presets import PRESETS
+from dreamfleet.worker.training.schedule import device_of, summary
+from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae import VAE
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import write_drive, write_drives
-from worker.training import train_mdnrnn, train_vae
-from worker.training.assemble import assemble
-from worker.training.checkpoint import load_config, load_progress, load_weights
-from worker.training.drives import load_drives
-from worker.training.encode import encode
-from worker.training.presets import PRESETS
-from worker.training.schedule import device_of, summary
-from worker.training.train_config import TrainConfig
-from worker.worldmodel.mdnrnn import MDNRNN
-from worker.worldmodel.mdnrnn_config import MDNRNNConfig
-from worker.worldmodel.vae import VAE
-from worker.worldmodel.vae_config import VAEConfig
 
 LAYERS = VAEConfig(latent=4, channels=(4, 4, 8, 8), batch_norm=True, dropout=0.1)
 SMALL = MDNRNNConfig(latent=4, hidden=8, mixtures=2, dropout=0.2)
@@ -142,7 +142,7 @@ def test_a_batch_in_chunks_has_the_same_gradients(encoded, monkeypatch):
     drives.logvar.fill_(-100)  # chance is drawn a chunk at a time
     found = []
     for steps in (10_000, 1):
-        monkeypatch.setattr("worker.training.drives.CHUNK_STEPS", steps)
+        monkeypatch.setattr("dreamfleet.worker.training.drives.CHUNK_STEPS", steps)
         model.zero_grad()
         values = train_mdnrnn.backward(model, drives, torch.Generator().manual_seed(0))
         found.append((values, [each.grad.clone() for each in model.parameters() if each.requires_grad]))

@@ -5,26 +5,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from common.controller import Controller
-from common.errors import DatasetError
-from common.messages import TaskSpec
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.worker.car_racing.preprocessing import RAW
+from dreamfleet.worker.driving.scene import Dream
+from dreamfleet.worker.scoring.rollout import write_episode
+from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tools.evaluation import evaluate
+from dreamfleet.worker.tools.recording import record
+from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training.assemble import assemble
+from dreamfleet.worker.training.collect import CollectConfig, collect, episode_path
+from dreamfleet.worker.training.dataset import load_pictures
+from dreamfleet.worker.training.encode import encode
+from dreamfleet.worker.training.intake import take_in
+from dreamfleet.worker.training.presets import PRESETS
+from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.worldmodel import vae_config
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from tests.support.drives import write_drive, write_drives
-from worker.drive import write_episode
-from worker.driving.scene import Dream
-from worker.evaluation import evaluate
-from worker.recording import record
-from worker.scoring import Scorer
-from worker.tasks.preprocessing import RAW
-from worker.training import train_mdnrnn, train_vae
-from worker.training.assemble import assemble
-from worker.training.collect import CollectConfig, collect, episode_path
-from worker.training.dataset import load_pictures
-from worker.training.encode import encode
-from worker.training.intake import take_in
-from worker.training.presets import PRESETS
-from worker.training.train_config import TrainConfig
-from worker.worldmodel import vae_config
-from worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
 # SWIG warns as Box2D is imported, and an error there kills the process.
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")

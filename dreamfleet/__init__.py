@@ -1,0 +1,1 @@
+"""Evolve World-Models controllers on whatever machines you have."""

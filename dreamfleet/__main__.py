@@ -1,0 +1,7 @@
+"""`python -m dreamfleet`: the command line."""
+
+import sys
+
+from dreamfleet.common.cli import main
+
+sys.exit(main())

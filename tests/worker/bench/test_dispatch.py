@@ -1,0 +1,32 @@
+"""The peers of `bench dispatch`: whatever they do, the benchmark ends."""
+
+import time
+from contextlib import contextmanager
+
+from dreamfleet.worker.bench import dispatch
+
+
+@contextmanager
+def hanging():
+    yield lambda _work, _count: time.sleep(3600)
+
+
+@contextmanager
+def failing():
+    raise RuntimeError("not today")
+    yield
+
+
+@contextmanager
+def prompt():
+    yield lambda work, count: [work(index) for index in range(min(count, 2))]
+
+
+def test_a_peer_is_measured_in_a_process_of_its_own():
+    assert dispatch.in_time(prompt).keys() == {"efficiency_50ms", "null_jobs_per_second"}
+
+
+def test_a_peer_that_hangs_or_fails_has_no_figures(monkeypatch):
+    assert dispatch.in_time(failing) is None
+    monkeypatch.setattr(dispatch, "PEER_SECONDS", 1.0)
+    assert dispatch.in_time(hanging) is None

@@ -1,0 +1,169 @@
+"""The native picture is gymnasium's, to the bit. `dreamfleet bench env --exact` compares far more."""
+
+import os
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pygame
+import pytest
+from gymnasium.error import InvalidAction
+
+import dreamfleet.worker.car_racing  # noqa: F401 - registers the environment
+from dreamfleet.common.bundle import find_bundle
+from dreamfleet.worker.bench.environment import completed_lap, discrete, policy_of
+from dreamfleet.worker.car_racing.check import compare, leap, make_car_racing, native_is_exact
+from dreamfleet.worker.car_racing.environment import GRASS, WHEEL, CarRacing, _native, available, score_text
+from dreamfleet.worker.car_racing.preprocessing import BOX
+
+needs_native = pytest.mark.skipif(not available(), reason="no native module was built")
+
+
+@needs_native
+def test_the_quick_look_at_a_workers_start_finds_it_exact():
+    assert native_is_exact()
+
+
+@needs_native
+@pytest.mark.parametrize("seed", [3, 4])
+def test_random_driving_looks_the_same(seed):
+    assert compare(seed, 160, leap) is None
+
+
+@needs_native
+def test_evolved_driving_looks_the_same():
+    act = policy_of(find_bundle("tiny"))
+    assert compare(5, 160, lambda _step, seen, _random: act(seen)) is None
+
+
+@needs_native
+@pytest.mark.long
+def test_a_completed_lap_looks_the_same_to_its_end():
+    lap = completed_lap(3)
+    assert compare(lap.seed, len(lap.actions) + 1, lambda step, _seen, _random: lap.actions[step]) is None
+
+
+@needs_native
+def test_wider_instructions_change_no_bit():
+    if not _native.widen(True):
+        pytest.skip("this processor has none")
+    try:
+        pictures = []
+        for wide in (True, False):
+            _native.widen(wide)
+            pictures.append(drive_all([CarRacing()], [11], 120)[0])
+    finally:
+        _native.widen(True)
+    assert np.array_equal(*pictures)
+
+
+@needs_native
+def test_leaving_the_field_looks_the_same():
+    def straight_out(_step, _picture, _random):
+        return np.array([0.0, 1.0, 0.0], np.float32)
+
+    assert compare(6, 260, straight_out) is None
+
+
+@needs_native
+@pytest.mark.parametrize(
+    ("settings", "actions"),
+    [({"domain_randomize": True}, leap), ({"continuous": False}, discrete), ({"lap_complete_percent": 0.3}, leap)],
+)
+def test_every_option_looks_the_same(settings, actions):
+    assert compare(7, 100, actions, **settings) is None
+
+
+@needs_native
+def test_extreme_actions_behave_as_gymnasiums():
+    extremes = [(9, 9, 9), (-9, -9, -9), (1e6, 1, 0), (-1, 1, 1), (0, 0, 0)]
+    assert compare(8, 80, lambda step, _seen, _random: np.array(extremes[step // 7 % 5], np.float32)) is None
+
+
+@needs_native
+def test_environments_that_take_turns_do_not_see_each_other():
+    alone = [drive_all([CarRacing(preprocessing="box-64")], [seed], 30)[0] for seed in range(8)]
+    together = drive_all([CarRacing(preprocessing="box-64") for _ in range(8)], range(8), 30)
+    assert all(np.array_equal(one, other) for one, other in zip(alone, together, strict=True))
+
+
+def drive_all(environments, seeds, steps):
+    """Every environment's pictures, one step of each in turn."""
+    seen = [[environment.reset(seed=seed)[0]] for environment, seed in zip(environments, seeds, strict=True)]
+    for step in range(steps):
+        for index, (environment, seed) in enumerate(zip(environments, seeds, strict=True)):
+            seen[index].append(environment.step(np.array([0.1 * seed, 0.5, 0], np.float32))[0])
+            if step == 10:
+                environment.t += 1.0
+    return [np.stack(pictures) for pictures in seen]
+
+
+@needs_native
+def test_one_more_environment_adds_little_memory():
+    def drawing():
+        environment = CarRacing(preprocessing="box-64")
+        drive_all([environment], [1], 20)
+        return environment
+
+    kept = [drawing() for _ in range(8)]
+    before = memory()
+    kept.append(drawing())
+    assert memory() - before < 6 * 2**20
+
+
+def memory():
+    """Bytes of this process that lie in memory."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@needs_native
+@pytest.mark.parametrize("x", [np.nan, np.inf, 1e30])
+def test_a_car_that_cannot_be_drawn_is_a_clear_error(x):
+    environment = CarRacing(preprocessing="box-64")
+    environment.reset(seed=1)
+    with pytest.raises(ValueError, match="too far away"):
+        _native.scene(
+            np.empty((96, 96, 3), np.uint8), environment._road, environment._road_colours, GRASS, environment._palette,
+            np.array([16.2, 0, x, 0, 333]), np.zeros((5, 4)), environment._fixtures, WHEEL,
+        )  # fmt: skip
+
+
+def test_where_it_was_not_built_gymnasium_draws():
+    ours, small = CarRacing(native=False), CarRacing(native=False, preprocessing="box-64")
+    observation, small_one = ours.reset(seed=1)[0], small.reset(seed=1)[0]
+    assert ours.drawn_by == "gymnasium"
+    assert np.array_equal(BOX.picture(observation), small_one)
+
+
+@pytest.mark.parametrize("action", [np.array([np.nan, 0, 0]), np.array([0, np.inf, 0]), np.zeros(2), np.zeros((1, 3))])
+def test_an_action_that_is_none_is_refused_and_the_environment_goes_on(action):
+    environment = CarRacing()
+    environment.reset(seed=1)
+    with pytest.raises(InvalidAction, match="three finite numbers"):
+        environment.step(action)
+    environment.step(np.zeros(3, np.float32))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_gymnasium_finds_it_a_well_made_environment():
+    from gymnasium.utils.env_checker import check_env
+
+    environment = gymnasium.make("dreamfleet/CarRacing-v3", render_mode="rgb_array")
+    check_env(environment.unwrapped, skip_render_check=False)
+    environment.reset(seed=1)
+    assert environment.render().shape == (400, 600, 3)
+
+
+def test_an_episode_ends_after_a_thousand_steps():
+    assert make_car_racing(preprocessing="box-64").spec.max_episode_steps == 1000
+
+
+def test_a_score_is_written_after_somebody_closed_pygame():
+    before = score_text("0012").copy()
+    pygame.quit()
+    score_text.cache_clear()
+    assert np.array_equal(score_text("0012"), before)
+
+
+def test_score_texts_are_kept():
+    assert score_text("0123") is score_text("0123")

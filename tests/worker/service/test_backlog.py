@@ -1,0 +1,98 @@
+import dataclasses
+import hashlib
+
+from dreamfleet.common.messages import JobBatch, VectorPart
+from dreamfleet.worker.service.backlog import KEPT_VECTORS, Backlog
+from tests.support.samples import HEAD, SPEC, VECTOR, VECTOR_ID, job
+
+WHOLE = VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR)
+
+
+def batch(number, jobs=(), vectors=(WHOLE,), cancels=()):
+    return JobBatch(**HEAD, nonce="n", number=number, vectors=vectors, jobs=jobs, cancels=cancels, verdicts=())
+
+
+def test_jobs_come_out_in_order_with_their_vector():
+    backlog = Backlog(SPEC)
+    backlog.take_in(batch(1, (job(0), job(1))))
+    assert [backlog.take(1), backlog.take(5), backlog.take(1)] == [[(job(0), VECTOR)], [(job(1), VECTOR)], []]
+
+
+def test_a_batch_that_comes_twice_counts_once():
+    backlog = Backlog(SPEC)
+    for _ in range(2):
+        backlog.take_in(batch(1, (job(0),)))
+    assert backlog.take(1)
+    backlog.take_in(batch(1, (job(0),)))
+    assert not backlog.take(1)
+
+
+def test_seen_is_the_last_number_without_a_gap():
+    backlog = Backlog(SPEC)
+    seen = []
+    for number in (1, 3, 4, 2):
+        backlog.take_in(batch(number))
+        seen.append(backlog.seen)
+    assert seen == [1, 1, 1, 4]
+
+
+def test_a_vector_may_be_spread_over_batches_that_come_in_any_order():
+    backlog = Backlog(SPEC)
+    first, second = (dataclasses.replace(WHOLE, offset=at, data=VECTOR[at : at + 32]) for at in (0, 32))
+    backlog.take_in(batch(2, (job(0),), (second,)))
+    assert not backlog.take(1)
+    backlog.take_in(batch(1, (), (first,)))
+    assert backlog.take(1) == [(job(0), VECTOR)]
+
+
+def test_a_cancelled_job_is_not_started():
+    backlog = Backlog(SPEC)
+    backlog.take_in(batch(1, (job(0), job(1)), cancels=()))
+    backlog.take_in(batch(2, cancels=(job(0).digest,)))
+    assert backlog.take(1) == [(job(1), VECTOR)]
+
+
+def test_a_job_whose_digest_is_of_something_else_is_refused():
+    backlog = Backlog(SPEC)
+    wrong = dataclasses.replace(job(0), seeds=(5,))
+    assert backlog.take_in(batch(1, (wrong,))) == [(wrong, "the job's digest is not of its content")]
+    assert not backlog.take(1)
+
+
+def test_a_job_is_of_the_temperature_that_it_names():
+    backlog, warm = Backlog(SPEC), job(1, temperature=1.5)
+    renamed = [dataclasses.replace(warm, temperature=wrong) for wrong in (None, 1.25)]
+    assert [each for each, _ in backlog.take_in(batch(1, (warm, *renamed)))] == renamed
+    assert backlog.take(5) == [(warm, VECTOR)]
+
+
+def test_a_turn_is_of_one_temperature():
+    jobs = [job(episode, temperature=each) for episode, each in enumerate((None, None, 1.5, 1.5, 2.25))]
+    backlog = Backlog(SPEC)
+    backlog.take_in(batch(1, jobs))
+    assert [[each.episode for each, _ in backlog.take(5)] for _ in range(4)] == [[0, 1], [2, 3], [4], []]
+
+
+def test_a_damaged_vector_is_never_scored():
+    backlog = Backlog(SPEC)
+    backlog.take_in(batch(1, (job(0),), (dataclasses.replace(WHOLE, data=VECTOR[::-1]),)))
+    assert not backlog.take(1)
+
+
+def test_vectors_that_no_job_needs_are_let_go():
+    backlog = Backlog(SPEC)
+    for number in range(1, 500):
+        data = number.to_bytes(8, "little")
+        part = dataclasses.replace(WHOLE, id=hashlib.sha256(data).digest(), shape=(2,), data=data)
+        backlog.take_in(batch(number, vectors=(part,)))
+    assert len(backlog._vectors) <= KEPT_VECTORS
+
+
+def test_a_new_life_of_the_coordinator_counts_from_one_again():
+    backlog = Backlog(SPEC)
+    backlog.take_in(batch(1, (job(0),)))
+    backlog.begin()
+    backlog.clear()
+    assert not backlog.take(1)
+    backlog.take_in(batch(1, (job(1),)))
+    assert backlog.take(1) == [(job(1), VECTOR)]

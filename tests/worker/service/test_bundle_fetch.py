@@ -1,0 +1,145 @@
+"""Downloads that are cut, over a real router: what is on disk stays, and the whole is verified."""
+
+import hashlib
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.bundle import BundleStore, Manifest, write_bundle
+from dreamfleet.common.codec import Inbox
+from dreamfleet.common.errors import BundleError
+from dreamfleet.common.messages import MAX_PART
+from dreamfleet.common.session import Network, open_session
+from dreamfleet.worker.service import bundle_fetch
+from dreamfleet.worker.service.bundle_fetch import WINDOW, obtain
+from tests.support import tasks
+from tests.support.bundles import npy
+from tests.support.hand import DEADLINE, Hand
+from tests.support.processes import free_port
+
+pytestmark = pytest.mark.timeout(60)
+PARTS = 5
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx"), b"x")
+    parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
+    manifest = Manifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
+    content = hashlib.sha256(b"a").digest() * ((PARTS - 1) * MAX_PART // 32)
+    return write_bundle(tmp_path_factory.mktemp("bundle") / "small.zip", manifest, {**parts, "policy.onnx": content})
+
+
+@pytest.fixture(scope="module")
+def hand(bundle):
+    made = Hand(free_port(), bundle, tasks.TOY)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def session(hand):
+    with open_session(Network(connect=(hand.endpoint,))) as opened:
+        yield opened
+
+
+@pytest.fixture(autouse=True)
+def fresh(hand):
+    hand.damage = lambda offset, data: data
+    asked(hand)
+
+
+@pytest.fixture
+def store(tmp_path):
+    return BundleStore(tmp_path)
+
+
+def begun(store, bundle, data):
+    with store.downloading(bundle.sha256) as path:
+        path.write_bytes(data)
+    return path
+
+
+def fetch(session, hand, store, stopped=lambda: False):
+    return obtain(session, hand.run, hand.spec.bundle, store, Inbox(), stopped)
+
+
+def asked(hand):
+    return [hand.offsets.get_nowait() for _ in range(hand.offsets.qsize())]
+
+
+SIZES = [0, 1, 17, MAX_PART - 1, MAX_PART, MAX_PART + 1, 3 * MAX_PART + 11, -1, None]
+
+
+@pytest.mark.parametrize("cut", SIZES)
+def test_a_download_that_was_cut_anywhere_goes_on_from_there(session, hand, store, bundle, cut):
+    whole = bundle.path.read_bytes()
+    cut = len(whole) if cut is None else cut % len(whole)
+    partial = begun(store, bundle, whole[:cut])
+    fetched = fetch(session, hand, store)
+    assert fetched.path.read_bytes() == whole
+    assert fetched.sha256 == bundle.sha256
+    assert not partial.exists()
+    assert min(asked(hand)) == cut, "nothing that was there is asked for again"
+
+
+@pytest.mark.parametrize("where", [0, MAX_PART, 2 * MAX_PART + 16])
+def test_a_damaged_beginning_is_thrown_away_and_fetched_again(session, hand, store, bundle, where):
+    spoilt = bytearray(bundle.path.read_bytes()[: 2 * MAX_PART + 17])
+    spoilt[where] ^= 1
+    begun(store, bundle, bytes(spoilt))
+    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
+    offsets = asked(hand)
+    assert offsets[0] == len(spoilt)
+    assert 0 in offsets
+
+
+def test_a_beginning_that_is_longer_than_the_bundle_is_of_something_else(session, hand, store, bundle):
+    begun(store, bundle, bundle.path.read_bytes() + b"!")
+    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
+
+
+def test_parts_that_come_short_never_make_a_wrong_file(session, hand, store, bundle):
+    """Every second answer is cut, as by a coordinator that serves smaller parts."""
+    short = iter([True, False] * 100)
+    hand.damage = lambda offset, data: data[: len(data) // 2] if next(short) else data
+    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
+
+
+def test_a_stop_in_the_middle_keeps_what_has_come_and_the_next_life_goes_on(session, hand, store, bundle):
+    stop = threading.Event()
+    hand.damage = lambda offset, data: stop.set() if offset >= 2 * MAX_PART else data  # no answer from here on
+    assert fetch(session, hand, store, stop.is_set) is None
+    with store.downloading(bundle.sha256) as partial:
+        kept = partial.stat().st_size
+    assert kept in (MAX_PART, 2 * MAX_PART)
+    asked(hand)
+    hand.damage = lambda offset, data: data
+    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
+    assert min(asked(hand)) == kept
+
+
+def test_two_workers_of_a_host_fetch_it_once(session, hand, store, bundle):
+    with ThreadPoolExecutor() as threads:
+        both = [threads.submit(fetch, session, hand, store) for _ in range(2)]
+        assert {each.result(DEADLINE).sha256 for each in both} == {bundle.sha256}
+    assert len([offset for offset in asked(hand) if offset == 0]) == 1
+
+
+def test_a_coordinator_that_stays_silent_is_an_error_and_what_has_come_stays(session, hand, store, bundle, monkeypatch):
+    monkeypatch.setattr(bundle_fetch, "SILENCES", 2)
+    monkeypatch.setattr(bundle_fetch, "QUERY_TIMEOUT", 0.1)
+    monkeypatch.setattr(bundle_fetch, "PAUSE", 0.0)
+    partial = begun(store, bundle, bundle.path.read_bytes()[:100])
+    hand.damage = lambda offset, data: None
+    with pytest.raises(BundleError, match="no longer answers"):
+        fetch(session, hand, store)
+    assert partial.read_bytes() == bundle.path.read_bytes()[:100]
+
+
+def test_a_window_of_parts_is_asked_for_at_once(session, hand, store, bundle):
+    fetch(session, hand, store)
+    assert PARTS < WINDOW
+    assert sorted(asked(hand)) == [index * MAX_PART for index in range(-(-bundle.path.stat().st_size // MAX_PART))]

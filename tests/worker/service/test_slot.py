@@ -1,0 +1,277 @@
+import hashlib
+import io
+import os
+import queue
+import select
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from time import monotonic
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.worker.service.slot import FAILED_STARTS, Slot
+from tests.support import tasks
+from tests.support.processes import environment
+from tests.support.samples import VECTOR, job
+
+TIMEOUT = 60
+
+
+def spec(task):
+    return TaskSpec(task=task, bundle="ab" * 32, horizon=100, patience=0)
+
+
+class Harness:
+    """A slot and its worker's queue."""
+
+    def __init__(self, task, bundle, memory_limit):
+        self.spec = spec(task)
+        self.events = queue.SimpleQueue()
+        self.slot = Slot(0, self.spec, bundle, self.events, memory_limit)
+
+    def wait_ready(self):
+        while not self.slot.ready:
+            self.slot.handle(self.events.get(timeout=TIMEOUT)[1])
+
+    def result(self):
+        while True:
+            if results := self.slot.handle(self.events.get(timeout=TIMEOUT)[1]):
+                (result,) = results
+                return result
+
+    def outcome(self):
+        """The result, and the file that came with it."""
+        while True:
+            event = self.events.get(timeout=TIMEOUT)[1]
+            if results := self.slot.handle(event):
+                return results[0], event.done.upload
+
+    def score(self, episode=0):
+        self.wait_ready()
+        self.slot.submit([(job(episode, spec=self.spec), VECTOR)])
+        return self.result()
+
+
+@pytest.fixture
+def harness(random_bundle):
+    made = []
+
+    def make(task, bundle=None, memory_limit=0):
+        made.append(Harness(task, bundle or random_bundle.path, memory_limit))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.slot.stop()
+
+
+def test_it_scores_and_the_same_job_gives_the_same_bits(harness):
+    slot = harness(tasks.TOY)
+    first, second, other = slot.score(), slot.score(), slot.score(1)
+    assert first.fitness is not None
+    assert first.steps == 10
+    assert first.fitness == second.fitness != other.fitness
+
+
+def test_a_kept_drive_is_what_a_candidate_would_drive(harness):
+    slot = harness(tasks.TOY)
+    scored = slot.score()
+    slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
+    kept, file = slot.outcome()
+    assert (kept.fitness, kept.steps) == (scored.fitness, scored.steps)
+    assert kept.upload == hashlib.sha256(file).digest()
+    with np.load(io.BytesIO(file), allow_pickle=False) as drive:
+        assert drive["reward"].sum() == pytest.approx(scored.fitness, rel=1e-5)
+        assert (len(drive["picture"]), bool(drive["ended"])) == (10, True)
+    slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
+    assert slot.outcome()[1] == file, "equal drives give equal files"
+
+
+def test_a_failed_drive_is_an_error_without_a_file(harness):
+    slot = harness(tasks.RAISING)
+    slot.wait_ready()
+    slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
+    failed, file = slot.outcome()
+    assert (failed.fitness, failed.upload, file) == (None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("task", "error"), [(tasks.RAISING, "RuntimeError: the road has ended"), (tasks.NAN, "ValueError: the episode's")]
+)
+def test_an_exception_is_the_jobs_error_and_the_child_lives_on(harness, task, error):
+    slot = harness(task)
+    pid = None
+    for _ in range(2):
+        result = slot.score()
+        assert result.fitness is None
+        assert result.error.startswith(error)
+        assert slot.slot.pid == (pid or slot.slot.pid)
+        pid = slot.slot.pid
+
+
+def test_a_crash_costs_one_job_and_another_child_takes_its_place(harness):
+    slot = harness(tasks.CRASHING)
+    for _ in range(2):
+        result = slot.score()
+        assert (result.fitness, result.error) == (None, f"slot crashed (signal {signal.SIGSEGV.value})")
+
+
+def test_a_child_that_is_heard_no_more_and_lives_on_is_replaced(harness):
+    slot = harness(tasks.SILENT)
+    slot.wait_ready()
+    pid = slot.slot.pid
+    assert slot.score().error == "slot crashed (the child ended)"
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def test_nobody_reads_from_a_slot_that_was_stopped(harness):
+    slot = harness(tasks.TOY)
+    before = threading.active_count()
+    slot.score()
+    slot.slot.stop()
+    assert threading.active_count() == before - 1
+
+
+def test_a_killed_child_is_replaced_alone(harness):
+    slot = harness(tasks.SLOW_TOY)
+    slot.wait_ready()
+    slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    assert "signal 9" in slot.result().error
+    assert slot.score().fitness is not None
+
+
+def test_a_job_that_is_given_up_ends_without_a_result_and_the_child_lives_on(harness):
+    slot = harness(tasks.SLOW_TOY)
+    slot.wait_ready()
+    pid = slot.slot.pid
+    slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
+    slot.slot.abandon(job(0, spec=slot.spec).digest)
+    while slot.slot.running:
+        assert slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1]) == ()
+    assert slot.score(1).fitness is not None
+    assert slot.slot.pid == pid
+
+
+def test_after_short_turns_the_next_one_waits_in_the_child(harness):
+    slot = harness(tasks.TOY)
+    slot.wait_ready()
+    assert not slot.slot.takes_more
+    slot.score()
+    for number in (1, 2):
+        slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
+        assert slot.slot.takes_more == (number == 1)
+    assert [each.digest for each in slot.slot.waiting] == [job(2, spec=slot.spec).digest]
+    assert [slot.result().digest for _ in range(2)] == [job(number, spec=slot.spec).digest for number in (1, 2)]
+
+
+def test_a_crash_leaves_what_waits_to_the_next_child(harness):
+    slot = harness(tasks.SLOW_TOY)
+    slot.wait_ready()
+    for number in (0, 1):
+        slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    crashed, scored = slot.result(), slot.result()
+    assert (crashed.digest, crashed.fitness) == (job(0, spec=slot.spec).digest, None)
+    assert scored.digest == job(1, spec=slot.spec).digest
+    assert scored.fitness is not None
+
+
+def test_of_a_turn_of_several_jobs_all_must_be_given_up_to_end_it(harness):
+    slot = harness(tasks.SLOW_TOY)
+    slot.wait_ready()
+    jobs = [job(number, spec=slot.spec) for number in range(2)]
+    slot.slot.submit([(each, VECTOR) for each in jobs])
+    slot.slot.abandon(jobs[0].digest)
+    results = ()
+    while not results:
+        results = slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1])
+    assert [each.digest for each in results] == [each.digest for each in jobs]
+    slot.slot.submit([(each, VECTOR) for each in jobs])
+    for each in jobs:
+        slot.slot.abandon(each.digest)
+    while slot.slot.running:
+        assert slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1]) == ()
+
+
+def test_a_hung_job_is_killed_and_its_child_replaced(harness):
+    slot = harness(tasks.HANGING)
+    slot.wait_ready()
+    stalling = replace(job(0, spec=slot.spec), stall=5.0)
+    slot.slot.submit([(stalling, VECTOR)])
+    now = monotonic()
+    slot.slot.check(now + 4.0, 0.0)
+    slot.slot.check(now + 8.0, 4.0)  # the host stood still for four of the eight seconds
+    assert slot.slot.running
+    slot.slot.check(now + 9.5, 0.0)
+    result = slot.result()
+    assert (result.fitness, result.error) == (None, "slot crashed (no step for 5 s)")
+    slot.wait_ready()
+
+
+def test_a_child_over_its_memory_limit_is_replaced_between_jobs(harness):
+    slot = harness(tasks.TOY, memory_limit=1)
+    slot.wait_ready()
+    pid = slot.slot.pid
+    assert slot.score().fitness is not None
+    assert not slot.slot.ready
+    assert slot.score(1).fitness is not None
+    assert slot.slot.pid != pid
+
+
+def test_a_child_that_cannot_start_ends_with_its_reason(harness, tmp_path):
+    broken = tmp_path / "broken.zip"
+    broken.write_bytes(b"no bundle")
+    slot = harness(tasks.TOY, broken)
+    for _ in range(FAILED_STARTS - 1):
+        slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1])
+    last = slot.events.get(timeout=TIMEOUT)[1]
+    with pytest.raises(DreamfleetError, match=r"cannot start: BundleError.*not a whole bundle"):
+        slot.slot.handle(last)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_asks_the_worker_to_leave_does_not_end_a_child_that_starts(harness, number):
+    slot = harness(tasks.TOY)
+    pid = slot.slot.pid
+    os.kill(pid, number)
+    assert slot.score().fitness is not None
+    assert slot.slot.pid == pid
+
+
+@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
+def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import queue, sys, pathlib\n"
+        "from tests.support import tasks\n"
+        "from tests.support.samples import VECTOR, job\n"
+        "from tests.worker.service.test_slot import spec\n"
+        "from dreamfleet.worker.service.slot import Slot\n"
+        "if __name__ == '__main__':\n"
+        "    events = queue.SimpleQueue()\n"
+        "    slot = Slot(0, spec(tasks.HANGING), pathlib.Path(sys.argv[1]), events)\n"
+        "    slot.handle(events.get()[1])\n"
+        "    slot.submit([(job(spec=spec(tasks.HANGING)), VECTOR)])\n"
+        "    print(slot.pid, slot.ready, flush=True)\n"
+        "    events.get()\n"
+    )
+    command = [sys.executable, script, random_bundle.path]
+    with subprocess.Popen(command, env=environment(tmp_path), stdout=subprocess.PIPE, text=True) as parent:
+        pid, ready = parent.stdout.readline().split()
+        assert ready == "True"
+        child = os.pidfd_open(int(pid))
+        assert not select.select([child], [], [], 0)[0]
+        parent.kill()
+        died = bool(select.select([child], [], [], 10)[0])
+        if not died:
+            os.kill(int(pid), signal.SIGKILL)
+        os.close(child)
+        assert died, "it hangs in its job, where no closed pipe ends it"

@@ -1,0 +1,116 @@
+import gymnasium
+import numpy as np
+import pytest
+
+from dreamfleet.common.bundle import Manifest, write_bundle
+from dreamfleet.common.errors import BundleError, ControllerError, UsageError
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
+from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tasks.api import find_task, known_tasks
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support import tasks
+from tests.support.bundles import npy, write_random_bundle
+
+
+def test_car_racing_is_registered():
+    assert "car-racing" in known_tasks()
+    assert find_task("car-racing").name == "car-racing"
+
+
+def test_a_task_is_found_by_its_reference():
+    assert find_task(tasks.TOY).name == tasks.TOY
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("moon", "known are car-racing"), ("tests.support.tasks:Moon", "Moon"), ("no.such:Task", "no")],
+)
+def test_an_unknown_task_is_an_error_that_says_which_there_are(name, says):
+    with pytest.raises(UsageError, match=says):
+        find_task(name)
+
+
+@pytest.mark.parametrize("task", ["car-racing", "dream"])
+@pytest.mark.parametrize(
+    ("of", "preprocessing", "shape"),
+    [
+        ("moon", "box-64", (64, 64, 3)),
+        ("car-racing", "none", (64, 64, 3)),
+        ("car-racing", "raw-96", (64, 64, 3)),
+        ("car-racing", "box-64", (96, 96, 3)),
+    ],
+)
+def test_a_bundle_of_another_task_or_of_pictures_that_it_does_not_give_is_refused(
+    tmp_path, task, of, preprocessing, shape
+):
+    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "policy.onnx"), b"x")
+    parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
+    manifest = Manifest("moon", of, preprocessing, shape, latent=4, hidden=4, actions=3)
+    bundle, found = write_bundle(tmp_path / "moon.zip", manifest, parts), find_task(task)
+    for make in (found.make_environment, found.make_judge, found.make_policy):
+        with pytest.raises(BundleError, match=f"of task '{of}' and pictures '{preprocessing}'"):
+            make(bundle)
+
+
+@pytest.mark.parametrize("preprocessing", [BOX, RAW])
+def test_environment_and_judge_observe_gymnasiums_own_environment_behind_the_bundles_preprocessing(
+    tmp_path, preprocessing
+):
+    vae = VAEConfig(picture=preprocessing.size, latent=4, channels=(2, 2, 2, 2))
+    bundle = write_random_bundle(tmp_path / "b.zip", vae=vae, rnn=MDNRNNConfig(latent=4, hidden=4))
+    task, plain = find_task("car-racing"), gymnasium.make("CarRacing-v3")
+    ours = [task.make_environment(bundle), task.make_judge(bundle)]
+    observed, _ = plain.reset(seed=10_000)
+    seen = [each.reset(seed=10_000)[0] for each in ours]
+    action = np.array([0.1, 0.5, 0.0], np.float32)
+    for _ in range(60):  # past the opening's zoom
+        assert all((each == preprocessing.picture(observed)).all() for each in seen)
+        observed, reward, *_ = plain.step(action)
+        steps = [each.step(action) for each in ours]
+        assert [each[1] for each in steps] == [reward, reward]
+        seen = [each[0] for each in steps]
+    for each in (*ours, plain):
+        assert each.observation_space.contains(each.reset(seed=1)[0])
+        each.close()
+
+
+def test_an_episode_begins_from_nothing_whatever_was_driven_before(random_bundle):
+    policy = find_task("car-racing").make_policy(random_bundle)
+    random = np.random.default_rng(1)
+    parameters = random.normal(size=random_bundle.controller_shape.size).astype(np.float32)
+    pictures = random.integers(0, 256, (5, 64, 64, 3), dtype=np.uint8)
+    episodes = []
+    for _ in range(2):
+        policy.begin(parameters)
+        episodes.append(np.stack([policy.act(each) for each in (*pictures, pictures[0])]))
+    assert (episodes[0] == episodes[1]).all()
+    assert (episodes[0][0] != episodes[0][-1]).any(), "the state changes what the same picture leads to"
+
+
+def test_a_job_is_scored_under_the_controller_that_its_run_names(random_bundle):
+    shape = random_bundle.shape_of("z", 4)
+    scorer = Scorer(TaskSpec("car-racing", random_bundle.sha256, 5, 0, shape), random_bundle)
+    assert scorer.score("score", np.zeros(shape.size, np.float32), 3).steps == 5
+    with pytest.raises(ControllerError, match="867 parameters"):
+        scorer.score("score", np.zeros(867, np.float32), 3)
+    scorer.close()
+
+
+def test_a_controller_of_another_size_is_refused(random_bundle):
+    with pytest.raises(ControllerError, match="15 parameters"):
+        find_task("car-racing").make_policy(random_bundle).begin(np.zeros(15, np.float32))
+
+
+def test_a_turn_is_scored_at_its_jobs_temperature_as_a_run_of_that_temperature_scores(random_bundle):
+    spec = TaskSpec("dream", random_bundle.sha256, 20, 0, temperature=1.0)
+    random = np.random.default_rng(1)
+    jobs = [("score", random.normal(size=867).astype(np.float32), seed) for seed in (1, 2, 3)]
+    scorer, found = Scorer(spec, random_bundle), {}
+    for temperature in (None, 1.5, None, 2.25, 1.5):
+        scores = scorer.score_all(jobs, lambda _: None, temperature)
+        assert scores == [scorer.score(*each, temperature=temperature) for each in jobs]
+        assert scores == found.setdefault(temperature, scores)
+        assert scores == Scorer(spec.at(temperature), random_bundle).score_all(jobs, lambda _: None)
+    assert len({score.fitness for scores in found.values() for score in scores}) == 9

@@ -1,0 +1,63 @@
+from dataclasses import replace
+
+import av
+import numpy as np
+import pytest
+
+from dreamfleet.common.bundle import DREAM, write_bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.worker.scoring.episode import Course, rollout
+from dreamfleet.worker.tasks.api import find_task
+from dreamfleet.worker.tools.canvas import AWAKE, DREAMING
+from dreamfleet.worker.tools.recording import FRAMES_PER_SECOND, record
+
+SEED, STEPS = 10_003, 8
+
+
+@pytest.fixture
+def controller(random_bundle):
+    shape = random_bundle.controller_shape
+    parameters = np.random.default_rng(0).normal(size=shape.size).astype(np.float32)
+    return Controller(shape, parameters, "car-racing", random_bundle.sha256)
+
+
+def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_bundle, tmp_path):
+    told = []
+    score = record(controller, random_bundle, SEED, STEPS, tmp_path / "new" / "drive.mp4", on_step=told.append)
+    task = find_task("car-racing")
+    judge = task.make_judge(random_bundle)
+    driven = rollout(judge, task.make_policy(random_bundle), controller.parameters, Course(SEED, STEPS))
+    judge.close()
+    assert score == driven.fitness
+    assert told == list(range(1, STEPS + 1))
+    with av.open(str(tmp_path / "new" / "drive.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert (stream.width, stream.height, stream.average_rate) == (*DREAMING.size, FRAMES_PER_SECOND)
+        assert len(list(container.decode(stream))) == STEPS
+
+
+def test_a_controller_that_was_evolved_in_the_dream_is_recorded_in_reality(controller, random_bundle, tmp_path):
+    dreamer = Controller(controller.shape, controller.parameters, "dream", controller.bundle)
+    scores = [record(each, random_bundle, SEED, 3, tmp_path / "drive.mp4") for each in (controller, dreamer)]
+    assert scores[0] == scores[1]
+
+
+def test_a_bundle_that_cannot_dream_is_recorded_with_two_pictures(controller, random_bundle, tmp_path):
+    manifest = random_bundle.manifest
+    parts = {name: random_bundle.read(name) for name in manifest.parts if name != DREAM}
+    awake = write_bundle(tmp_path / "awake.zip", replace(manifest, parts={}), parts)
+    record(controller, awake, SEED, 2, tmp_path / "drive.mp4")
+    with av.open(str(tmp_path / "drive.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.width, stream.height) == AWAKE.size
+
+
+def test_another_task_or_an_impossible_place_is_refused(controller, random_bundle, tmp_path):
+    moon = Controller(controller.shape, controller.parameters, "moon", controller.bundle)
+    with pytest.raises(UsageError, match="only car-racing"):
+        record(moon, random_bundle, SEED, STEPS, tmp_path / "drive.mp4")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DreamfleetError, match="choose another --out"):
+        record(controller, random_bundle, SEED, STEPS, tmp_path / "file" / "drive.mp4")

@@ -1,0 +1,151 @@
+"""Bundles and data sets that are wrong are refused before anything runs, in one clear line."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.bundle import DREAM, INITIAL, POLICY, find_bundle, write_bundle
+from dreamfleet.common.errors import BundleError, DatasetError
+from dreamfleet.common.tensors import weights_finite
+from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training.assemble import assemble, graphs, manifest
+from dreamfleet.worker.training.dataset import load
+from dreamfleet.worker.training.encode import encode
+from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import npy, random_models, weights
+from tests.support.drives import write_drives
+
+LAYERS, RNN = VAEConfig(latent=4, channels=(4, 4, 8, 8)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
+SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
+
+
+def ignore(_done, _note):
+    pass
+
+
+def parts_of(bundle):
+    return {name: bundle.read(name) for name in bundle.manifest.parts}
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("name", ["encoder.0.weight", "lstm.weight_ih_l0", "heads.weight"])
+def test_weights_that_are_no_numbers_are_refused(tmp_path, name, value):
+    models = [weights(each) for each in random_models(0, LAYERS, RNN)]
+    model = next(each for each in models if name in each)
+    model[name] = model[name].copy()
+    model[name].flat[3] = value
+    parts = graphs(*models, np.zeros((1, 2, 4), np.float32), LAYERS, RNN)
+    with pytest.raises(BundleError, match="NaN or infinite; train the model again"):
+        write_bundle(tmp_path / "b.zip", manifest("b", {}, LAYERS, RNN), parts)
+
+
+def test_what_ships_and_what_is_no_model_have_no_wrong_weights():
+    assert weights_finite(find_bundle("tiny").read(POLICY))
+    assert weights_finite(b"x")
+    data = find_bundle("tiny").read(POLICY)[:2000]
+    for cut in range(0, 2000, 7):
+        assert weights_finite(data[:cut])
+
+
+@pytest.mark.parametrize(
+    ("initial", "said"),
+    [
+        (npy(np.zeros((0, 2, 32), np.float32)), "with N at least 1"),
+        (npy(np.zeros((4, 2, 16), np.float32)), r"\(N, 2, 32\)"),
+        (npy(np.full((4, 2, 32), np.nan, np.float32)), "NaN or infinity"),
+        (npy(np.array([object()])), "no array of latents"),
+        (npy(np.zeros(3, np.int64)), "no array of latents"),
+        (b"", "no array of latents"),
+        (npy(np.zeros((4, 2, 32), np.float32))[:-9], "no array of latents"),
+    ],
+)
+def test_a_dream_begins_at_real_latents(random_bundle, tmp_path, initial, said):
+    with pytest.raises(BundleError, match=said):
+        write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts_of(random_bundle), INITIAL: initial})
+
+
+def test_graphs_of_other_sizes_than_the_manifest_says_are_refused(random_bundle, tmp_path):
+    parts = {**parts_of(random_bundle), INITIAL: npy(np.zeros((1, 2, 16), np.float32))}
+    other = write_bundle(tmp_path / "b.zip", replace(random_bundle.manifest, latent=16), parts)
+    for part in (PolicyStep, DreamStep, Encoder):
+        with pytest.raises(BundleError, match="its manifest says"):
+            part(other)
+
+
+def test_a_truncated_dream_is_an_error_of_the_bundle(random_bundle, tmp_path):
+    parts = parts_of(random_bundle)
+    cut = write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, DREAM: parts[DREAM][:5000]})
+    with pytest.raises(BundleError, match=r"dream\.onnx cannot be run"):
+        DreamStep(cut)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    write_drives(folder, episodes=4, steps=6)
+    train_vae.train_vae(folder, SHORT, ignore, LAYERS)
+    list(encode(folder))
+    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, RNN)
+    return folder
+
+
+@pytest.fixture
+def folder(trained, tmp_path):
+    return shutil.copytree(trained, tmp_path / "data")
+
+
+def test_a_half_written_episode_stops_training_before_its_first_update(folder):
+    path = sorted((folder / "episodes").glob("*.npz"))[-1]
+    path.write_bytes(path.read_bytes()[:-50])
+    (folder / train_vae.CHECKPOINT).unlink()
+    seen = []
+    for stage in (
+        lambda: train_vae.train_vae(folder, SHORT, lambda done, _: seen.append(done), LAYERS),
+        lambda: train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, RNN),
+    ):
+        with pytest.raises(DatasetError, match=r"damaged|no .*vae"):
+            stage()
+    assert not seen
+
+
+def test_an_episode_without_its_actions_is_refused(folder):
+    path = sorted((folder / "episodes").glob("*.npz"))[0]
+    arrays = load(path, "picture", "reward", "preprocessing", "ended")
+    np.savez(path, **arrays)
+    with pytest.raises(DatasetError, match=r"lacks action\.npy"):
+        list(encode(folder))
+
+
+def test_a_half_written_encoded_episode_is_encoded_again(folder):
+    path = sorted((folder / "encoded").glob("*.npz"))[1]
+    whole = load(path, "mu")["mu"]
+    path.write_bytes(path.read_bytes()[:100])
+    assert len(list(encode(folder))) == 1
+    assert np.array_equal(load(path, "mu")["mu"], whole)
+
+
+def test_an_mdnrnn_of_other_latents_is_refused(folder):
+    (folder / train_mdnrnn.CHECKPOINT).unlink()
+    with pytest.raises(DatasetError, match="4 latents, this MDN-RNN 5"):
+        train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, replace(RNN, latent=5))
+
+
+def test_data_that_are_no_numbers_stop_training_and_keep_the_checkpoint(folder):
+    before = (folder / train_mdnrnn.CHECKPOINT).read_bytes()
+    for path in (folder / "encoded").glob("*.npz"):
+        arrays = dict(np.load(path))
+        np.savez(path, **{**arrays, "mu": arrays["mu"] * np.nan, "mirrored_mu": arrays["mu"] * np.nan})
+    with pytest.raises(DatasetError, match="loss of update 3 is nan"):
+        train_mdnrnn.train_mdnrnn(folder, replace(SHORT, updates=4), ignore, RNN)
+    assert (folder / train_mdnrnn.CHECKPOINT).read_bytes() == before
+
+
+def test_a_whole_folder_still_makes_a_bundle(folder):
+    bundle = assemble(folder, folder / "b.zip", "b", with_weights=True)
+    assert bundle.manifest.models["vae"]["latent"] == 4
+    assert PolicyStep(bundle).state_size == 16

@@ -1,0 +1,41 @@
+import argparse
+
+import pytest
+
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.training.checkpoint import load_config
+from dreamfleet.worker.verbs import collect, train_mdnrnn, train_vae
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.drives import write_drives
+
+
+def call(verb, *arguments):
+    parser = argparse.ArgumentParser()
+    verb.configure(parser)
+    return verb.run(parser.parse_args(arguments))
+
+
+def test_flags_change_what_a_preset_says(tmp_path, capsys):
+    write_drives(tmp_path, episodes=3, steps=4)
+    call(
+        train_vae, "--data", str(tmp_path), "--updates", "1", "--channels", "2", "2", "4", "4", "--no-batch-norm",
+        "--padding", "same",
+    )  # fmt: skip
+    assert load_config(tmp_path / "vae.safetensors", VAEConfig) == VAEConfig(channels=(2, 2, 4, 4), padding="same")
+    assert "reconstruction_error" in capsys.readouterr().out
+
+
+def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):
+    write_drives(tmp_path, episodes=3, steps=4, picture=96)
+    call(train_vae, "--data", str(tmp_path), "--updates", "1", "--picture", "96", "--channels", "2", "2", "4", "4")
+    assert load_config(tmp_path / "vae.safetensors", VAEConfig).picture == 96
+    assert call(collect, "--data", str(tmp_path), "--episodes", "3", "--picture", "96") == 0
+    assert "0 episodes, 0 frames new; 3 episodes in all" in capsys.readouterr().out
+    with pytest.raises(DatasetError, match="or --picture"):
+        call(collect, "--data", str(tmp_path), "--episodes", "4")
+
+
+@pytest.mark.parametrize(("verb", "count"), [(train_vae, "4,348,547"), (train_mdnrnn, "422,368")])
+def test_a_summary_trains_nothing(tmp_path, capsys, verb, count):
+    assert call(verb, "--data", str(tmp_path / "absent"), "--preset", "paper", "--summary") == 0
+    assert count in capsys.readouterr().out

@@ -1,0 +1,129 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dreamfleet.common.bundle import DREAM, find_bundle
+from dreamfleet.common.controller import act
+from dreamfleet.common.errors import BundleError
+from dreamfleet.worker.worldmodel.inference import DreamStep, PolicyStep
+from dreamfleet.worker.worldmodel.mdnrnn_config import ARTICLE, ATTENTIVE, NOTEBOOK, PAPER, REWARDED, MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import random_models, write_random_bundle
+
+ROWS = 256
+SMALL = {"latent": 4, "hidden": 8, "mixtures": 3, "attention_units": 6}
+SMALL_VAE = VAEConfig(latent=4, channels=(4, 4, 8, 8))
+VARIANTS = {
+    "paper": PAPER,
+    "ours": REWARDED,
+    "article": ARTICLE,
+    "notebook": NOTEBOOK,
+    "attentive": ATTENTIVE,
+    "done": MDNRNNConfig(done=True, reward="none"),
+    "everything": MDNRNNConfig(reward="value", done=True, previous_reward=True, dropout=0.2, window=3),
+    "one mixture": MDNRNNConfig(mixtures=1),
+}
+
+
+def chance(config, rows=ROWS, seed=0):
+    """What a step takes beside the temperature."""
+    random = np.random.default_rng(seed)
+    shapes = {"latent": config.latent, "action": config.actions, "state": config.state}
+    feed = {name: random.normal(0, 0.5, (rows, size)).astype(np.float32) for name, size in shapes.items()}
+    feed["uniform"] = random.random((rows, config.latent)).astype(np.float32)
+    feed["normal"] = random.normal(size=(rows, config.latent)).astype(np.float32)
+    return feed
+
+
+def dreamt_in_torch(model, feed, temperature, mask):
+    """The same step by the book: softmax, its running sum, the first beyond `uniform`."""
+    config = model.config
+    model.heads.weight.data = model.heads.weight.data.half().float()  # as the bundle keeps them
+    tensors = {name: torch.from_numpy(each) for name, each in feed.items()}
+    with torch.no_grad():
+        hidden, state = model.advance(torch.cat([tensors["latent"], tensors["action"]], dim=1), tensors["state"])
+        told = model.predict(hidden * torch.as_tensor(mask))
+    weights = torch.softmax(told.log_weights / temperature, dim=-1)
+    index = (weights.cumsum(dim=-1) <= tensors["uniform"][..., None]).sum(dim=-1).clamp(max=config.mixtures - 1)
+    mean, deviation = (each.gather(-1, index[..., None])[..., 0] for each in (told.means, told.log_deviations))
+    latent = mean + deviation.exp() * temperature**0.5 * tensors["normal"]
+    reward = told.reward if config.reward in ("value", "none") else torch.sigmoid(told.reward)
+    if config.previous_reward:
+        state[:, 2 * config.hidden] = reward if config.reward == "value" else (told.reward > 0).float()
+    done = torch.sigmoid(told.done) if config.done else told.done
+    return latent.numpy(), state.numpy(), reward.numpy(), done.numpy()
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("temperature", [0.5, 1.15])
+def test_the_dream_is_what_torch_dreams(tmp_path, name, temperature):
+    config = VARIANTS[name]
+    bundle, feed = write_random_bundle(tmp_path / "b.zip", rnn=config), chance(config)
+    mask = np.float32(1)
+    if config.dropout:
+        mask = (np.random.default_rng(1).random((ROWS, config.hidden)) > config.dropout) / np.float32(0.8)
+    dream = DreamStep(bundle).imagine(**feed, temperature=temperature, mask=mask if config.dropout else None)
+    expected = dreamt_in_torch(random_models(0, rnn=config)[1], feed, temperature, mask)
+    for one, other in zip((dream.latent, dream.state, dream.reward, dream.done), expected, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4)
+    assert dream.reward.shape == dream.done.shape == (ROWS,)
+
+
+@pytest.mark.parametrize("name", ["ours", "everything"])
+@pytest.mark.parametrize("rows", [1, 3, 64, 256])
+def test_a_dreamers_bits_do_not_depend_on_who_else_dreams(tmp_path, name, rows):
+    config = VARIANTS[name]
+    step, feed = DreamStep(write_random_bundle(tmp_path / "b.zip", rnn=config)), chance(config)
+    parameters = np.random.default_rng(2).normal(0, 0.1, (ROWS, step.shape.size)).astype(np.float32)
+    del feed["action"]
+    whole = step.step(**feed, parameters=parameters, temperature=1.15)
+    order = np.random.default_rng(3).permutation(ROWS)
+    for start in range(0, ROWS - rows + 1, max(rows, 16)):
+        chosen = order[start : start + rows]
+        few = step.step(
+            **{key: each[chosen] for key, each in feed.items()}, parameters=parameters[chosen], temperature=1.15
+        )
+        assert all(np.array_equal(one, other[chosen]) for one, other in zip(few, whole, strict=True))
+
+
+@pytest.mark.parametrize("features", ["z", "zh"])
+@pytest.mark.parametrize("hidden", [0, 5])
+def test_every_controller_acts_by_its_formula_in_the_dream_and_in_reality(tmp_path, features, hidden):
+    config = replace(REWARDED, previous_reward=True)
+    bundle = write_random_bundle(tmp_path / "b.zip", rnn=config)
+    bundle = bundle.under(bundle.shape_of(features, hidden))
+    dream, policy, feed = DreamStep(bundle), PolicyStep(bundle), chance(config, rows=4)
+    random = np.random.default_rng(4)
+    parameters = random.normal(0, 0.1, (4, bundle.controller_shape.size)).astype(np.float32)
+    real = policy.step(random.integers(0, 256, (4, 64, 64, 3), dtype=np.uint8), parameters, feed["state"])
+    dreamt = dream.step(real.latent, parameters, feed["state"], feed["uniform"], feed["normal"], temperature=1.0)
+    np.testing.assert_allclose(dreamt.action, real.action, atol=2e-6)
+    seen = np.concatenate([real.latent, feed["state"][:, : config.hidden]], axis=1)[
+        :, : bundle.controller_shape.features
+    ]
+    for row in range(4):
+        expected = act(bundle.controller_shape, parameters[row], seen[row])
+        np.testing.assert_allclose(real.action[row], expected, atol=2e-6)
+    column = 2 * config.hidden  # reality does not know its reward yet
+    np.testing.assert_allclose(np.delete(dreamt.state, column, 1), np.delete(real.state, column, 1), atol=1e-5)
+
+
+@pytest.mark.parametrize(("kind", "labels"), [("positive", [1, 0]), ("notebook", [0, 1]), ("value", [3.2, -0.1])])
+def test_reality_remembers_its_reward_as_the_head_tells_it(tmp_path, kind, labels):
+    config = MDNRNNConfig(**SMALL, reward=kind, previous_reward=True, window=2)
+    policy = PolicyStep(write_random_bundle(tmp_path / "b.zip", rnn=config, vae=SMALL_VAE))
+    state = policy.zero_state(2)
+    policy.remember(state, np.array([3.2, -0.1]))
+    assert np.flatnonzero(state.any(axis=0)).tolist() == [2 * config.hidden]
+    np.testing.assert_allclose(state[:, 2 * config.hidden], labels, rtol=1e-6)
+
+
+def test_a_bundle_from_before_the_dream_says_so():
+    shipped = find_bundle("tiny")
+    if DREAM not in shipped.manifest.parts:
+        with pytest.raises(BundleError, match=r"holds no dream\.onnx"):
+            DreamStep(shipped)
+        with pytest.raises(BundleError, match="build it again"):
+            shipped.under(shipped.shape_of("z"))

@@ -1,0 +1,107 @@
+"""The models of the sources: their sizes, and that what is exported is what was trained."""
+
+import numpy as np
+import pytest
+import torch
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.worldmodel import mdnrnn_config as mdnrnn
+from dreamfleet.worker.worldmodel import vae_config as vae
+from dreamfleet.worker.worldmodel.inference import Decoder, Encoder, PolicyStep
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, reward_labels
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae import VAE
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import random_models, write_random_bundle
+
+TINY = {"latent": 4, "channels": (4, 4, 8, 8)}
+VAES = {
+    "paper": vae.PAPER,
+    "notebook": vae.NOTEBOOK,
+    "article": vae.ARTICLE,
+    "valid 96": VAEConfig(picture=96, **TINY),
+    "same 64": VAEConfig(padding="same", **TINY),
+    "everything": VAEConfig(activation="leaky_relu", batch_norm=True, dropout=0.1, **TINY),
+    "everything same": VAEConfig(activation="leaky_relu", batch_norm=True, padding="same", picture=96, **TINY),
+}
+
+
+def learnt(module):
+    return sum(each.numel() for each in module.parameters() if each.requires_grad)
+
+
+def test_the_notebooks_lstm_and_heads_have_its_sizes():
+    model = MDNRNN(mdnrnn.NOTEBOOK)
+    assert (mdnrnn.NOTEBOOK.lstm_inputs, mdnrnn.NOTEBOOK.hidden, mdnrnn.NOTEBOOK.outputs) == (36, 256, 481)
+    assert (learnt(model.lstm), learnt(model.heads)) == (300_032, 123_617)
+
+
+def test_the_papers_vae_and_heads_have_its_sizes():
+    assert learnt(VAE(vae.PAPER)) == 4_348_547  # ctallec/world-models, the same layers
+    assert mdnrnn.PAPER.outputs == 480
+
+
+@pytest.mark.parametrize("name", VAES)
+def test_an_exported_vae_computes_what_torch_does(tmp_path, name):
+    config = VAES[name]
+    model, _ = random_models(0, config, MDNRNNConfig(latent=config.latent, hidden=4))
+    bundle = write_random_bundle(tmp_path / "b.zip", 0, config, MDNRNNConfig(latent=config.latent, hidden=4))
+    pictures = np.random.default_rng(0).integers(0, 256, (3, config.picture, config.picture, 3), dtype=np.uint8)
+    with torch.no_grad():
+        mu, logvar = model.encode(torch.from_numpy(pictures).permute(0, 3, 1, 2).float() / 255)
+        decoded = model.decode(mu).permute(0, 2, 3, 1).numpy() * 255
+    for one, other in zip(Encoder(bundle).encode(pictures), (mu, logvar), strict=True):
+        np.testing.assert_allclose(one, other.numpy(), atol=1e-4)
+    np.testing.assert_allclose(Decoder(bundle).decode(mu.numpy()), decoded, atol=1.0)
+    policy = PolicyStep(bundle)
+    parameters = np.zeros((3, policy.shape.size), np.float32)
+    np.testing.assert_allclose(policy.step(pictures, parameters, policy.zero_state(3)).latent, mu.numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("config", [mdnrnn.REWARDED, mdnrnn.NOTEBOOK, mdnrnn.ATTENTIVE])
+def test_step_by_step_is_the_same_as_a_whole_drive(config):
+    torch.manual_seed(0)
+    model = MDNRNN(config).eval()
+    inputs, state, hidden = torch.randn(2, 6, config.inputs), torch.zeros(2, config.state), []
+    with torch.no_grad():
+        for step in range(6):
+            if config.previous_reward:
+                state[:, 2 * config.hidden] = inputs[:, step, -1]
+            last, state = model.advance(inputs[:, step, : config.latent + config.actions], state)
+            hidden.append(last)
+        stepped, whole = model.predict(torch.stack(hidden, dim=1)), model(inputs)
+    for one, other in zip(stepped, whole, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
+
+
+def test_attention_looks_at_the_past_of_its_own_row():
+    torch.manual_seed(0)
+    model = MDNRNN(MDNRNNConfig(latent=2, hidden=8, window=3)).eval()
+    inputs = torch.randn(2, 8, 5)
+    changed = inputs.clone()
+    changed[1] += 1  # a neighbour
+    changed[0, 7] += 1  # the future
+    with torch.no_grad():
+        assert torch.equal(model(inputs).means[0, :7], model(changed).means[0, :7])
+
+
+def test_the_notebooks_label_is_one_where_nothing_is_gained_and_the_episode_goes_on():
+    rewards, done = torch.tensor([[3.2, -0.1, -100.0]]), torch.tensor([[0.0, 0.0, 1.0]])
+    assert reward_labels("positive", rewards, done).tolist() == [[1, 0, 0]]
+    assert reward_labels("notebook", rewards, done).tolist() == [[0, 1, 0]]
+    assert reward_labels("value", rewards, done) is rewards
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: VAEConfig(picture=32),
+        lambda: VAEConfig(channels=(1, 2)),
+        lambda: VAEConfig(dropout=1.0),
+        lambda: MDNRNNConfig(hidden=0),
+        lambda: MDNRNNConfig(reward="none", previous_reward=True),
+    ],
+)
+def test_sizes_that_make_no_model_are_refused(make):
+    with pytest.raises(UsageError):
+        make()

@@ -1,0 +1,174 @@
+"""gymnasium's CarRacing-v3 with its own track, physics and rewards; only the observation is drawn by our native module.
+
+`rgb_array` and `human` rendering stay gymnasium's. Where the native module was not built, `car_racing.check` says
+so and gymnasium draws.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from functools import cache, lru_cache
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pygame
+from gymnasium.envs.box2d import car_dynamics, car_racing
+from gymnasium.error import InvalidAction
+from numpy.typing import NDArray
+
+from dreamfleet.worker.car_racing.car import Car
+from dreamfleet.worker.car_racing.preprocessing import BOX, RAW, find_preprocessing
+
+try:
+    from dreamfleet.worker.car_racing import _native
+except ImportError:  # no compiler when this was installed
+    _native = None  # type: ignore[assignment]
+
+TEXT_WIDTH = 125  # pixels at the window's left end that hold the score
+_Base: Any = car_racing.CarRacing  # untyped upstream
+
+
+class CarRacing(_Base):  # type: ignore[misc]
+    """CarRacing-v3 with its observation drawn natively.
+
+    `preprocessing` names what it observes: `raw-96`, gymnasium's own, or another of `car_racing.preprocessing`.
+    `native` False lets gymnasium draw, as it does anyway where the module was not built. Not thread-safe, as
+    gymnasium's is not: environments of one process share one canvas.
+    """
+
+    def __init__(self, *arguments: Any, preprocessing: str = RAW.name, native: bool = True, **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self._native = native and available()
+        self._preprocessing = find_preprocessing(preprocessing)
+        self._fixtures = np.zeros(0)
+        self.observation_space = gymnasium.spaces.Box(0, 255, self._preprocessing.shape, np.uint8)
+
+    @property
+    def drawn_by(self) -> str:
+        """`native` or `gymnasium`."""
+        return "native" if self._native else "gymnasium"
+
+    def step(self, action: Any) -> Any:
+        """Gymnasium's step; an action of another shape, or NaN, is refused before anything moves."""
+        if self.car.__class__ is car_dynamics.Car:  # a new one, of a reset
+            self.car.__class__ = Car
+        if action is not None and self.continuous:
+            action = np.asarray(action)
+            if action.shape != (3,) or not all(map(math.isfinite, action)):
+                raise InvalidAction(f"an action is three finite numbers (steering, gas, brake), not {action!r}")
+        return super().step(action)
+
+    def _create_track(self) -> bool:
+        """Gymnasium's track; the tiles' colours then live in one array, which contacts change in place."""
+        if not super()._create_track():
+            return False
+        self._road = np.array([corners for corners, _ in self.road_poly], dtype=np.float64)
+        self._road_colours = np.array([colour for _, colour in self.road_poly], dtype=np.float64)
+        rows = {id(colour): row for row, (_, colour) in enumerate(self.road_poly)}
+        for tile in self.road:
+            row = rows[id(tile.color)]
+            tile.color = self._road_colours[row]
+            self.road_poly[row] = (self.road_poly[row][0], tile.color)
+        self._palette = np.array([self.bg_color, self.grass_color], dtype=np.float64)
+        self._fixtures = np.zeros(0)
+        return True
+
+    def _render(self, mode: str) -> Any:
+        if mode != "state_pixels":
+            return super()._render(mode)
+        return self._draw() if self._native else self._preprocessing.picture(super()._render(mode))
+
+    def _draw(self) -> NDArray[np.uint8]:
+        """The picture `(size, size, 3)` of the preprocessing."""
+        car, t = self.car, self.t
+        hull = car.hull
+        if not self._fixtures.size:
+            self._fixtures = fixtures_of(car)
+        bodies = array("d")
+        for body in (*car.wheels, hull):
+            at = body.position
+            bodies.extend((at.x, at.y, body.angle, 0.0 if body is hull else body.phase))
+        x, y, angle = bodies[-4:-1]
+        zoom = 0.1 * car_racing.SCALE * max(1 - t, 0) + car_racing.ZOOM * car_racing.SCALE * min(t, 1)
+        sight = array("d", (zoom, -angle, x, y, car_racing.PLAYFIELD))
+        out = np.empty((96, 96, 3), np.uint8)
+        _native.scene(out, self._road, self._road_colours, GRASS, self._palette, sight, bodies, self._fixtures, WHEEL)
+        if self._preprocessing is BOX:
+            picture = np.empty(BOX.shape, np.uint8)
+            _native.picture(picture, out)
+            return picture
+        self._draw_bar(out[84:])
+        return out
+
+    def _draw_bar(self, rows: NDArray[np.uint8]) -> None:
+        car, hull = self.car, self.car.hull
+        velocity = hull.linearVelocity
+        vx, vy = velocity.x, velocity.y
+        wheels = car.wheels
+        _native.bar(
+            rows, math.sqrt(vx * vx + vy * vy), *(wheel.omega for wheel in wheels),
+            wheels[0].joint.angle, hull.angularVelocity,
+        )  # fmt: skip
+        text = score_text(f"{self.reward:04.0f}")
+        rows[:, : text.shape[1]] = text
+
+
+def available() -> bool:
+    """Whether the native module was built."""
+    return _native is not None
+
+
+def fixtures_of(car: car_dynamics.Car) -> NDArray[np.float64]:
+    """The car's polygons in drawing order: body, colour, count, vertices."""
+    rows: list[float] = []
+    for obj in car.drawlist:
+        body = 4 if obj is car.hull else car.wheels.index(obj)
+        for fixture in obj.fixtures:
+            vertices = fixture.shape.vertices
+            rows += [body, *(int(c * 255) for c in obj.color), len(vertices)]
+            rows += [value for vertex in vertices for value in vertex]
+    return np.array(rows, dtype=np.float64)
+
+
+@lru_cache(maxsize=4096)
+def score_text(text: str) -> NDArray[np.uint8]:
+    """The score's text as observation rows 84-95, columns 0-11.
+
+    The text lies within the window's first 125 columns, which are exactly twelve of the observation's.
+    """
+    image = _write(text)
+    place = image.get_rect()
+    place.center = (60, int(car_racing.WINDOW_H - car_racing.WINDOW_H * 2.5 / 40.0))
+    surface = pygame.Surface((TEXT_WIDTH, car_racing.WINDOW_H))
+    surface.blit(image, place)
+    small = pygame.transform.smoothscale(surface, (12, 96))
+    return np.array(pygame.surfarray.pixels3d(small)[:, 84:].transpose(1, 0, 2), order="C")
+
+
+def _write(text: str) -> pygame.Surface:
+    try:
+        return _font().render(text, True, (255, 255, 255), (0, 0, 0))
+    except pygame.error:  # somebody closed a window, and with it pygame and its fonts
+        _font.cache_clear()
+        return _font().render(text, True, (255, 255, 255), (0, 0, 0))
+
+
+@cache
+def _font() -> pygame.font.Font:
+    pygame.font.init()
+    return pygame.font.Font(pygame.font.get_default_font(), 42)
+
+
+def _grass() -> NDArray[np.float64]:
+    size = car_racing.GRASS_DIM
+    return np.array([
+        [(size * x + size, size * y + 0), (size * x + 0, size * y + 0),
+         (size * x + 0, size * y + size), (size * x + size, size * y + size)]
+        for x in range(-20, 20, 2) for y in range(-20, 20, 2)
+    ], dtype=np.float64)  # fmt: skip
+
+
+GRASS = _grass()
+WHEEL = np.array([car_dynamics.WHEEL_W, car_dynamics.WHEEL_R, car_dynamics.SIZE, *car_dynamics.WHEEL_WHITE], float)

@@ -1,0 +1,58 @@
+"""Scoring many candidates in the dream at once; a fitness is the same bits alone, in any batch, in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.worker.dream.noise import SharedNoise
+from dreamfleet.worker.dream.world import DreamWorld
+from dreamfleet.worker.tasks.api import Episode, Score
+
+DEFAULT_TEMPERATURE = 1.0
+TILE = 256  # rows that dream together: larger batches are slower again
+
+
+class Dreamer:
+    """Dreams batches of episodes to their ends."""
+
+    def __init__(self, bundle: Bundle, spec: TaskSpec) -> None:
+        self._size = bundle.controller_shape.size
+        self._horizon = spec.horizon
+        self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE)
+
+    def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None] = lambda _: None) -> list[Score]:
+        """The summed reward of each dream, in step order, in double precision; `on_step` hears of all steps so far."""
+        scores: list[Score] = []
+        for start in range(0, len(episodes), TILE):
+            before = sum(score.steps for score in scores)
+            tile = episodes[start : start + TILE]
+            scores += self._dream(tile, lambda made, before=before: on_step(before + made))  # type: ignore[misc]
+        return scores
+
+    def _dream(self, episodes: Sequence[Episode], on_step: Callable[[int], None]) -> list[Score]:
+        parameters = np.stack([vector for vector, _ in episodes]).astype(np.float32)
+        if parameters.shape[1] != self._size or not np.isfinite(parameters).all():
+            raise UsageError(f"a dream needs controllers of {self._size} finite parameters")
+        world, rows = self._world, np.arange(len(episodes))
+        noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.initial)
+        fitness, steps = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
+        latent, state, made = noise.first, world.begin(len(rows)), 0
+        for _ in range(self._horizon):
+            moment = world.live(latent, parameters, state, noise.next(rows))
+            fitness[rows] += moment.reward
+            steps[rows] += 1
+            made += len(rows)
+            on_step(made)
+            latent, state = moment.latent, moment.state
+            if moment.done.any():
+                going = ~moment.done
+                rows, parameters = rows[going], parameters[going]
+                latent, state = latent[going], state[going]
+            if not len(rows):
+                break
+        return [Score(float(total), int(count)) for total, count in zip(fitness, steps, strict=True)]

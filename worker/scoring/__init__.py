@@ -1,0 +1,1 @@
+"""Scoring candidates: one episode loop for all who drive one."""

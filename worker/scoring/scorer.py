@@ -1,0 +1,86 @@
+"""What a slot does with a job: the task's environment and policy, made once, used for every job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.messages import Kind, TaskSpec
+from dreamfleet.worker.scoring.episode import Course, rollout
+from dreamfleet.worker.scoring.rollout import Drive
+from dreamfleet.worker.tasks.api import Batch, Batched, Score, find_task
+
+DRIVER = "controller"  # as a kept drive names who drove
+FULL_EPISODE = 10**6  # steps: the environment's own limit ends it
+
+
+class Scorer:
+    """Scores a slot's jobs; a `judge` does so in the environment that reported scores come from."""
+
+    def __init__(self, spec: TaskSpec, bundle: Bundle, *, judge: bool = False) -> None:
+        task = find_task(spec.task)
+        fitting = bundle.under(spec.controller)
+        self._spec = spec
+        self._batch_at: Callable[[float | None], Batch] | None = None
+        if isinstance(task, Batched) and not judge:
+            make = task.make_batch
+            # One is kept: a run's temperature is raised now and then, and making a batch takes milliseconds.
+            self._batch_at = lru_cache(maxsize=1)(lambda temperature: make(fitting, spec.at(temperature)))
+            self._batch_at(None)  # so that what is wrong with it shows at once
+        self._environment = task.make_judge(fitting) if judge else task.make_environment(fitting)
+        self._policy = task.make_policy(fitting)
+        self._preprocessing = bundle.manifest.preprocessing
+
+    def score(
+        self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,
+        temperature: float | None = None,
+    ) -> Score:  # fmt: skip
+        """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode.
+
+        `temperature` is one other than the run's.
+        """
+        if kind == "score" and self._batch_at is not None:
+            return self._batch_at(temperature).score([(parameters, seed)], on_step)[0]
+        return rollout(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
+
+    def score_all(
+        self, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]], on_step: Callable[[int], None],
+        temperature: float | None = None,
+    ) -> list[Score]:  # fmt: skip
+        """A turn's jobs, as `score` does; `on_step` hears of all steps made so far."""
+        if self._batch_at is not None and all(kind == "score" for kind, _, _ in jobs):
+            return self._batch_at(temperature).score([(parameters, seed) for _, parameters, seed in jobs], on_step)
+        scores: list[Score] = []
+        for job in jobs:
+            before = sum(each.steps for each in scores)
+            scores.append(
+                self.score(*job, lambda done, before=before: on_step(before + done), temperature)  # type: ignore[misc]
+            )
+        return scores
+
+    def collect(
+        self, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None
+    ) -> tuple[Score, Drive]:
+        """An episode as candidates drive it, and what happened in it, failures included."""
+        drive = Drive(DRIVER, self._preprocessing)
+        course = self.course("collect", seed)
+        return rollout(self._environment, self._policy, parameters, course, on_step, drive), drive
+
+    @property
+    def drawn_by(self) -> str:
+        """Who draws the environment's picture; `-` where a task does not say."""
+        return str(getattr(self._environment.unwrapped, "drawn_by", "-"))
+
+    def course(self, kind: Kind, seed: int) -> Course:
+        """The episode that a job of this kind and seed is."""
+        if kind == "evaluate":
+            return Course(seed, FULL_EPISODE)
+        return Course(seed, self._spec.horizon, self._spec.patience)
+
+    def close(self) -> None:
+        """Release the environment."""
+        self._environment.close()

@@ -1,0 +1,92 @@
+"""Asking to join a run: hello, and what the answer means."""
+
+from __future__ import annotations
+
+import json
+import queue
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import zenoh
+
+from dreamfleet.common import keys
+from dreamfleet.common.codec import Inbox, MalformedError, encode_json, from_plain
+from dreamfleet.common.errors import RefusedError, UsageError
+from dreamfleet.common.fingerprint import fingerprint, package_version
+from dreamfleet.common.messages import HelloReply, HelloRequest, Intervals, TaskSpec
+
+HELLO_TIMEOUT = 2.0
+
+
+@dataclass(frozen=True)
+class Admission:
+    """A run that this worker has joined, in one life of its coordinator."""
+
+    run: str
+    run_uid: str
+    incarnation: int
+    nonce: str
+    spec: TaskSpec
+    intervals: Intervals
+
+
+def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> Admission | None:
+    """Say hello to `run`, or to the only live one; `None` if nobody answers, `RefusedError` if the answer is no."""
+    replies = [reply for payload in _get(session, keys.hello(run or "*"), encode_json(request))
+               if (reply := inbox.decode_json(HelloReply, payload)) is not None]  # fmt: skip
+    if not replies:
+        return None
+    if len(replies) > 1:
+        names = ", ".join(sorted(reply.run for reply in replies))
+        raise UsageError(f"several runs are live: choose one with --run: {names}")
+    return _admission(replies[0])
+
+
+def neediest(session: zenoh.Session) -> str | None:
+    """The live run that works with the fewest slots; of equals the first by name."""
+    found = []
+    for payload in _get(session, keys.status("*"), b""):
+        with suppress(ValueError, KeyError, TypeError):  # what answers need not be of this version
+            document = json.loads(payload)
+            if document["state"] not in ("ended", "paused"):
+                found.append((int(document["slots"]), str(document["run"])))
+    return min(found)[1] if found else None
+
+
+def make_request(worker: str, tasks: tuple[str, ...], slots: int) -> HelloRequest:
+    """What a worker says of itself."""
+    return HelloRequest(
+        protocol_min=keys.PROTOCOL_VERSION,
+        protocol_max=keys.PROTOCOL_VERSION,
+        package=package_version("dreamfleet") or "unknown",
+        worker=worker,
+        tasks=tasks,
+        fingerprint=fingerprint(),
+        slots=slots,
+    )
+
+
+def _admission(reply: HelloReply) -> Admission:
+    if not reply.accepted:
+        raise RefusedError(f"run {reply.run} refused this worker: {reply.why}; {reply.remedy}")
+    try:
+        spec, intervals = from_plain(TaskSpec, reply.spec), from_plain(Intervals, reply.intervals)
+    except MalformedError as error:
+        raise RefusedError(
+            f"run {reply.run} (dreamfleet {reply.package}) describes its task in words that this version does not know "
+            f"({error}); install dreamfleet {reply.package} here"
+        ) from error
+    return Admission(keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals)
+
+
+def _get(session: zenoh.Session, key: str, payload: bytes) -> list[bytes]:
+    replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    done = object()
+    handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
+    session.get(key, handler, payload=payload, encoding="application/json", timeout=HELLO_TIMEOUT)
+    payloads = []
+    while (reply := replies.get()) is not done:
+        if reply.ok is not None:
+            payloads.append(reply.ok.payload.to_bytes())
+    return payloads

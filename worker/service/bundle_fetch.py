@@ -1,0 +1,99 @@
+"""Fetching the frozen world model by its hash: in parts, resumable, verified."""
+
+from __future__ import annotations
+
+import logging
+import queue
+from collections.abc import Callable
+from pathlib import Path
+from time import sleep
+from typing import Any
+
+import zenoh
+
+from dreamfleet.common import keys
+from dreamfleet.common.bundle import Bundle, BundleStore
+from dreamfleet.common.codec import Inbox
+from dreamfleet.common.errors import BundleError
+from dreamfleet.common.messages import MAX_PART, BundlePart
+
+log = logging.getLogger(__name__)
+WINDOW = 8  # queries in flight: enough to fill a link with a long way
+ATTEMPTS = 3  # damaged downloads before giving up
+SILENCES = 20  # rounds without progress before giving up
+QUERY_TIMEOUT = 3.0
+LOOK = 0.2  # seconds between looks at whether to stop
+PAUSE = 0.5  # seconds after a round without progress
+
+
+def obtain(
+    session: zenoh.Session, run: str, sha256: str, store: BundleStore, inbox: Inbox,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Bundle | None:  # fmt: skip
+    """The bundle from the cache, or fetched from the coordinator; `None` if `stopped`, what has come stays."""
+    bundle = store.find(sha256)
+    if bundle is not None:
+        return bundle
+    with store.downloading(sha256) as path:
+        for attempt in range(1, ATTEMPTS + 1):
+            if (bundle := store.find(sha256)) is not None:  # another worker of this host was faster
+                return bundle
+            _download(session, keys.bundle(run, sha256), sha256, path, inbox, stopped)
+            if stopped():
+                return None
+            try:
+                bundle = store.complete(sha256)
+            except BundleError as error:
+                log.warning("attempt %d of %d: %s", attempt, ATTEMPTS, error)
+                continue
+            log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6)
+            return bundle
+    raise BundleError(f"the bundle {sha256[:12]}... arrived damaged {ATTEMPTS} times: check the coordinator's copy")
+
+
+def _download(
+    session: zenoh.Session, key: str, sha256: str, path: Path, inbox: Inbox, stopped: Callable[[], bool]
+) -> None:
+    """Append to `path` until it is as long as the bundle, or `stopped`."""
+    total, silences = None, 0
+    with path.open("ab") as file:
+        while (total is None or file.tell() < total) and not stopped():
+            before = file.tell()
+            offsets = [before + index * MAX_PART for index in range(WINDOW if total else 1)]
+            parts = _ask(session, key, [each for each in offsets if total is None or each < total], inbox, stopped)
+            for part in sorted(parts, key=lambda part: part.offset):
+                if part.sha256.hex() == sha256:
+                    total = part.total
+                    if part.offset == file.tell():
+                        file.write(part.data)
+            if total is not None and file.tell() > total:
+                file.seek(0)
+                file.truncate()  # the beginning of something else
+            elif file.tell() > before or file.tell() == total:
+                silences = 0
+            else:
+                silences += 1
+                sleep(PAUSE)
+            if silences >= SILENCES:
+                raise BundleError("the coordinator no longer answers for its bundle; start the worker again later")
+
+
+def _ask(
+    session: zenoh.Session, key: str, offsets: list[int], inbox: Inbox, stopped: Callable[[], bool]
+) -> list[BundlePart]:
+    replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    done = object()
+    for offset in offsets:
+        handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
+        session.get(f"{key}?offset={offset};length={MAX_PART}", handler, timeout=QUERY_TIMEOUT)
+    parts, left = [], len(offsets)
+    while left and not stopped():
+        try:
+            reply = replies.get(timeout=LOOK)
+        except queue.Empty:
+            continue
+        if reply is done:
+            left -= 1
+        elif reply.ok is not None and (part := inbox.decode(BundlePart, reply.ok.payload.to_bytes())) is not None:
+            parts.append(part)
+    return parts

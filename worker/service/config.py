@@ -1,0 +1,37 @@
+"""How one worker works."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dreamfleet.common.config import option
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.keys import check_run_name
+from dreamfleet.common.messages import MAX_LEASES
+
+
+@dataclass(frozen=True)
+class WorkerConfig:
+    """How one worker works."""
+
+    run: str | None = option(None, "name of the run (default: the only live one)")
+    name: str | None = option(None, "name of this worker (default: the host's)")
+    slots: int = option(0, "scoring processes; 0: one a core")
+    drain_timeout: float = option(30.0, "seconds that running episodes may take after the first Ctrl-C")
+    any: bool = option(False, "serve whichever live run has the fewest slots, and the next one when it is over")
+    lifetime: float = option(0.0, "leave by itself after so many seconds, as at the first Ctrl-C; 0: never")
+    slot_memory: int = option(
+        2048, "MiB of a scoring process; one that holds more is replaced between jobs; 0: no limit"
+    )
+    exit_when_done: bool = option(False, "leave when the run has ended, instead of waiting for its coordinator")
+
+    def __post_init__(self) -> None:
+        if self.run is not None:
+            check_run_name(self.run)
+        if self.any and self.run is not None:
+            raise UsageError("--any and --run exclude each other")
+        if not 0 <= self.slots <= MAX_LEASES:
+            raise UsageError(f"--slots must be from 0 to {MAX_LEASES}, not {self.slots}")
+        for name in ("drain_timeout", "lifetime", "slot_memory"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise UsageError(f"--{name.replace('_', '-')} must not be negative, nor without end")

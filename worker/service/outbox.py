@@ -1,0 +1,57 @@
+"""Results that have no verdict yet. Pure: a clock in, what to send out."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from dreamfleet.common.messages import Result
+
+BATCH = 64  # results of a message: each is far below a kilobyte
+
+
+@dataclass
+class Waiting:
+    """A result, and when it was last sent."""
+
+    result: Result
+    sent: float | None = None
+
+
+class Outbox:
+    """Sends each result at once and again every `repeat` seconds until its verdict comes."""
+
+    def __init__(self, repeat: float) -> None:
+        self.repeat = repeat
+        self._waiting: OrderedDict[bytes, Waiting] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    @property
+    def digests(self) -> list[bytes]:
+        """Of the results without a verdict, oldest first."""
+        return list(self._waiting)
+
+    def add(self, result: Result) -> None:
+        """A job has ended."""
+        self._waiting[result.digest] = Waiting(result)
+
+    def settle(self, digests: Iterable[bytes]) -> None:
+        """Verdicts came, whichever they are."""
+        for digest in digests:
+            self._waiting.pop(digest, None)
+
+    def resend_all(self) -> None:
+        """Send everything again at the next opportunity."""
+        for waiting in self._waiting.values():
+            waiting.sent = None
+
+    def due(self, now: float) -> list[tuple[Result, ...]]:
+        """Results to send now, in messages."""
+        due = [each for each in self._waiting.values() if each.sent is None or now - each.sent >= self.repeat]
+        for waiting in due:
+            waiting.sent = now
+        results = [waiting.result for waiting in due]
+        return [tuple(results[start : start + BATCH]) for start in range(0, len(results), BATCH)]

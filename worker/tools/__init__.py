@@ -1,0 +1,1 @@
+"""What people do with a controller: judge it, record it, score it again."""

@@ -1,0 +1,87 @@
+"""Judging a controller on unseen tracks, in gymnasium's own unmodified environment."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.bundle import Bundle, BundleStore, default_cache, find_bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import BundleError, DreamfleetError
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.worker.scoring.scorer import Scorer
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """Scores of whole episodes, one a seed."""
+
+    seeds: tuple[int, ...]
+    scores: tuple[float, ...]
+
+    @property
+    def mean(self) -> float:
+        """Mean score."""
+        return float(np.mean(self.scores))
+
+    @property
+    def std(self) -> float:
+        """Standard deviation between tracks."""
+        return float(np.std(self.scores))
+
+
+def bundle_for(controller: Controller, named: str | None, beside: Path | None = None) -> Bundle:
+    """The world model that a controller was evolved with: as named, beside the controller, cached or shipped."""
+    if named is not None:
+        bundle = find_bundle(named)
+    elif beside is not None and beside.exists():
+        bundle = Bundle.open(beside)
+    else:
+        found = BundleStore(default_cache()).find(controller.bundle)
+        if found is None:
+            raise BundleError(
+                f"the controller's world model {controller.bundle[:12]}... is not here: name it with --bundle FILE"
+            )
+        bundle = found
+    return bundle.under(controller.shape)
+
+
+def evaluate(controller: Controller, bundle: Bundle, seeds: tuple[int, ...], jobs: int) -> Iterator[tuple[int, float]]:
+    """Drive one whole episode a seed in `jobs` processes; yields (seed, score) as each ends."""
+    pin_thread_pools()
+    spec = TaskSpec(controller.task, bundle.sha256, horizon=1000, patience=0, controller=bundle.controller_shape)
+    pool = ProcessPoolExecutor(min(jobs, len(seeds)), get_context("spawn"), _start_process)
+    try:
+        drives = [pool.submit(_drive, spec, bundle.path, controller.parameters, seed) for seed in seeds]
+        for drive in as_completed(drives):
+            yield drive.result()
+    except BrokenProcessPool as error:
+        raise DreamfleetError("a process that drove has crashed; `dreamfleet doctor` looks for the cause") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _start_process() -> None:
+    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches the whole group: end without a traceback
+
+
+def _drive(spec: TaskSpec, bundle: Path, parameters: NDArray[np.float32], seed: int) -> tuple[int, float]:
+    return seed, _scorer(spec, bundle).score("evaluate", parameters, seed).fitness
+
+
+@cache
+def _scorer(spec: TaskSpec, bundle: Path) -> Scorer:
+    """One a process, made by its first drive, so that whatever is wrong is that drive's error."""
+    return Scorer(spec, Bundle.open(bundle), judge=True)
