@@ -1,7 +1,7 @@
 """The evolved controller: its shape, how a flat vector packs it, and the formula in NumPy.
 
-A single linear layer (Ha & Schmidhuber 2018, section 2.3): a = W [z; h] + b, squashed to CarRacing's ranges; its
-ablations see z alone, or have a layer of tanh units between.
+A single linear layer (Ha & Schmidhuber 2018, section 2.3): a = W [z; h] + b, which the task's world makes an action of;
+its ablations see z alone, or have a layer of tanh units between.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.actions import Actions
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.fields import OPTIONAL, written
 from dreamfleet.common.files import write_aside
 
 FORMAT = 1
+_PLAIN: dict[str, Any] = {"options": "", "version": 1}  # of tasks; written only where they differ
 
 
 @dataclass(frozen=True)
@@ -67,16 +69,15 @@ class ControllerShape:
         return layers
 
 
-def act(shape: ControllerShape, parameters: NDArray[np.float32], features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Steering in [-1, 1], gas in [0, 1], brake in [0, 1] for features `(features,)`; the reference for the ONNX graph.
-
-    Source: hardmaru/WorldModelsExperiments, carracing: tanh; gas (tanh + 1) / 2; brake clip(tanh, 0, 1).
-    """
+def act(
+    shape: ControllerShape, parameters: NDArray[np.float32], features: NDArray[np.float32], actions: Actions
+) -> Any:
+    """The action of a controller `(size,)` on features `(features,)`; the reference for the ONNX graphs."""
+    *before, (weights, biases) = shape.unpack(parameters)
     value = features
-    for weights, biases in shape.unpack(parameters):
-        value = np.tanh(weights @ value + biases)
-    steer, gas, brake = value
-    return np.array([steer, (gas + 1) / 2, np.clip(brake, 0, 1)], dtype=np.float32)
+    for each, offsets in before:
+        value = np.tanh(each @ value + offsets)
+    return actions.of(weights @ value + biases)
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,10 @@ class Controller:
     shape: ControllerShape
     parameters: NDArray[np.float32]
     task: str
-    bundle: str  # SHA-256 of the bundle's file, hexadecimal
+    bundle: str  # SHA-256 of the bundle's file, hexadecimal; empty where the task needs none
     provenance: dict[str, Any] = field(default_factory=dict)
+    options: str = ""  # the task's own, as its specification has them
+    version: int = 1  # the task's
 
     def __post_init__(self) -> None:
         if self.parameters.shape != (self.shape.size,) or self.parameters.dtype != np.float32:
@@ -103,9 +106,14 @@ class Controller:
         """Hash of the parameters' little-endian bytes."""
         return hashlib.sha256(self.parameters.astype("<f4").tobytes()).hexdigest()
 
+    @property
+    def _task_details(self) -> dict[str, Any]:
+        return {"options": self.options, "version": self.version}
+
     def save(self, path: Path) -> None:
         """Write an `.npz` that `load` reads; whole or not at all."""
         about = {"format": FORMAT, "shape": written(self.shape), "task": self.task, "bundle": self.bundle}
+        about |= {name: value for name, value in self._task_details.items() if value != _PLAIN[name]}
         text = json.dumps({**about, "provenance": self.provenance}, sort_keys=True)
         with write_aside(path) as file:
             np.savez(file, parameters=self.parameters, about=np.array(text))
@@ -120,7 +128,9 @@ class Controller:
             if about["format"] != FORMAT:
                 raise ControllerError(f"{path} has controller format {about['format']}; this version reads {FORMAT}")
             shape = ControllerShape(**about["shape"])
-            return cls(shape, parameters, str(about["task"]), str(about["bundle"]), dict(about["provenance"]))
+            details = {name: type(value)(about.get(name, value)) for name, value in _PLAIN.items()}
+            task, bundle = str(about["task"]), str(about["bundle"])
+            return cls(shape, parameters, task, bundle, dict(about["provenance"]), **details)
         except FileNotFoundError:
             raise ControllerError(f"no controller at {path}") from None
         except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error) as error:

@@ -18,6 +18,7 @@ from dreamfleet.common.fields import OPTIONAL, written
 MAX_MESSAGE = 48 * 1024
 MAX_PART = 40 * 1024  # room for the envelope around a part's bytes
 MAX_UPLOAD = 32 << 20  # a drive of 1000 steps is 12 MB (64x64) or 28 MB (96x96) before it is compressed
+MAX_OPTIONS = 20_000  # characters
 MAX_LEASES = 1024  # of one worker: so that a beat, which names them all, stays under MAX_MESSAGE
 TAG_BYTES = 8
 COLDEST, HOTTEST = 1e-3, 1e3  # of a dream
@@ -58,11 +59,19 @@ class TaskSpec:
     """What is scored in, frozen with a run: a fitness is a function of this, the parameters and the seeds alone."""
 
     task: Word
-    bundle: Annotated[str, Length(64, 64)]  # SHA-256 of the bundle's file, hexadecimal
+    bundle: Annotated[str, Length(0, 64)]  # SHA-256 of the bundle's file, hexadecimal; empty where there is none
     horizon: Annotated[int, Between(1, 10**6)]  # an episode's steps at most, when scored for the strategy
     patience: Annotated[int, Between(0, 10**6)]  # steps without reward before a scored episode is cut; 0: never
     controller: ControllerShape | None = field(default=None, metadata=OPTIONAL)  # `None`: linear on z and h
     temperature: Temperature | None = field(default=None, metadata=OPTIONAL)  # of a dream
+    # The task's own, as canonical JSON: what its environment is made with, how it normalises what it observes.
+    options: Annotated[str, Length(0, MAX_OPTIONS)] = field(default="", metadata=OPTIONAL)
+    # The task's own version: another one gives other fitnesses.
+    version: Annotated[int, Between(1, 10**6)] = field(default=1, metadata=OPTIONAL)
+
+    def option(self, name: str, default: Any = None) -> Any:
+        """One of the task's own options."""
+        return json.loads(self.options or "{}").get(name, default)
 
     def at(self, temperature: float | None) -> TaskSpec:
         """The same at another temperature; `None`: at its own."""

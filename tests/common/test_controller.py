@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from dreamfleet.common.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.controller import Controller, ControllerShape, act
 from dreamfleet.common.errors import ControllerError
 
@@ -31,7 +32,9 @@ def test_a_file_brings_everything_back(tmp_path):
 
 
 def test_zero_parameters_drive_straight_on_at_half_gas():
-    assert np.array_equal(act(SHAPE, np.zeros(15, np.float32), np.ones(4, np.float32)), [0.0, 0.5, 0.0])
+    assert np.array_equal(
+        act(SHAPE, np.zeros(15, np.float32), np.ones(4, np.float32), STEERING_GAS_BRAKE), [0.0, 0.5, 0.0]
+    )
 
 
 def test_weights_come_row_by_row_then_biases():
@@ -48,7 +51,7 @@ def test_a_hidden_layer_lies_between():
     assert (inner.shape, shift.shape, outer.shape, bias.shape) == ((4, 2), (4,), (3, 4), (3,))
     squashed = np.tanh(outer @ np.tanh(inner @ np.ones(2, np.float32) + shift) + bias)
     expected = [squashed[0], (squashed[1] + 1) / 2, max(squashed[2], 0)]
-    np.testing.assert_allclose(act(shape, parameters, np.ones(2, np.float32)), expected, atol=1e-6)
+    np.testing.assert_allclose(act(shape, parameters, np.ones(2, np.float32), STEERING_GAS_BRAKE), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("parameters", [np.zeros(14), np.full(15, np.nan), np.full(15, np.inf)])

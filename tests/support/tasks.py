@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from dreamfleet.worker.tasks.api import Score
+from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 
 MODULE = "tests.support.tasks"
 TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC = (
@@ -52,18 +52,15 @@ class ToyPolicy:
         return self._action
 
 
-class Toy:
+class Toy(Task):
     name = TOY
-    width = 1
+    world = World(Continuous.between([-1.0] * 8, [1.0] * 8))
     seconds = 0.0
 
-    def make_environment(self, bundle):
+    def make_environment(self, assignment):
         return ToyEnvironment(self.seconds)
 
-    def make_judge(self, bundle):
-        return self.make_environment(bundle)
-
-    def make_policy(self, bundle):
+    def make_policy(self, assignment):
         return ToyPolicy()
 
 
@@ -77,7 +74,7 @@ class SlowToy(Toy):
 class Raising(Toy):
     name = RAISING
 
-    def make_policy(self, bundle):
+    def make_policy(self, assignment):
         return RaisingPolicy()
 
 
@@ -89,7 +86,7 @@ class RaisingPolicy(ToyPolicy):
 class Crashing(Toy):
     name = CRASHING
 
-    def make_policy(self, bundle):
+    def make_policy(self, assignment):
         return CrashingPolicy()
 
 
@@ -101,7 +98,7 @@ class CrashingPolicy(ToyPolicy):
 class Nan(Toy):
     name = NAN
 
-    def make_policy(self, bundle):
+    def make_policy(self, assignment):
         return NanPolicy()
 
 
@@ -113,7 +110,7 @@ class NanPolicy(ToyPolicy):
 class Hanging(Toy):
     name = HANGING
 
-    def make_policy(self, bundle):
+    def make_policy(self, assignment):
         return HangingPolicy()
 
 
@@ -127,7 +124,7 @@ class Silent(Toy):
 
     name = SILENT
 
-    def make_policy(self, bundle):
+    def make_policy(self, assignment):
         return SilentPolicy()
 
 
@@ -142,8 +139,8 @@ class Judged(Toy):
 
     name = JUDGED
 
-    def make_judge(self, bundle):
-        return gymnasium.wrappers.TransformReward(self.make_environment(bundle), lambda reward: reward + 100)
+    def make_judge(self, assignment):
+        return gymnasium.wrappers.TransformReward(self.make_environment(assignment), lambda reward: reward + 100)
 
 
 class Counted(Toy):
@@ -151,7 +148,7 @@ class Counted(Toy):
 
     name = COUNTED
 
-    def make_environment(self, bundle):
+    def make_environment(self, assignment):
         return CountedEnvironment(0.001)
 
 
@@ -173,7 +170,7 @@ class Heavy(Toy):
 
     name = HEAVY
 
-    def make_environment(self, bundle):
+    def make_environment(self, assignment):
         return HeavyEnvironment()
 
 
@@ -198,8 +195,8 @@ class Optimistic(Toy):
     name = OPTIMISTIC
     width = 4
 
-    def make_batch(self, bundle, spec):
-        return OptimisticBatch(spec.temperature)
+    def make_batch(self, assignment):
+        return OptimisticBatch(assignment.spec.temperature)
 
 
 class OptimisticBatch:

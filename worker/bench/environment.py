@@ -20,6 +20,8 @@ from dreamfleet.common.seeds import VALIDATION
 from dreamfleet.worker.car_racing.check import Actions, Difference, compare, leap, make_car_racing
 from dreamfleet.worker.car_racing.preprocessing import BOX
 from dreamfleet.worker.car_racing.task import CarRacing, CarRacingPolicy, PictureObservation
+from dreamfleet.worker.scoring.episode import Course, play
+from dreamfleet.worker.tasks.api import Assignment
 
 STEPS = 1000
 Policy = Callable[[NDArray[np.uint8]], Any]
@@ -30,20 +32,18 @@ def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
 
     Every kind drives the same actions, which the shipped controller chose on that track beforehand.
     """
-    task = CarRacing()
-    cases: dict[str, Callable[[Drive], float]] = {
-        "gymnasium": lambda drive: seconds_a_step(gymnasium.make("CarRacing-v3"), drive),
-        "observation": lambda drive: seconds_a_step(make_car_racing(), drive),
-        "gymnasium_picture": lambda drive: seconds_a_step(
-            PictureObservation(gymnasium.make("CarRacing-v3"), BOX), drive
-        ),
-        "picture": lambda drive: seconds_a_step(make_car_racing(preprocessing=BOX.name), drive),
-        "fitness_step": lambda drive: seconds_a_step(task.make_environment(bundle), drive, policy_of(bundle)),
+    task, assignment = CarRacing(), Assignment.of(CarRacing.name, bundle)
+    cases: dict[str, Callable[[Plan], float]] = {
+        "gymnasium": lambda plan: seconds_a_step(gymnasium.make("CarRacing-v3"), plan),
+        "observation": lambda plan: seconds_a_step(make_car_racing(), plan),
+        "gymnasium_picture": lambda plan: seconds_a_step(PictureObservation(gymnasium.make("CarRacing-v3"), BOX), plan),
+        "picture": lambda plan: seconds_a_step(make_car_racing(preprocessing=BOX.name), plan),
+        "fitness_step": lambda plan: seconds_a_step(task.make_environment(assignment), plan, policy_of(bundle)),
     }
     notes = []
     if find_spec("torch"):
-        cases["torch_fitness_step"] = lambda drive: seconds_a_step(
-            task.make_judge(bundle), drive, torch_policy_of(bundle)
+        cases["torch_fitness_step"] = lambda plan: seconds_a_step(
+            task.make_judge(assignment), plan, torch_policy_of(bundle)
         )
     else:
         notes.append("ratio_fitness_step needs torch: pip install 'dreamfleet[train]'")
@@ -53,9 +53,9 @@ def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
         notes.append("ratio_envpool needs envpool: pip install envpool")
     times: dict[str, list[float]] = {name: [] for name in cases}
     for round_number in range(rounds):
-        drive = recorded_drive(VALIDATION.start + round_number)
+        plan = recorded_plan(VALIDATION.start + round_number)
         for name, measure in cases.items():
-            times[name].append(measure(drive))
+            times[name].append(measure(plan))
     seconds = {name: statistics.median(values) for name, values in times.items()}
 
     def ratio(slow: str, fast: str) -> float | None:
@@ -74,28 +74,24 @@ def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Drive:
+class Plan:
     """A track and what was done on it."""
 
     seed: int
     actions: list[NDArray[np.float32]]
 
 
-def recorded_drive(seed: int) -> Drive:
+def recorded_plan(seed: int) -> Plan:
     """What the shipped controller does on a track; it ends with the lap, or after 1000 steps."""
-    environment, act = make_car_racing(preprocessing=BOX.name), driver(find_bundle("tiny"))
-    picture, _ = environment.reset(seed=seed)
-    actions: list[NDArray[np.float32]] = []
-    random, ended = np.random.default_rng(seed), False
-    while not ended:
-        actions.append(np.array(act(len(actions), picture, random)))
-        picture, _, terminated, truncated, _ = environment.step(actions[-1])
-        ended = terminated or truncated
+    policy, controller = shipped_driver(find_bundle("tiny"))
+    policy.begin(controller.parameters)
+    environment = make_car_racing(preprocessing=BOX.name)
+    actions = [np.array(moment.action) for moment in play(environment, policy, Course(seed, STEPS))]
     environment.close()
-    return Drive(seed, actions)
+    return Plan(seed, actions)
 
 
-def completed_lap(seed: int) -> Drive:
+def completed_lap(seed: int) -> Plan:
     """A drive that touches every tile: towards a point ahead on the middle of the road, which the environment knows."""
     environment = make_car_racing(preprocessing=BOX.name, max_episode_steps=4 * STEPS)
     environment.reset(seed=seed)
@@ -118,18 +114,18 @@ def completed_lap(seed: int) -> Drive:
         if (terminated or truncated) and not info.get("lap_finished"):
             raise RuntimeError(f"no lap on track {seed}")  # a mistake in this function
     environment.close()
-    return Drive(seed, actions)
+    return Plan(seed, actions)
 
 
-def seconds_a_step(environment: gymnasium.Env[Any, Any], drive: Drive, policy: Policy | None = None) -> float:
+def seconds_a_step(environment: gymnasium.Env[Any, Any], plan: Plan, policy: Policy | None = None) -> float:
     """One episode from its reset on. What the policy answers costs its time and is not driven."""
     started = perf_counter()
-    observation, _ = environment.reset(seed=drive.seed)
-    for action in drive.actions:
+    observation, _ = environment.reset(seed=plan.seed)
+    for action in plan.actions:
         if policy is not None:
             policy(observation)
         observation = environment.step(action)[0]
-    seconds = (perf_counter() - started) / len(drive.actions)
+    seconds = (perf_counter() - started) / len(plan.actions)
     environment.close()
     return seconds
 
@@ -150,16 +146,16 @@ def torch_policy_of(bundle: Bundle) -> Policy:
     return lambda _picture: step_once()
 
 
-def envpool_seconds_a_step(drive: Drive) -> float:
+def envpool_seconds_a_step(plan: Plan) -> float:
     """EnvPool's CarRacing, one environment; not the same pixels, and the same actions on tracks of its own."""
     import envpool
 
-    environment = envpool.make("CarRacing-v3", env_type="gymnasium", num_envs=1, seed=drive.seed)
+    environment = envpool.make("CarRacing-v3", env_type="gymnasium", num_envs=1, seed=plan.seed)
     started = perf_counter()
     environment.reset()
-    for action in drive.actions:
+    for action in plan.actions:
         environment.step(action[None])
-    return (perf_counter() - started) / len(drive.actions)
+    return (perf_counter() - started) / len(plan.actions)
 
 
 def prove_exact(bundle: Bundle) -> Iterator[tuple[str, Difference | None]]:
@@ -186,8 +182,14 @@ def discrete(_step: int, _picture: Any, random: np.random.Generator) -> int:
 
 def driver(bundle: Bundle) -> Actions:
     """The shipped controller, which drives."""
-    policy, controller = CarRacingPolicy(bundle), Controller.load(pretrained() / f"{bundle.manifest.name}.npz")
-    if controller.bundle != bundle.sha256:
-        raise ControllerError(f"the shipped controller {bundle.manifest.name} is not of {bundle.path}")
+    policy, controller = shipped_driver(bundle)
     policy.begin(controller.parameters)
     return lambda _step, picture, _random: policy.act(picture)
+
+
+def shipped_driver(bundle: Bundle) -> tuple[CarRacingPolicy, Controller]:
+    """A bundle's policy and the controller that ships with it."""
+    controller = Controller.load(pretrained() / f"{bundle.manifest.name}.npz")
+    if controller.bundle != bundle.sha256:
+        raise ControllerError(f"the shipped controller {bundle.manifest.name} is not of {bundle.path}")
+    return CarRacingPolicy(bundle), controller

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import Bundle
+from dreamfleet.worker.tasks.api import Assignment, Continuous, Task, World
 
 NAP_SECONDS = 0.05
 NAPS, NULLS = (f"{__name__}:{name}" for name in ("Naps", "Nulls"))
@@ -48,22 +48,18 @@ class Idle:
         return observation
 
 
-class Naps:
+class Naps(Task):
     """Episodes of 50 ms."""
 
     name = NAPS
-    width = 1
+    world = World(actions=Continuous.between([-1.0], [1.0]))
     seconds = NAP_SECONDS
 
-    def make_environment(self, _bundle: Bundle) -> gymnasium.Env[Any, Any]:
+    def make_environment(self, _assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """A nap."""
         return NapEnvironment(self.seconds)
 
-    def make_judge(self, bundle: Bundle) -> gymnasium.Env[Any, Any]:
-        """The same."""
-        return self.make_environment(bundle)
-
-    def make_policy(self, _bundle: Bundle) -> Idle:
+    def make_policy(self, _assignment: Assignment) -> Idle:
         """Of any bundle."""
         return Idle()
 

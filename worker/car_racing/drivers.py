@@ -6,19 +6,10 @@ stands teaches nothing.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
-HELD_FRAMES = 20
-
-
-class Driver(Protocol):
-    """Chooses an action `(3,)`: steering in [-1, 1], gas and brake in [0, 1]."""
-
-    def act(self) -> NDArray[np.float32]:
-        """The next action."""
+HELD_FRAMES = 20  # an action is steering in [-1, 1], gas and brake in [0, 1]
 
 
 class HeldDriver:

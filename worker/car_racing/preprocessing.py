@@ -8,31 +8,15 @@ the bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.tasks.api import Preprocessing
 
 Pixels = NDArray[np.uint8]
 SCENE_ROWS = 84
 SMALL = 64
-
-
-@dataclass(frozen=True)
-class Preprocessing:
-    """One way from CarRacing's observation to a picture."""
-
-    name: str  # in bundles' manifests and in recorded drives
-    size: int  # height and width of its pictures
-    picture: Callable[[Pixels], Pixels]  # `(96, 96, 3)` to `(size, size, 3)`, both uint8
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Height, width and channels of its pictures."""
-        return self.size, self.size, 3
 
 
 def _row_weights() -> NDArray[np.float32]:
@@ -71,12 +55,3 @@ def find_preprocessing(name: str) -> Preprocessing:
     if name not in PREPROCESSINGS:
         raise UsageError(f"unknown preprocessing {name!r}: choose one of {', '.join(PREPROCESSINGS)}")
     return PREPROCESSINGS[name]
-
-
-def preprocessing_to(size: int) -> Preprocessing:
-    """The preprocessing whose pictures are so many pixels wide; `UsageError` if there is none."""
-    for each in PREPROCESSINGS.values():
-        if each.size == size:
-            return each
-    sizes = " or ".join(str(each.size) for each in PREPROCESSINGS.values())
-    raise UsageError(f"pictures are {sizes} pixels wide, not {size}")

@@ -7,36 +7,67 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.box2d.car_dynamics import Car
 from numpy.typing import NDArray
 
+from dreamfleet.common.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.errors import BundleError
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.worker.car_racing.check import make_car_racing
-from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS, Preprocessing
+from dreamfleet.worker.car_racing.drivers import DRIVERS
+from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS
+from dreamfleet.worker.tasks.api import Assignment, DreamReward, Preprocessing, Task, World
 from dreamfleet.worker.worldmodel.inference import PolicyStep
 
 ENVIRONMENT = "CarRacing-v3"
+WORLD = World(
+    actions=STEERING_GAS_BRAKE,
+    packages=NUMERIC_PACKAGES,
+    idle_cost=0.1,
+    frames_per_second=50,
+    action_names=("steer", "gas", "brake"),
+    dream_reward=DreamReward(gain=3.5, cost=0.1),  # a tile gives 1000 / N, of a track's N tiles: 3.5 on average
+)
 
 
-class CarRacing:
+class CarRacing(Task):
     """The task `car-racing`."""
 
     name = "car-racing"
-    width = 1
+    world = WORLD
+    drivers = DRIVERS
+    preprocessings = PREPROCESSINGS
 
-    def make_environment(self, bundle: Bundle) -> gymnasium.Env[Any, Any]:
+    def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """The environment with the native picture, where that is exact; it observes the bundle's pictures."""
-        return make_car_racing(preprocessing=self.preprocessing(bundle).name)
+        return self.make_recorded(self.preprocessing(assignment.world_model).name)
 
-    def make_judge(self, bundle: Bundle, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
+        """The same, observing the pictures of a preprocessing by name."""
+        return make_car_racing(preprocessing=preprocessing)
+
+    def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The unmodified environment of gymnasium, preprocessed here."""
-        preprocessing = self.preprocessing(bundle)
+        preprocessing = self.preprocessing(assignment.world_model)
         return PictureObservation(gymnasium.make(ENVIRONMENT, render_mode=render_mode), preprocessing)
 
-    def make_policy(self, bundle: Bundle) -> CarRacingPolicy:
+    def make_policy(self, assignment: Assignment) -> CarRacingPolicy:
         """Encoder, controller and MDN-RNN of a bundle that was trained on this task's pictures."""
-        self.preprocessing(bundle)
-        return CarRacingPolicy(bundle)
+        self.preprocessing(assignment.world_model)
+        return CarRacingPolicy(assignment.world_model)
+
+    def begin_anywhere(self, environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:
+        """Move the car to a random tile, turned and shifted a little, past the opening's zoom."""
+        inner: Any = environment.unwrapped
+        _, beta, x, y = inner.track[random.integers(len(inner.track))]
+        shift, turn = random.normal(0, 2.0), random.normal(0, 0.25)
+        inner.car.destroy()
+        inner.car = Car(  # type: ignore[no-untyped-call]
+            inner.world, beta + turn, x + shift * np.cos(beta), y + shift * np.sin(beta)
+        )
+        inner.t = 1.0  # the camera zooms in during the first second
+        return environment.step(np.zeros(3, dtype=np.float32))[0]
 
     def preprocessing(self, bundle: Bundle) -> Preprocessing:
         """What makes the pictures that the bundle was trained on; `BundleError` if this task does not give them."""

@@ -11,7 +11,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.worker.dream.noise import SharedNoise
 from dreamfleet.worker.dream.world import DreamWorld
-from dreamfleet.worker.tasks.api import Episode, Score
+from dreamfleet.worker.tasks.api import Episode, Score, World
 
 DEFAULT_TEMPERATURE = 1.0
 TILE = 256  # rows that dream together: larger batches are slower again
@@ -20,10 +20,11 @@ TILE = 256  # rows that dream together: larger batches are slower again
 class Dreamer:
     """Dreams batches of episodes to their ends."""
 
-    def __init__(self, bundle: Bundle, spec: TaskSpec) -> None:
+    def __init__(self, bundle: Bundle, spec: TaskSpec, world: World | None = None) -> None:
+        """`world` is the bundle's own; found by its name if it is not given."""
         self._size = bundle.controller_shape.size
         self._horizon = spec.horizon
-        self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE)
+        self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, world)
 
     def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None] = lambda _: None) -> list[Score]:
         """The summed reward of each dream, in step order, in double precision; `on_step` hears of all steps so far."""

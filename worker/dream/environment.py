@@ -10,6 +10,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from dreamfleet.common.actions import Actions, Discrete
 from dreamfleet.common.bundle import Bundle, find_bundle
 from dreamfleet.worker.dream.noise import Noise, side_by_side
 from dreamfleet.worker.dream.world import DreamWorld
@@ -20,9 +21,11 @@ Flags = NDArray[np.bool_]
 FRAMES_PER_SECOND = 50  # CarRacing's
 
 
-def action_space() -> Any:
-    """CarRacing's: steering, gas, brake."""
-    return spaces.Box(np.array([-1, 0, 0], np.float32), np.array([1, 1, 1], np.float32))
+def action_space(actions: Actions) -> Any:
+    """What the dreamt world's actions may be; CarRacing's: steering, gas, brake."""
+    if isinstance(actions, Discrete):
+        return spaces.Discrete(actions.outputs, start=actions.first)
+    return spaces.Box(np.array(actions.low, np.float32), np.array(actions.high, np.float32))
 
 
 def latent_space(size: int) -> Any:
@@ -55,7 +58,7 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
         self.observation_space = latent_space(self._world.chance.latent)
-        self.action_space = action_space()
+        self.action_space = action_space(self._world.world.actions)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Begin a dream; without a seed, one after the last."""
@@ -102,7 +105,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
         self.single_observation_space = latent_space(self._world.chance.latent)
-        self.single_action_space = action_space()
+        self.single_action_space = action_space(self._world.world.actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from dreamfleet.common.bundle import DREAM, INITIAL, Bundle
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.worker.dream.noise import Draw
+from dreamfleet.worker.tasks.api import Assignment, DreamReward, World
+from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.inference import Dream, DreamStep
 
 Floats = NDArray[np.float32]
-
-TILE_REWARD = 3.5  # of a new tile, on average: CarRacing gives 1000 / N for each of a track's N tiles
-IDLE_COST = 0.1  # of each step, as in CarRacing
 
 
 class Moment(NamedTuple):
@@ -32,13 +31,21 @@ class Moment(NamedTuple):
 class DreamWorld:
     """The frozen MDN-RNN as a world, at one temperature (Ha & Schmidhuber 2018, section 4)."""
 
-    def __init__(self, bundle: Bundle, temperature: float) -> None:
+    def __init__(self, bundle: Bundle, temperature: float, world: World | None = None) -> None:
+        """`world` is the bundle's own; found by its name if it is not given."""
         check_temperature(temperature)
         if DREAM not in bundle.manifest.parts:
             raise BundleError(f"{bundle.path.name} is from before dreams: build it again with `dreamfleet bundle`")
+        self.world = world or world_of(bundle)
         self._kind = str(bundle.manifest.models.get("mdnrnn", {}).get("reward", "none"))
-        if self._kind == "none":
+        self._worth = self.world.dream_reward
+        survival = self._worth is not None and self._worth.source == "survival"
+        if self._kind == "none" and not survival:
             raise BundleError(f"{bundle.path.name} predicts no reward: nothing can be scored in its dream")
+        if self._kind != "value" and self._worth is None:
+            raise BundleError(
+                f"task {bundle.manifest.task} does not say what a dreamt step of {bundle.path.name} is worth"
+            )
         self._step = DreamStep(bundle)
         self._temperature = temperature
         self.chance = self._step.chance
@@ -60,12 +67,20 @@ class DreamWorld:
 
     def _judge(self, dream: Dream) -> Moment:
         told = dream.reward.astype(np.float64)
-        if self._kind == "value":
-            reward = told
-        else:
-            tile = told if self._kind == "positive" else 1 - told  # the notebook's head tells of steps without one
-            reward = TILE_REWARD * tile - IDLE_COST
+        reward = told if self._worth is None or self._kind == "value" else self._value(told, self._worth, dream)
         return Moment(dream.latent, dream.state, reward, dream.done > 0.5)
+
+    def _value(self, told: NDArray[np.float64], worth: DreamReward, dream: Dream) -> NDArray[np.float64]:
+        if worth.source == "survival":
+            label = (dream.done <= 0.5).astype(np.float64)
+        else:
+            label = told if self._kind == "positive" else 1 - told  # the notebook's head tells of steps without one
+        return np.asarray(worth.gain * label - worth.cost)
+
+
+def world_of(bundle: Bundle) -> World:
+    """The world that a bundle was trained on."""
+    return find_task(bundle.manifest.task).world_of(Assignment.of(bundle.manifest.task, bundle))
 
 
 def check_temperature(temperature: float) -> None:

@@ -13,8 +13,8 @@ from dreamfleet.common.errors import BundleError, DatasetError, JournalError
 from dreamfleet.common.runs import RunFolder, open_run
 from dreamfleet.worker.dream.daydream import can_dream
 from dreamfleet.worker.inspection import curves, memory, vision
-from dreamfleet.worker.inspection.drive import Drive, DriveConfig, drive
 from dreamfleet.worker.inspection.page import Page
+from dreamfleet.worker.inspection.rollout import DriveConfig, EncodedRollout, drive
 from dreamfleet.worker.inspection.section import Section
 from dreamfleet.worker.worldmodel.inference import Decoder
 
@@ -89,7 +89,7 @@ def sections_of(subject: Subject, config: DriveConfig, data: Path | None) -> Ite
         yield from training
 
 
-def _dreams(bundle: Bundle, driven: Drive, decoder: Decoder) -> Iterator[Section]:
+def _dreams(bundle: Bundle, driven: EncodedRollout, decoder: Decoder) -> Iterator[Section]:
     if not can_dream(bundle):
         text = "This bundle is from before dreams; build it again with `dreamfleet bundle` to see one."
         yield Section("dream", "A dream beside the drive", text)

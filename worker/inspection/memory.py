@@ -9,7 +9,7 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.worker.dream.noise import Draw, Noise
 from dreamfleet.worker.dream.world import DreamWorld, check_temperature
 from dreamfleet.worker.inspection.charts import FONT, heat, new_figure, picture_grid, png
-from dreamfleet.worker.inspection.drive import Drive
+from dreamfleet.worker.inspection.rollout import EncodedRollout
 from dreamfleet.worker.inspection.section import Section
 from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, RewardLabel
 
@@ -18,7 +18,7 @@ STEPS = (0, 5, 10, 20, 50, 100)  # shown of a dream
 TEMPERATURES = (0.5, 1.0)
 
 
-def states_of(bundle: Bundle, drive: Drive) -> Floats:
+def states_of(bundle: Bundle, drive: EncodedRollout) -> Floats:
     """The recurrent state `(T, 1, state)` before each step of the drive, as a controller would have it."""
     model, label = DreamStep(bundle), RewardLabel(bundle)
     state, states = model.zero_state(1), []
@@ -29,7 +29,7 @@ def states_of(bundle: Bundle, drive: Drive) -> Floats:
     return np.stack(states)
 
 
-def dream_latents(bundle: Bundle, drive: Drive, temperature: float, seed: int = 0) -> Floats:
+def dream_latents(bundle: Bundle, drive: EncodedRollout, temperature: float, seed: int = 0) -> Floats:
     """The latents `(T, latent)` dreamt from the drive's first one under its actions."""
     check_temperature(temperature)
     model = DreamStep(bundle)
@@ -43,7 +43,7 @@ def dream_latents(bundle: Bundle, drive: Drive, temperature: float, seed: int = 
     return np.stack(latents)
 
 
-def dream_beside(bundle: Bundle, drive: Drive, decoder: Decoder) -> Section:
+def dream_beside(bundle: Bundle, drive: EncodedRollout, decoder: Decoder) -> Section:
     """Frames of the drive and of dreams under the same actions."""
     steps = [step for step in STEPS if step < len(drive)]
     rows = [("drive", drive.picture[steps]), ("decoded", decoder.decode(drive.mu[steps]))]
@@ -58,7 +58,7 @@ def dream_beside(bundle: Bundle, drive: Drive, decoder: Decoder) -> Section:
     )  # fmt: skip
 
 
-def rewards(bundle: Bundle, drive: Drive) -> Section:
+def rewards(bundle: Bundle, drive: EncodedRollout) -> Section:
     """Predicted and real reward of each step, and their sums."""
     world, zeros = DreamWorld(bundle, 1.0), np.zeros((1, bundle.manifest.latent), np.float32)
     awake = [
@@ -83,7 +83,7 @@ def rewards(bundle: Bundle, drive: Drive) -> Section:
     )  # fmt: skip
 
 
-def _dreamt_rewards(world: DreamWorld, drive: Drive) -> list[float]:
+def _dreamt_rewards(world: DreamWorld, drive: EncodedRollout) -> list[float]:
     noise, latent, state, told = Noise(0, world.chance), drive.mu[:1], world.begin(1), []
     for action in drive.action:
         moment = world.imagine(latent, action[None], state, noise.next())
@@ -92,7 +92,7 @@ def _dreamt_rewards(world: DreamWorld, drive: Drive) -> list[float]:
     return told
 
 
-def attention(bundle: Bundle, drive: Drive) -> Section | None:
+def attention(bundle: Bundle, drive: EncodedRollout) -> Section | None:
     """Where the model looks at each step of the drive; `None` without a window."""
     model = DreamStep(bundle)
     if not model.attends:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dreamfleet.worker.inspection.charts import FONT, heat, new_figure, picture_grid, png
-from dreamfleet.worker.inspection.drive import Drive
+from dreamfleet.worker.inspection.rollout import EncodedRollout
 from dreamfleet.worker.inspection.section import Section
 from dreamfleet.worker.worldmodel.inference import Decoder
 
@@ -13,7 +13,7 @@ SHOWN = 8  # pictures a row, latents a table
 TRAVERSED = np.linspace(-3, 3, 7)
 
 
-def reconstructions(drive: Drive, decoder: Decoder) -> Section:
+def reconstructions(drive: EncodedRollout, decoder: Decoder) -> Section:
     """Pictures of the drive, and what the decoder makes of their means."""
     steps = np.linspace(0, len(drive) - 1, SHOWN).astype(int)
     decoded = decoder.decode(drive.mu)
@@ -28,7 +28,7 @@ def reconstructions(drive: Drive, decoder: Decoder) -> Section:
     )  # fmt: skip
 
 
-def traversals(drive: Drive, decoder: Decoder) -> Section:
+def traversals(drive: EncodedRollout, decoder: Decoder) -> Section:
     """The most active latents, one moved at a time around a picture of the drive."""
     step = drive.richest
     base = drive.mu[step]
@@ -45,7 +45,7 @@ def traversals(drive: Drive, decoder: Decoder) -> Section:
     )  # fmt: skip
 
 
-def moments(drive: Drive) -> Section:
+def moments(drive: EncodedRollout) -> Section:
     """Mean and log variance of every latent over the drive."""
     order, height = drive.most_active, 1.2 + 0.075 * drive.mu.shape[1]
     figure, axes = new_figure(2 * height, 2, sharex=True)

@@ -1,20 +1,18 @@
-"""The episode loop, blind to what the task is."""
+"""The one episode loop: whoever scores, judges, records, collects or inspects goes through it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.worker.scoring.rollout import Drive
+from dreamfleet.worker.scoring.rollout import Rollout
 from dreamfleet.worker.tasks.api import Policy, Score
-
-IDLE_COST = 0.1  # CarRacing's own cost of a step
 
 
 @dataclass(frozen=True)
@@ -24,45 +22,78 @@ class Course:
     seed: int
     horizon: int
     patience: int = 0
+    idle_cost: float = 0.0  # the world's: charged for each step that is cut off
 
 
-def rollout(
+class Moment(NamedTuple):
+    """One step that was made."""
+
+    seen: Any  # the observation before the action
+    action: Any
+    reward: float
+    step: int  # from 1
+    ended: bool  # the environment says so
+    cut: bool  # patience is at its end
+
+
+Begin = Callable[[gymnasium.Env[Any, Any], Any], Any]
+"""Changes an environment that was just reset, and its first observation; returns the new one."""
+
+
+def play(
+    environment: gymnasium.Env[Any, Any], policy: Policy, course: Course, begin: Begin | None = None
+) -> Iterator[Moment]:
+    """Make the episode's steps one by one, under a policy that has begun.
+
+    It is over where the environment says so, after `horizon` steps, or after `patience` steps without a positive
+    reward.
+    """
+    observation, _ = environment.reset(seed=course.seed)
+    if begin is not None:
+        observation = begin(environment, observation)
+    # Of a `Rewarded` policy; to ask `isinstance` of a protocol takes 70 microseconds, as long as some tasks' steps.
+    tell: Callable[[float], None] | None = getattr(policy, "reward", None)
+    idle, over = 0, False
+    for step in range(1, course.horizon + 1):
+        seen, action = observation, policy.act(observation)
+        observation, given, terminated, truncated, _ = environment.step(action)
+        reward = float(given)
+        if tell is not None:
+            tell(reward)
+        idle = 0 if reward > 0 else idle + 1
+        ended = bool(terminated or truncated)
+        over = not ended and 0 < course.patience <= idle
+        yield Moment(seen, action, reward, step, ended, over)
+        if ended or over:
+            return
+
+
+def score(
     environment: gymnasium.Env[Any, Any],
     policy: Policy,
     parameters: NDArray[np.float32],
     course: Course,
     on_step: Callable[[int], None] = lambda _steps: None,
-    drive: Drive | None = None,
+    rollout: Rollout | None = None,
 ) -> Score:
-    """Drive one episode; the sum of its rewards, in step order, in double precision. `drive` keeps what happens.
+    """The episode's fitness: the sum of its rewards, in step order, in double precision. `rollout` keeps what happens.
 
-    An episode cut after `patience` steps without a positive reward is charged what standing still would have cost up
-    to the horizon, so that cut and uncut candidates compare.
+    An episode that patience cuts is charged what standing still would have cost up to the horizon, so that cut and
+    uncut candidates compare.
     """
     if not np.isfinite(parameters).all():
         raise ValueError("the controller's parameters hold NaN or infinity")
-    observation, _ = environment.reset(seed=course.seed)
     policy.begin(parameters)
-    # Of a `Rewarded` policy; to ask `isinstance` of a protocol takes 70 microseconds, as long as some tasks' steps.
-    tell: Callable[[float], None] | None = getattr(policy, "reward", None)
-    fitness, idle, steps, ended = 0.0, 0, 0, False
-    while steps < course.horizon and not ended:
-        action, seen = policy.act(observation), observation
-        observation, reward, terminated, truncated, _ = environment.step(action)
-        if drive is not None:
-            drive.add(seen, action, float(reward))
-        fitness += float(reward)
-        if tell is not None:
-            tell(float(reward))
-        steps += 1
+    fitness, steps = 0.0, 0
+    for moment in play(environment, policy, course):
+        fitness += moment.reward
+        steps = moment.step
+        if rollout is not None:
+            rollout.add(moment.seen, moment.action, moment.reward)
+            rollout.ended = moment.ended
         on_step(steps)
-        ended = bool(terminated or truncated)
-        idle = 0 if float(reward) > 0 else idle + 1
-        if course.patience and idle >= course.patience and not ended:
-            fitness -= IDLE_COST * (course.horizon - steps)
-            break
-    if drive is not None:
-        drive.ended = ended
+        if moment.cut:
+            fitness -= course.idle_cost * (course.horizon - steps)
     if not math.isfinite(fitness):
         raise ValueError("the episode's rewards do not add up to a number")
     return Score(fitness, steps)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class Drive:
-    """Grows step by step; equal drives give equal files."""
+class Rollout:
+    """Grows step by step; equal rollouts give equal files."""
 
     def __init__(self, driver: str, preprocessing: str) -> None:
         self.ended = False  # whether the environment ended it

@@ -9,31 +9,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.messages import Kind, TaskSpec
-from dreamfleet.worker.scoring.episode import Course, rollout
-from dreamfleet.worker.scoring.rollout import Drive
-from dreamfleet.worker.tasks.api import Batch, Batched, Score, find_task
+from dreamfleet.worker.scoring.episode import Course, score
+from dreamfleet.worker.scoring.rollout import Rollout
+from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Score
+from dreamfleet.worker.tasks.registry import find_task
 
-DRIVER = "controller"  # as a kept drive names who drove
-FULL_EPISODE = 10**6  # steps: the environment's own limit ends it
+DRIVER = "controller"  # as a kept rollout names who drove
 
 
 class Scorer:
-    """Scores a slot's jobs; a `judge` does so in the environment that reported scores come from."""
+    """Scores a slot's jobs; a `judge` does so in the environment that reported scores come from.
 
-    def __init__(self, spec: TaskSpec, bundle: Bundle, *, judge: bool = False) -> None:
+    >>> from dreamfleet.common.bundle import find_bundle
+    >>> bundle = find_bundle("tiny")
+    >>> scorer = Scorer(TaskSpec("car-racing", bundle.sha256, horizon=100, patience=0), bundle)  # doctest: +SKIP
+    >>> scorer.score("score", np.zeros(867, np.float32), seed=2**20)  # doctest: +SKIP
+    """
+
+    def __init__(self, spec: TaskSpec, bundle: Bundle | None = None, *, judge: bool = False) -> None:
         task = find_task(spec.task)
-        fitting = bundle.under(spec.controller)
+        assignment = Assignment(spec, None if bundle is None else bundle.under(spec.controller))
+        self.world = task.world_of(assignment)
+        if self.world.version != spec.version:
+            raise UsageError(
+                f"the run scores in version {spec.version} of task {spec.task}, here is version {self.world.version}: "
+                "install the package version that the run was begun with"
+            )
         self._spec = spec
         self._batch_at: Callable[[float | None], Batch] | None = None
         if isinstance(task, Batched) and not judge:
             make = task.make_batch
             # One is kept: a run's temperature is raised now and then, and making a batch takes milliseconds.
-            self._batch_at = lru_cache(maxsize=1)(lambda temperature: make(fitting, spec.at(temperature)))
+            self._batch_at = lru_cache(maxsize=1)(lambda temperature: make(assignment.at(temperature)))
             self._batch_at(None)  # so that what is wrong with it shows at once
-        self._environment = task.make_judge(fitting) if judge else task.make_environment(fitting)
-        self._policy = task.make_policy(fitting)
-        self._preprocessing = bundle.manifest.preprocessing
+        self._environment = task.make_judge(assignment) if judge else task.make_environment(assignment)
+        self._policy = task.make_policy(assignment)
+        self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,
@@ -45,7 +58,7 @@ class Scorer:
         """
         if kind == "score" and self._batch_at is not None:
             return self._batch_at(temperature).score([(parameters, seed)], on_step)[0]
-        return rollout(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
+        return score(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
 
     def score_all(
         self, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]], on_step: Callable[[int], None],
@@ -64,11 +77,11 @@ class Scorer:
 
     def collect(
         self, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None
-    ) -> tuple[Score, Drive]:
+    ) -> tuple[Score, Rollout]:
         """An episode as candidates drive it, and what happened in it, failures included."""
-        drive = Drive(DRIVER, self._preprocessing)
+        rollout = Rollout(DRIVER, self._preprocessing)
         course = self.course("collect", seed)
-        return rollout(self._environment, self._policy, parameters, course, on_step, drive), drive
+        return score(self._environment, self._policy, parameters, course, on_step, rollout), rollout
 
     @property
     def drawn_by(self) -> str:
@@ -78,8 +91,8 @@ class Scorer:
     def course(self, kind: Kind, seed: int) -> Course:
         """The episode that a job of this kind and seed is."""
         if kind == "evaluate":
-            return Course(seed, FULL_EPISODE)
-        return Course(seed, self._spec.horizon, self._spec.patience)
+            return Course(seed, self.world.horizon)
+        return Course(seed, self._spec.horizon, self._spec.patience, self.world.idle_cost)
 
     def close(self) -> None:
         """Release the environment."""

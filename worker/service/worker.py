@@ -31,7 +31,7 @@ from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.outbox import Outbox
 from dreamfleet.worker.service.slot import Slot, SlotEvent
 from dreamfleet.worker.service.uploads import PACE, Uploads
-from dreamfleet.worker.tasks.api import find_task, known_tasks
+from dreamfleet.worker.tasks.registry import find_task, known_tasks
 
 log = logging.getLogger(__name__)
 RETRY = 1.0  # seconds between attempts to connect or join

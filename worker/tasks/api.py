@@ -1,30 +1,53 @@
-"""What a task is: an environment, and what a controller sees of it and may do.
+"""What a task is: an environment, what a controller sees of it and may do, and all that the rest must know of a world.
 
-The only module that a third party imports. Register a task under the entry-point group `dreamfleet.tasks`; the dream
-and the real track satisfy the same protocol, so that no caller can tell them apart.
+The only module that a third party imports; docs/tasks.md has an example. The dream, the real track and any gymnasium
+environment satisfy the same contract, so that no caller can tell them apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from importlib import import_module
-from importlib.metadata import entry_points
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.actions import STEERING_GAS_BRAKE, Actions, Continuous, Discrete
 from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.tasks import Description
+from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
-GROUP = "dreamfleet.tasks"
+__all__ = [
+    "STEERING_GAS_BRAKE",
+    "Actions",
+    "Assignment",
+    "Batch",
+    "Batched",
+    "Collected",
+    "Continuous",
+    "Description",
+    "Discrete",
+    "DreamReward",
+    "Driver",
+    "Episode",
+    "Policy",
+    "Preprocessing",
+    "Rewarded",
+    "Score",
+    "Task",
+    "World",
+]
+
+ENVIRONMENTS_OWN = 10**6  # steps: the environment's own limit ends an episode
 
 
 class Policy(Protocol):
-    """A frozen world model under one controller."""
+    """What turns observations into actions, under one controller."""
 
     def begin(self, parameters: NDArray[np.float32]) -> None:
         """Begin an episode with this controller's flat vector."""
@@ -52,20 +75,99 @@ Episode = tuple[NDArray[np.float32], int]
 """A candidate's flat vector and the seed of its episode."""
 
 
-class Task(Protocol):
-    """One thing to score in."""
+@dataclass(frozen=True)
+class DreamReward:
+    """What a dreamt step is worth where the MDN-RNN foretells no reward itself: `gain * told - cost`.
+
+    `told` is what the head for the reward's label tells, or, of `survival`, whether the dream goes on.
+    """
+
+    gain: float
+    cost: float = 0.0
+    source: Literal["label", "survival"] = "label"
+
+
+@dataclass(frozen=True)
+class World:
+    """All that the rest of the system must know of a world."""
+
+    actions: Actions
+    packages: tuple[str, ...] = ("numpy", "gymnasium")  # distributions whose versions a fitness may depend on
+    idle_cost: float = 0.0  # what a step without a reward costs: charged for steps that `patience` cuts off
+    horizon: int = ENVIRONMENTS_OWN  # steps of a judged episode at most
+    version: int = 1  # to be raised whenever the same parameters and seeds give another fitness
+    frames_per_second: int = 30  # of a video
+    action_names: tuple[str, ...] = ()  # of continuous actions, for people
+    dream_reward: DreamReward | None = None  # of worlds that world models are trained on
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """What is to be scored: the run's specification and, for tasks that need one, its world model."""
+
+    spec: TaskSpec
+    bundle: Bundle | None = None
+
+    @classmethod
+    def of(cls, task: str, bundle: Bundle) -> Assignment:
+        """A task on a world model outside of any run."""
+        return cls(TaskSpec(task, bundle.sha256, ENVIRONMENTS_OWN, 0), bundle)
+
+    @property
+    def world_model(self) -> Bundle:
+        """The bundle, under the run's controllers; `BundleError` where there is none."""
+        if self.bundle is None:
+            raise BundleError(f"task {self.spec.task} needs a world model: give one with --bundle")
+        return self.bundle.under(self.spec.controller) if self.spec.controller else self.bundle
+
+    @property
+    def controller(self) -> ControllerShape:
+        """The controllers that are scored."""
+        if self.spec.controller is None:
+            return self.world_model.controller_shape
+        return self.spec.controller
+
+    def at(self, temperature: float | None) -> Assignment:
+        """The same at another temperature; `None`: at its own."""
+        return replace(self, spec=self.spec.at(temperature))
+
+
+class Task:
+    """One thing to score in; what is not told here is refused by name when the task is looked up.
+
+    A subclass gives `name`, `world` and `make_environment`. Its policy is a linear or hidden
+    controller on the flat observation unless `make_policy` says otherwise.
+    """
 
     name: str
-    width: int  # episodes that a slot scores at once
+    width: ClassVar[int] = 1  # episodes that a slot scores at once
+    world: World
 
-    def make_environment(self, bundle: Bundle) -> gymnasium.Env[Any, Any]:
-        """A new environment; its observations are what the bundle's policy takes."""
+    def world_of(self, assignment: Assignment) -> World:  # noqa: ARG002 - a dream asks its bundle
+        """The world that is scored in."""
+        return self.world
 
-    def make_judge(self, bundle: Bundle) -> gymnasium.Env[Any, Any]:
-        """The environment that reported scores come from; the same as the other where there is no second one."""
+    def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
+        """A new environment; its observations are what the policy takes."""
+        raise NotImplementedError
 
-    def make_policy(self, bundle: Bundle) -> Policy:
-        """The policy of a bundle; `BundleError` if the bundle is of another task."""
+    def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+        """The environment that reported scores and videos come from; the same where there is no second one."""
+        if render_mode is not None:
+            raise UsageError(f"task {self.name} draws no pictures: its make_judge takes no render_mode")
+        return self.make_environment(assignment)
+
+    def make_policy(self, assignment: Assignment) -> Policy:
+        """What drives; `BundleError` if the bundle is of another task."""
+        return FlatPolicy(assignment.controller, self.world_of(assignment).actions)
+
+
+@runtime_checkable
+class Describing(Protocol):
+    """A task that needs no bundle: it says itself how large its controllers are."""
+
+    def describe(self, options: Mapping[str, Any]) -> Description:
+        """What a new run freezes; `options` are the run's own for the task, `UsageError` for one it does not know."""
 
 
 class Batch(Protocol):
@@ -79,29 +181,39 @@ class Batch(Protocol):
 class Batched(Protocol):
     """A task that scores candidates in batches, beside its environment, in which its means are evaluated."""
 
-    def make_batch(self, bundle: Bundle, spec: TaskSpec) -> Batch:
+    def make_batch(self, assignment: Assignment) -> Batch:
         """What scores candidates; `BundleError` if the bundle has no such thing.
 
-        Called again whenever `spec.temperature` changes, which a run with `--heat` raises.
+        Called again whenever the specification's temperature changes, which a run with `--heat` raises.
         """
 
 
-def known_tasks() -> tuple[str, ...]:
-    """Names of the registered tasks."""
-    return tuple(sorted(point.name for point in entry_points(group=GROUP)))
+@dataclass(frozen=True)
+class Preprocessing:
+    """One way from an environment's observation to the picture that a world model sees."""
+
+    name: str  # in bundles' manifests and in recorded rollouts
+    size: int  # height and width of its pictures
+    picture: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]  # to `(size, size, 3)`, both uint8
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Height, width and channels of its pictures."""
+        return self.size, self.size, 3
 
 
-def find_task(name: str) -> Task:
-    """A registered task by name, or any as `module:attribute`; `UsageError` lists the registered ones."""
-    for point in entry_points(group=GROUP):
-        if point.name == name:
-            registered: Task = point.load()()
-            return registered
-    module, _, attribute = name.partition(":")
-    if not attribute:
-        raise UsageError(f"unknown task {name!r}: known are {', '.join(known_tasks()) or 'none'}")
-    try:
-        task: Task = getattr(import_module(module), attribute)()
-    except (ImportError, AttributeError) as error:
-        raise UsageError(f"task {name!r} cannot be loaded: {error}") from error
-    return task
+@runtime_checkable
+class Collected(Protocol):
+    """A task whose world rollouts are recorded in and world models are trained on."""
+
+    name: str
+    world: World
+    preprocessings: Mapping[str, Preprocessing]
+    drivers: Mapping[str, Callable[[np.random.Generator], Driver]]
+    """Random drivers by name, in the order in which collecting takes them in turn."""
+
+    def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
+        """An environment that observes the pictures of one of its preprocessings."""
+
+    def begin_anywhere(self, environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:
+        """Move a reset environment to somewhere else in its world; what is observed there."""

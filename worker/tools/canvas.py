@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pygame
@@ -11,7 +12,9 @@ from numpy.typing import NDArray
 SIDE = 192  # of the small pictures: three times or twice their size
 MARGIN, LABEL, GAP = 8, 22, 10
 BACKGROUND, INK, FAINT = (18, 20, 24), (235, 235, 235), (150, 155, 165)
-BARS = (("steer", (120, 170, 255)), ("gas", (110, 210, 120)), ("brake", (240, 110, 100)))
+PEDALS = ("gas", "brake")
+COLOURS = ((120, 170, 255), (110, 210, 120), (240, 110, 100))
+MOST_BARS, BAR, NARROWEST = 3, 122, 600  # bars of actions, pixels of one, and of a world's picture
 
 Frame = NDArray[np.uint8]
 Corner = tuple[int, int]
@@ -19,18 +22,26 @@ Corner = tuple[int, int]
 
 @dataclass(frozen=True)
 class Layout:
-    """How large the track is drawn, so that the small pictures beside it have room."""
+    """How large the world is drawn, and whether the small pictures have room beside it."""
 
     track: tuple[int, int]
+    column: bool = True
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of a frame."""
-        return self.track[0] + SIDE + 32, self.track[1] + 80
+        """Width and height of a frame; both even, as the codec wants."""
+        return self.track[0] + (SIDE + 32 if self.column else 2 * MARGIN), self.track[1] + 80
 
 
 AWAKE = Layout((600, 400))  # two small pictures
 DREAMING = Layout((900, 600))  # three
+
+
+def plain_layout(picture: Frame) -> Layout:
+    """A world's picture alone, large enough for the words below it."""
+    height, width = picture.shape[:2]
+    scale = max(1.0, NARROWEST / width)
+    return Layout((round(width * scale) // 2 * 2, round(height * scale) // 2 * 2), column=False)
 
 
 @dataclass(frozen=True)
@@ -42,46 +53,70 @@ class Dreamt:
 
 
 @dataclass(frozen=True)
+class Mind:
+    """What a world model sees, makes of it, and dreams."""
+
+    seen: Frame
+    decoded: Frame
+    dreamt: Dreamt | None = None
+
+
+@dataclass(frozen=True)
 class Moment:
     """One step of the drive."""
 
     track: Frame
-    seen: Frame
-    decoded: Frame
-    action: NDArray[np.float32]
+    action: NDArray[Any]
     step: int
     score: float
-    dreamt: Dreamt | None = None
+    mind: Mind | None = None
 
 
 class Canvas:
     """Lays a moment out as one frame."""
 
-    def __init__(self, seed: int, layout: Layout = AWAKE) -> None:
+    def __init__(self, seed: int, layout: Layout = AWAKE, actions: tuple[str, ...] = ()) -> None:
+        """`actions` names what the bars show."""
         pygame.font.init()
         self._seed = seed
         self._layout = layout
+        self._actions = actions
         self._large = pygame.font.Font(None, 30)
         self._small = pygame.font.Font(None, 22)
         self._surface = pygame.Surface(layout.size)
 
     def draw(self, moment: Moment) -> Frame:
         """The frame `(height, width, 3)`."""
-        width, height = self._layout.track
+        height = self._layout.track[1]
         self._surface.fill(BACKGROUND)
         self._picture(moment.track, (MARGIN, MARGIN), self._layout.track, smooth=True)
-        column = [("what the model sees", moment.seen), ("what it decodes", moment.decoded)]
-        if moment.dreamt is not None:
-            column.append((f"dreaming since step {moment.dreamt.since}", moment.dreamt.picture))
+        if moment.mind is not None:
+            self._draw_mind(moment.mind)
+        self._text(f"score {moment.score:7.1f}", (12, height + 24), self._large, INK)
+        self._text(f"step {moment.step}   seed {self._seed}", (12, height + 52), self._small, FAINT)
+        self._draw_action(moment.action)
+        return pixels(self._surface)
+
+    def _draw_mind(self, mind: Mind) -> None:
+        column = [("what the model sees", mind.seen), ("what it decodes", mind.decoded)]
+        if mind.dreamt is not None:
+            column.append((f"dreaming since step {mind.dreamt.since}", mind.dreamt.picture))
         for row, (label, picture) in enumerate(column):
-            left, top = width + 20, MARGIN + row * (LABEL + SIDE + GAP)
+            left, top = self._layout.track[0] + 20, MARGIN + row * (LABEL + SIDE + GAP)
             self._text(label, (left, top), self._small, FAINT)
             self._picture(picture, (left, top + LABEL), (SIDE, SIDE))
-        self._text(f"score {moment.score:7.1f}", (12, height + 24), self._large, INK)
-        self._text(f"step {moment.step}   track {self._seed}", (12, height + 52), self._small, FAINT)
-        for index, ((name, colour), value) in enumerate(zip(BARS, moment.action, strict=True)):
-            self._bar(name, colour, float(value), (width - 350 + index * 122, height + 26))
-        return pixels(self._surface)
+
+    def _draw_action(self, action: NDArray[Any]) -> None:
+        """Bars of continuous actions, as many as have room; a discrete one by its number."""
+        width, height = self._layout.track
+        if action.dtype.kind in "iu":
+            self._text(f"action {int(action[0])}", (width - BAR, height + 26), self._small, FAINT)
+            return
+        shown = action[:MOST_BARS]
+        names = self._actions or tuple(f"action {index}" for index in range(len(shown)))
+        for index, (name, value) in enumerate(zip(names, shown, strict=False)):
+            corner = width + 16 - (len(shown) - index) * BAR, height + 26
+            self._bar(name, COLOURS[index], float(value), corner)
 
     def _picture(self, picture: Frame, corner: Corner, size: tuple[int, int], *, smooth: bool = False) -> None:
         """The small pictures keep their pixels' edges; the track is a painting."""
@@ -93,13 +128,14 @@ class Canvas:
         self._surface.blit(font.render(text, True, colour), corner)
 
     def _bar(self, name: str, colour: tuple[int, int, int], value: float, corner: Corner) -> None:
-        """A bar from its middle for steering, from its left for a pedal."""
+        """A bar from its middle; of a pedal, from its left."""
         left, top = corner
-        self._text(f"{name} {value:+.2f}" if name == "steer" else f"{name} {value:.2f}", corner, self._small, FAINT)
+        pedal = name in PEDALS
+        self._text(f"{name} {value:.2f}" if pedal else f"{name} {value:+.2f}", corner, self._small, FAINT)
         box = pygame.Rect(left, top + 22, 106, 14)
         pygame.draw.rect(self._surface, (45, 48, 56), box)
-        start = box.centerx if name == "steer" else box.left
-        length = round(value * (box.width / 2 if name == "steer" else box.width))
+        start = box.left if pedal else box.centerx
+        length = round(float(np.clip(value, -1, 1)) * (box.width if pedal else box.width / 2))
         pygame.draw.rect(self._surface, colour, (min(start, start + length), box.top, abs(length), box.height))
 
 

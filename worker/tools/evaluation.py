@@ -21,6 +21,7 @@ from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.threads import pin_thread_pools
 from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tasks.api import ENVIRONMENTS_OWN
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,13 @@ class Evaluated:
         return float(np.std(self.scores))
 
 
-def bundle_for(controller: Controller, named: str | None, beside: Path | None = None) -> Bundle:
-    """The world model that a controller was evolved with: as named, beside the controller, cached or shipped."""
+def bundle_for(controller: Controller, named: str | None, beside: Path | None = None) -> Bundle | None:
+    """The world model that a controller was evolved with: as named, beside the controller, cached or shipped.
+
+    `None` for a task that needs none.
+    """
+    if not controller.bundle:
+        return None
     if named is not None:
         bundle = find_bundle(named)
     elif beside is not None and beside.exists():
@@ -57,13 +63,16 @@ def bundle_for(controller: Controller, named: str | None, beside: Path | None = 
     return bundle.under(controller.shape)
 
 
-def evaluate(controller: Controller, bundle: Bundle, seeds: tuple[int, ...], jobs: int) -> Iterator[tuple[int, float]]:
+def evaluate(
+    controller: Controller, bundle: Bundle | None, seeds: tuple[int, ...], jobs: int
+) -> Iterator[tuple[int, float]]:
     """Drive one whole episode a seed in `jobs` processes; yields (seed, score) as each ends."""
     pin_thread_pools()
-    spec = TaskSpec(controller.task, bundle.sha256, horizon=1000, patience=0, controller=bundle.controller_shape)
+    spec = spec_for(controller, bundle)
     pool = ProcessPoolExecutor(min(jobs, len(seeds)), get_context("spawn"), _start_process)
     try:
-        drives = [pool.submit(_drive, spec, bundle.path, controller.parameters, seed) for seed in seeds]
+        path = bundle.path if bundle else None
+        drives = [pool.submit(_drive, spec, path, controller.parameters, seed) for seed in seeds]
         for drive in as_completed(drives):
             yield drive.result()
     except BrokenProcessPool as error:
@@ -72,16 +81,24 @@ def evaluate(controller: Controller, bundle: Bundle, seeds: tuple[int, ...], job
         pool.shutdown(cancel_futures=True)
 
 
+def spec_for(controller: Controller, bundle: Bundle | None) -> TaskSpec:
+    """What a controller is judged in: whole episodes of its own task."""
+    return TaskSpec(
+        controller.task, bundle.sha256 if bundle else "", horizon=ENVIRONMENTS_OWN, patience=0,
+        controller=controller.shape, options=controller.options, version=controller.version,
+    )  # fmt: skip
+
+
 def _start_process() -> None:
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches the whole group: end without a traceback
 
 
-def _drive(spec: TaskSpec, bundle: Path, parameters: NDArray[np.float32], seed: int) -> tuple[int, float]:
+def _drive(spec: TaskSpec, bundle: Path | None, parameters: NDArray[np.float32], seed: int) -> tuple[int, float]:
     return seed, _scorer(spec, bundle).score("evaluate", parameters, seed).fitness
 
 
 @cache
-def _scorer(spec: TaskSpec, bundle: Path) -> Scorer:
+def _scorer(spec: TaskSpec, bundle: Path | None) -> Scorer:
     """One a process, made by its first drive, so that whatever is wrong is that drive's error."""
-    return Scorer(spec, Bundle.open(bundle), judge=True)
+    return Scorer(spec, Bundle.open(bundle) if bundle else None, judge=True)

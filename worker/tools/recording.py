@@ -1,4 +1,4 @@
-"""A drive as a video: the track, what the model sees of it, what it makes of that, and what it dreams."""
+"""A drive as a video: the world, what the model sees of it, what it makes of that, and what it dreams."""
 
 from __future__ import annotations
 
@@ -8,70 +8,128 @@ from pathlib import Path
 from typing import Any
 
 import av
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
 
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.worker.car_racing.task import CarRacing
+from dreamfleet.common.errors import DatasetError
 from dreamfleet.worker.dream.daydream import Daydream, DaydreamConfig, can_dream
-from dreamfleet.worker.tools.canvas import AWAKE, DREAMING, Canvas, Dreamt, Layout, Moment
+from dreamfleet.worker.scoring.episode import Course, play
+from dreamfleet.worker.tasks.api import Assignment, World
+from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tools.canvas import AWAKE, DREAMING, Canvas, Dreamt, Layout, Mind, Moment, plain_layout
+from dreamfleet.worker.tools.evaluation import spec_for
 from dreamfleet.worker.worldmodel.inference import Decoder
-
-FRAMES_PER_SECOND = 50  # CarRacing's own
-TASKS = ("car-racing", "dream")  # what was evolved in a dream drives in reality too
 
 
 def record(
-    controller: Controller, bundle: Bundle, seed: int, steps: int, out: Path,
+    controller: Controller, bundle: Bundle | None, seed: int, steps: int, out: Path,
     dreaming: DaydreamConfig | None = None, on_step: Callable[[int], None] = lambda _steps: None,
 ) -> float:  # fmt: skip
-    """Drive one episode in gymnasium's own environment into an mp4; returns its score.
+    """Drive one episode in the task's judge into an mp4; returns its score.
 
-    A bundle that can dream does so beside the drive.
+    A bundle shows what it sees and decodes beside the drive; one that can dream does so too.
     """
-    if controller.task not in TASKS:
-        raise UsageError(f"only {' and '.join(TASKS)} can be recorded, not {controller.task}")
-    task = CarRacing()
-    environment = task.make_judge(bundle, "rgb_array")
-    policy, decoder = task.make_policy(bundle), Decoder(bundle)
-    daydream = None
-    if can_dream(bundle):
-        daydream = Daydream(bundle, controller.parameters, dreaming or DaydreamConfig(seed=seed))
+    task, assignment = find_task(controller.task), Assignment(spec_for(controller, bundle), bundle)
+    world = task.world_of(assignment)
+    environment = task.make_judge(assignment, "rgb_array")
+    policy: Any = task.make_policy(assignment)
     policy.begin(controller.parameters)
-    observation, _ = environment.reset(seed=seed)
-    layout = DREAMING if daydream else AWAKE
-    canvas = Canvas(seed, layout)
-    score, step, ended = 0.0, 0, False
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        container = av.open(str(out), "w")
-    except OSError as error:
-        raise DatasetError(f"cannot write {out}: {error.strerror}; choose another --out") from error
-    with container:
-        stream = _open_stream(container, layout)
-        while step < steps and not ended:
-            state = policy.state
-            action = policy.act(observation)
-            decoded, dreamt = decoder.decode(policy.latent)[0], None
-            if daydream is not None:
-                imagined = daydream.follow(step, policy.latent, state)
-                dreamt = Dreamt(decoder.decode(imagined)[0], daydream.since)
-            track: Any = environment.render()
-            frame = canvas.draw(Moment(track, observation, decoded, action, step, score, dreamt))
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
-            observation, reward, terminated, truncated, _ = environment.step(action)
-            policy.reward(float(reward))
-            score, step, ended = score + float(reward), step + 1, terminated or truncated
-            on_step(step)
-        container.mux(stream.encode())
+    mind = None if bundle is None else Thoughts(bundle, policy, controller, dreaming or DaydreamConfig(seed=seed))
+    score = 0.0
+    with Film(out, environment, world, seed) as film:
+        actor = Filmed(policy, film, mind)
+        for moment in play(environment, actor, Course(seed, steps)):
+            score += moment.reward
+            on_step(moment.step)
     environment.close()
     return score
 
 
-def _open_stream(container: Any, layout: Layout) -> Any:
-    stream = container.add_stream("libx264", rate=FRAMES_PER_SECOND)
+class Thoughts:
+    """What a world model sees, decodes and dreams while its controller drives."""
+
+    def __init__(self, bundle: Bundle, policy: Any, controller: Controller, dreaming: DaydreamConfig) -> None:
+        self._policy, self._decoder = policy, Decoder(bundle)
+        self._daydream = Daydream(bundle, controller.parameters, dreaming) if can_dream(bundle) else None
+        self.layout = DREAMING if self._daydream else AWAKE
+
+    def after(self, step: int, seen: NDArray[np.uint8], state: Any) -> Mind:
+        """The pictures at a step; `state` is the policy's from before it acted."""
+        decoded, dreamt = self._decoder.decode(self._policy.latent)[0], None
+        if self._daydream is not None:
+            imagined = self._daydream.follow(step, self._policy.latent, state)
+            dreamt = Dreamt(self._decoder.decode(imagined)[0], self._daydream.since)
+        return Mind(seen, decoded, dreamt)
+
+
+class Filmed:
+    """A policy whose every step becomes a frame, as the world looks before the action."""
+
+    def __init__(self, policy: Any, film: Film, thoughts: Thoughts | None) -> None:
+        self._policy, self._film, self._thoughts = policy, film, thoughts
+        self._step, self._score = 0, 0.0
+
+    def begin(self, parameters: NDArray[np.float32]) -> None:
+        """Begin an episode."""
+        self._policy.begin(parameters)
+
+    def act(self, observation: Any) -> Any:
+        """The policy's action, and a frame of it."""
+        state = getattr(self._policy, "state", None)
+        action = self._policy.act(observation)
+        mind, layout = None, None
+        if self._thoughts is not None:
+            mind, layout = self._thoughts.after(self._step, observation, state), self._thoughts.layout
+        self._film.add(action, self._step, self._score, mind, layout)
+        self._step += 1
+        return action
+
+    def reward(self, value: float) -> None:
+        """What the action brought."""
+        self._score += value
+        tell = getattr(self._policy, "reward", None)
+        if tell is not None:
+            tell(value)
+
+
+class Film:
+    """An mp4 that grows frame by frame; what was filmed until an interruption can be played."""
+
+    def __init__(self, out: Path, environment: gymnasium.Env[Any, Any], world: World, seed: int) -> None:
+        self._out, self._environment, self._world, self._seed = out, environment, world, seed
+        self._canvas: Canvas | None = None
+
+    def __enter__(self) -> Film:
+        try:
+            self._out.parent.mkdir(parents=True, exist_ok=True)
+            self._container: Any = av.open(str(self._out), "w")
+        except OSError as error:
+            raise DatasetError(f"cannot write {self._out}: {error.strerror}; choose another --out") from error
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        if self._canvas is not None:
+            self._container.mux(self._stream.encode())
+        self._container.close()
+
+    def add(self, action: Any, step: int, score: float, mind: Mind | None, layout: Layout | None) -> None:
+        """The frame of a step."""
+        picture: Any = self._environment.render()
+        if self._canvas is None:
+            layout = layout or plain_layout(picture)
+            self._canvas = Canvas(self._seed, layout, self._world.action_names)
+            self._stream = _open_stream(self._container, layout, self._world.frames_per_second)
+        frame = self._canvas.draw(Moment(picture, np.atleast_1d(np.asarray(action)), step, score, mind))
+        self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
+
+
+def _open_stream(container: Any, layout: Layout, frames_per_second: int) -> Any:
+    stream = container.add_stream("libx264", rate=frames_per_second)
     stream.width, stream.height = layout.size
     stream.pix_fmt = "yuv420p"
-    stream.time_base = Fraction(1, FRAMES_PER_SECOND)
+    stream.time_base = Fraction(1, frames_per_second)
     stream.options = {"crf": "23", "preset": "veryfast"}
     return stream

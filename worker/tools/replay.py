@@ -30,7 +30,8 @@ def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[Replayed
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.worker.scoring.scorer import Scorer
 
-    scorer = Scorer(spec_of(run, generation), Bundle.open(run.bundle_path))
+    spec = spec_of(run, generation)
+    scorer = Scorer(spec, Bundle.open(run.bundle_path) if spec.bundle else None)
     for result in results:
         yield Replayed(
             result.episode, result.seed, result.fitness, scorer.score("score", parameters, result.seed).fitness

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
+from dreamfleet.common.actions import Continuous
 from dreamfleet.common.bundle import (
     DECODER,
     DREAM,
@@ -27,11 +28,11 @@ from dreamfleet.common.bundle import (
 )
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.fingerprint import package_version
-from dreamfleet.worker.car_racing.preprocessing import preprocessing_to
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.dataset import episodes, load, split
 from dreamfleet.worker.training.encode import ENCODED, encoder_of
+from dreamfleet.worker.training.world import WORLD, find_world, preprocessing_to
 from dreamfleet.worker.worldmodel.export import (
     Weights,
     export_controller,
@@ -91,7 +92,7 @@ def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn:
     preprocessing = preprocessing_to(vae.picture)
     return Manifest(
         name=name,
-        task="car-racing",
+        task=WORLD,
         preprocessing=preprocessing.name,
         picture=preprocessing.shape,
         latent=vae.latent,
@@ -110,15 +111,18 @@ def graphs(
     rnn_config: MDNRNNConfig = REWARDED,
 ) -> dict[str, bytes]:
     """The parts of a new bundle."""
+    actions = find_world().world.actions
+    if not isinstance(actions, Continuous):
+        raise DatasetError(f"world models are built for continuous actions; those of {WORLD} are not")
     buffer = io.BytesIO()
     np.save(buffer, initial)
     return {
         ENCODER: export_encoder(vae, vae_config),
         DECODER: export_decoder(vae, vae_config),
-        POLICY: export_policy(vae, rnn, vae_config, rnn_config),
+        POLICY: export_policy(vae, rnn, vae_config, rnn_config, actions),
         DREAM: export_dream(rnn, rnn_config),
-        LINEAR: export_controller(hidden=False),
-        LAYERED: export_controller(hidden=True),
+        LINEAR: export_controller(actions, hidden=False),
+        LAYERED: export_controller(actions, hidden=True),
         INITIAL: buffer.getvalue(),
     }
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files import write_aside
 from dreamfleet.common.threads import pin_thread_pools
-from dreamfleet.worker.car_racing.check import make_car_racing
-from dreamfleet.worker.car_racing.drivers import DRIVERS
-from dreamfleet.worker.car_racing.preprocessing import preprocessing_to
-from dreamfleet.worker.scoring.rollout import Drive, write_episode
+from dreamfleet.worker.scoring.episode import Course, play
+from dreamfleet.worker.scoring.rollout import Rollout, write_episode
+from dreamfleet.worker.tasks.policy import Driven
 from dreamfleet.worker.training.dataset import check_pictures
+from dreamfleet.worker.training.world import find_world, preprocessing_to
 
 
 @dataclass(frozen=True)
@@ -86,34 +86,19 @@ def _collect_one(task: tuple[Path, CollectConfig, int]) -> int:
 def drive(config: CollectConfig, number: int) -> dict[str, NDArray[Any]]:
     """One episode of T steps: `picture` (T, side, side, 3) before each `action` (T, 3), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
-    name = list(DRIVERS)[number % len(DRIVERS)]
-    driver = DRIVERS[name](random)
+    world = find_world()
+    name = list(world.drivers)[number % len(world.drivers)]
+    policy = Driven(world.drivers[name](random))
     preprocessing = preprocessing_to(config.picture)
-    environment = make_car_racing(preprocessing=preprocessing.name)
-    observation, _ = environment.reset(seed=int(random.integers(2**20, 2**31)))
-    if random.random() < config.anywhere:
-        observation = _put_anywhere(environment, random)
-    kept, idle = Drive(name, preprocessing.name), 0
-    while len(kept) < config.steps and idle < config.patience and not kept.ended:
-        action, seen = driver.act(), observation
-        observation, reward, terminated, truncated, _ = environment.step(action)
-        kept.add(seen, action, float(reward))
-        idle = 0 if float(reward) > 0 else idle + 1
-        kept.ended = bool(terminated or truncated)
+    environment = world.make_recorded(preprocessing.name)
+    course = Course(int(random.integers(2**20, 2**31)), config.steps, config.patience)
+
+    def begin(environment: gymnasium.Env[Any, Any], observation: Any) -> Any:
+        return world.begin_anywhere(environment, random) if random.random() < config.anywhere else observation
+
+    rollout = Rollout(name, preprocessing.name)
+    for moment in play(environment, policy, course, begin):
+        rollout.add(moment.seen, moment.action, moment.reward)
+        rollout.ended = moment.ended
     environment.close()
-    return kept.arrays()
-
-
-def _put_anywhere(environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:
-    """Move the car to a random tile, turned and shifted a little, past the opening's zoom."""
-    from gymnasium.envs.box2d.car_dynamics import Car
-
-    inner: Any = environment.unwrapped
-    _, beta, x, y = inner.track[random.integers(len(inner.track))]
-    shift, turn = random.normal(0, 2.0), random.normal(0, 0.25)
-    inner.car.destroy()
-    inner.car = Car(  # type: ignore[no-untyped-call]
-        inner.world, beta + turn, x + shift * np.cos(beta), y + shift * np.sin(beta)
-    )
-    inner.t = 1.0  # the camera zooms in during the first second
-    return environment.step(np.zeros(3, dtype=np.float32))[0]
+    return rollout.arrays()

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS, preprocessing_to
+from dreamfleet.worker.training.world import find_world, preprocessing_to
 
 POOL_EPISODES = 48  # whose frames are shuffled together
 POOL_FRAMES = 16_000  # of them at most, or one episode: 200 MB of 64x64, 440 MB of 96x96
@@ -81,7 +81,7 @@ def load_pictures(path: Path) -> NDArray[np.uint8]:
     """An episode's pictures `(T, side, side, 3)`; `DatasetError` if they are not what its preprocessing makes."""
     arrays = load(path, "picture", "preprocessing")
     pictures: NDArray[np.uint8] = arrays["picture"]
-    known = PREPROCESSINGS.get(str(arrays["preprocessing"]))
+    known = find_world().preprocessings.get(str(arrays["preprocessing"]))
     if known is None or pictures.shape[1:] != known.shape or not len(pictures):
         raise DatasetError(f"{path} holds pictures of another preprocessing or shape; collect into an empty folder")
     return pictures

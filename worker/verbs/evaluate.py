@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     done = Evaluated(seeds, tuple(scores[seed] for seed in seeds))
     if args.json:
         report = {"mean": done.mean, "std": done.std, "scores": done.scores, "seeds": done.seeds}
-        print(json.dumps({**report, "task": controller.task, "bundle": bundle.sha256, "judge": "gymnasium"}))
+        print(json.dumps({**report, "task": controller.task, "bundle": controller.bundle, "judge": "gymnasium"}))
     else:
         low, high = min(done.scores), max(done.scores)
         print(f"{done.mean:.1f} ± {done.std:.1f} on {len(seeds)} tracks ({low:.0f} to {high:.0f}), judged by gymnasium")

@@ -32,8 +32,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--steps must be at least 2 and --seed at least 0")
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.inspection.drive import DriveConfig
     from dreamfleet.worker.inspection.inspection import find_subject, inspect
+    from dreamfleet.worker.inspection.rollout import DriveConfig
 
     with find_subject(args.subject, args.runs_dir) as subject, progress_bar("inspect", SECTIONS, "sections") as bar:
         page = inspect(subject, args.out, DriveConfig(args.seed, args.steps), args.data, bar.move)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from onnx import TensorProto
 
+from dreamfleet.common.actions import Continuous
 from dreamfleet.worker.worldmodel.graph import GraphBuilder
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.recurrent import Recurrent, Weights, export_dream
@@ -50,30 +51,32 @@ def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
     return graph.build()
 
 
-def export_policy(vae: Weights, rnn: Weights, vae_config: VAEConfig, rnn_config: MDNRNNConfig) -> bytes:
+def export_policy(
+    vae: Weights, rnn: Weights, vae_config: VAEConfig, rnn_config: MDNRNNConfig, actions: Continuous
+) -> bytes:
     """One step: picture, controllers and state to action, next state and latent.
 
     The controller acts on (z_t, h_t), then the MDN-RNN advances on (z_t, a_t). `parameters` (N, size) holds a linear
     controller a row, packed as `common.controller.ControllerShape` says; z is the encoder's mean, h the first columns
     of `state` (N, state).
     """
-    graph, actions = GraphBuilder("policy"), rnn_config.actions
-    size = actions * (rnn_config.latent + rnn_config.hidden + 1)
+    graph, count = GraphBuilder("policy"), rnn_config.actions
+    size = count * (rnn_config.latent + rnn_config.hidden + 1)
     picture = graph.take("picture", TensorProto.UINT8, vae_config.picture, vae_config.picture, 3)
     parameters = graph.take("parameters", TensorProto.FLOAT, size)
     recurrent = Recurrent(graph, graph.take("state", TensorProto.FLOAT, rnn_config.state), rnn, rnn_config)
     latent = _linear(graph, _encode(graph, picture, vae, vae_config), vae, "mu")
-    weights, biases = graph.split(parameters, size - actions, actions)
-    weights = graph.node("Reshape", weights, graph.shape(-1, actions, rnn_config.latent + rnn_config.hidden))
-    action = _squash(graph, _layer(graph, graph.join(latent, recurrent.hidden), weights, biases))
+    weights, biases = graph.split(parameters, size - count, count)
+    weights = graph.node("Reshape", weights, graph.shape(-1, count, rnn_config.latent + rnn_config.hidden))
+    action = _squash(graph, _layer(graph, graph.join(latent, recurrent.hidden), weights, biases), actions)
     recurrent.advance(latent, action)
-    graph.give(action, "action", TensorProto.FLOAT, actions)
+    graph.give(action, "action", TensorProto.FLOAT, count)
     graph.give(recurrent.next_state(), "next_state", TensorProto.FLOAT, rnn_config.state)
     graph.give(latent, "latent", TensorProto.FLOAT, rnn_config.latent)
     return graph.build()
 
 
-def export_controller(*, hidden: bool) -> bytes:
+def export_controller(actions: Continuous, *, hidden: bool) -> bytes:
     """Controllers of any size, one a row: `features` (N, F) to `action` (N, A).
 
     `weights0` (N, A, F) and `biases0` (N, A); with a layer of K units `weights0` (N, K, F), `biases0` (N, K), then
@@ -84,7 +87,7 @@ def export_controller(*, hidden: bool) -> bytes:
     for index, (before, after) in enumerate(pairwise(sizes)):
         weights = graph.take(f"weights{index}", kind, after, before)
         value = _layer(graph, value, weights, graph.take(f"biases{index}", kind, after))
-    graph.give(_squash(graph, value), "action", kind, 3)
+    graph.give(_squash(graph, value, actions), "action", kind, actions.outputs)
     return graph.build()
 
 
@@ -132,9 +135,14 @@ def _layer(graph: GraphBuilder, features: str, weights: str, biases: str) -> str
     return str(graph.node("Tanh", graph.node("Add", graph.node("Squeeze", product, graph.shape(2)), biases)))
 
 
-def _squash(graph: GraphBuilder, squashed: str) -> str:
-    """To CarRacing's ranges: steering as it is; gas (tanh + 1) / 2; brake clip(tanh, 0, 1)."""
-    scale, shift = np.array([1, 0.5, 1], np.float32), np.array([0, 0.5, 0], np.float32)
-    low = np.array([-1, 0, 0], np.float32)
+def _squash(graph: GraphBuilder, squashed: str, actions: Continuous) -> str:
+    """To the world's ranges, as `actions` says; a bound that no output can pass is left out."""
+    scale, shift, low, high = (
+        np.array(each, np.float32) for each in (actions.scale, actions.shift, actions.low, actions.high)
+    )
     moved = graph.node("Add", graph.node("Mul", squashed, graph.constant(scale)), graph.constant(shift))
-    return str(graph.node("Max", moved, graph.constant(low)))
+    if (shift - scale < low).any():
+        moved = graph.node("Max", moved, graph.constant(low))
+    if (shift + scale > high).any():
+        moved = graph.node("Min", moved, graph.constant(high))
+    return str(moved)

@@ -7,8 +7,9 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.worker.dream.batch import Dreamer
 from dreamfleet.worker.dream.environment import CarRacingDream
-from dreamfleet.worker.dream.task import DreamPolicy
-from dreamfleet.worker.scoring.episode import Course, rollout
+from dreamfleet.worker.dream.policy import DreamPolicy
+from dreamfleet.worker.scoring import episode
+from dreamfleet.worker.scoring.episode import Course
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from tests.support.bundles import write_random_bundle
 
@@ -42,7 +43,7 @@ def test_the_environment_dreams_the_same_bits(dreaming, random_bundle):
     environment = CarRacingDream(random_bundle, temperature=1.3, horizon=HORIZON)
     for vector, seed in zip(candidates(random_bundle, 3), (5, 6, 7), strict=True):
         (batched,) = dreaming.score([(vector, seed)])
-        assert rollout(environment, DreamPolicy(random_bundle), vector, Course(seed, HORIZON)) == batched
+        assert episode.score(environment, DreamPolicy(random_bundle), vector, Course(seed, HORIZON)) == batched
 
 
 def test_dropout_is_part_of_the_dream_and_changes_no_promise(tmp_path):
@@ -52,7 +53,7 @@ def test_dropout_is_part_of_the_dream_and_changes_no_promise(tmp_path):
     together = dreamer.score(dreams)
     assert [dreamer.score([dream])[0] for dream in dreams] == together
     assert [
-        rollout(environment, DreamPolicy(bundle), vector, Course(seed, HORIZON)) for vector, seed in dreams
+        episode.score(environment, DreamPolicy(bundle), vector, Course(seed, HORIZON)) for vector, seed in dreams
     ] == together
 
 

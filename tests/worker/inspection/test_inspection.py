@@ -9,9 +9,9 @@ import torch
 from dreamfleet.common.bundle import DREAM, write_bundle
 from dreamfleet.common.errors import BundleError, DatasetError
 from dreamfleet.worker.inspection import curves, memory
-from dreamfleet.worker.inspection.drive import DriveConfig, drive
 from dreamfleet.worker.inspection.inspection import Subject, facts, find_subject, inspect
 from dreamfleet.worker.inspection.page import Page
+from dreamfleet.worker.inspection.rollout import DriveConfig, drive
 from dreamfleet.worker.inspection.section import Section
 from dreamfleet.worker.worldmodel.inference import DreamStep
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNNConfig

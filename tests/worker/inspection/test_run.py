@@ -8,8 +8,8 @@ from dreamfleet.common.runs import CONTROLLER, RunSettings, StoredGeneration, ru
 from dreamfleet.coordinator.evaluation import Evaluation
 from dreamfleet.coordinator.jobs import travelling
 from dreamfleet.coordinator.journal import Journal
-from dreamfleet.worker.inspection.drive import DriveConfig
 from dreamfleet.worker.inspection.inspection import find_subject, inspect
+from dreamfleet.worker.inspection.rollout import DriveConfig
 from tests.support.samples import SPEC
 
 

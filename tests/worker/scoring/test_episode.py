@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from dreamfleet.worker.scoring.episode import Course, rollout
+from dreamfleet.worker.scoring.episode import Course, score
 
 PARAMETERS = np.zeros(3, np.float32)
 
@@ -45,43 +45,43 @@ class Listening(Still):
 
 def test_a_policy_that_listens_hears_every_reward():
     policy = Listening()
-    rollout(Scripted([1.0, 2.0, 3.5]), policy, PARAMETERS, Course(1, 100))
+    score(Scripted([1.0, 2.0, 3.5]), policy, PARAMETERS, Course(1, 100))
     assert policy.heard == [1.0, 2.0, 3.5]
 
 
 def test_fitness_is_the_sum_of_rewards_until_the_end():
-    assert rollout(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 100)) == (
-        rollout(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 3))
+    assert score(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 100)) == (
+        score(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 3))
     )
-    score = rollout(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 100))
-    assert (score.fitness, score.steps) == (6.5, 3)
+    driven = score(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 100))
+    assert (driven.fitness, driven.steps) == (6.5, 3)
 
 
 def test_the_horizon_ends_an_episode():
-    assert rollout(Scripted([1.0] * 10), Still(), PARAMETERS, Course(1, 4)).steps == 4
+    assert score(Scripted([1.0] * 10), Still(), PARAMETERS, Course(1, 4)).steps == 4
 
 
 def test_a_hopeless_episode_is_cut_and_charged_what_standing_still_costs():
-    score = rollout(Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, Course(1, 100, patience=20))
-    whole = rollout(Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, Course(1, 100))
-    assert score.steps == 21
-    assert score.fitness == pytest.approx(whole.fitness)
+    driven = score(Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, Course(1, 100, patience=20, idle_cost=0.1))
+    whole = score(Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, Course(1, 100))
+    assert driven.steps == 21
+    assert driven.fitness == pytest.approx(whole.fitness)
 
 
 def test_reward_restores_patience():
     rewards = ([-0.1] * 9 + [1.0]) * 5
-    assert rollout(Scripted(rewards), Still(), PARAMETERS, Course(1, 100, patience=10)).steps == 50
+    assert score(Scripted(rewards), Still(), PARAMETERS, Course(1, 100, patience=10)).steps == 50
 
 
 def test_steps_are_told_as_they_are_made():
     told = []
-    rollout(Scripted([0.0] * 5), Still(), PARAMETERS, Course(1, 100), told.append)
+    score(Scripted([0.0] * 5), Still(), PARAMETERS, Course(1, 100), told.append)
     assert told == [1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_what_is_no_number_is_an_error_and_no_fitness(value):
     with pytest.raises(ValueError, match="NaN"):
-        rollout(Scripted([1.0]), Still(), np.full(3, value, np.float32), Course(1, 10))
+        score(Scripted([1.0]), Still(), np.full(3, value, np.float32), Course(1, 10))
     with pytest.raises(ValueError, match="add up"):
-        rollout(Scripted([value]), Still(), PARAMETERS, Course(1, 10))
+        score(Scripted([value]), Still(), PARAMETERS, Course(1, 10))

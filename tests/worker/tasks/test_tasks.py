@@ -7,7 +7,8 @@ from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
 from dreamfleet.worker.scoring.scorer import Scorer
-from dreamfleet.worker.tasks.api import find_task, known_tasks
+from dreamfleet.worker.tasks.api import Assignment
+from dreamfleet.worker.tasks.registry import find_task, known_tasks
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support import tasks
@@ -50,8 +51,10 @@ def test_a_bundle_of_another_task_or_of_pictures_that_it_does_not_give_is_refuse
     manifest = Manifest("moon", of, preprocessing, shape, latent=4, hidden=4, actions=3)
     bundle, found = write_bundle(tmp_path / "moon.zip", manifest, parts), find_task(task)
     for make in (found.make_environment, found.make_judge, found.make_policy):
-        with pytest.raises(BundleError, match=f"of task '{of}' and pictures '{preprocessing}'"):
-            make(bundle)
+        asked = task == "dream" and of == "moon"  # the dream asks the bundle's own world
+        says = "unknown task 'moon'" if asked else f"of task '{of}' and pictures '{preprocessing}'"
+        with pytest.raises(UsageError if asked else BundleError, match=says):
+            make(Assignment.of(task, bundle))
 
 
 @pytest.mark.parametrize("preprocessing", [BOX, RAW])
@@ -61,7 +64,8 @@ def test_environment_and_judge_observe_gymnasiums_own_environment_behind_the_bun
     vae = VAEConfig(picture=preprocessing.size, latent=4, channels=(2, 2, 2, 2))
     bundle = write_random_bundle(tmp_path / "b.zip", vae=vae, rnn=MDNRNNConfig(latent=4, hidden=4))
     task, plain = find_task("car-racing"), gymnasium.make("CarRacing-v3")
-    ours = [task.make_environment(bundle), task.make_judge(bundle)]
+    assignment = Assignment.of("car-racing", bundle)
+    ours = [task.make_environment(assignment), task.make_judge(assignment)]
     observed, _ = plain.reset(seed=10_000)
     seen = [each.reset(seed=10_000)[0] for each in ours]
     action = np.array([0.1, 0.5, 0.0], np.float32)
@@ -77,7 +81,7 @@ def test_environment_and_judge_observe_gymnasiums_own_environment_behind_the_bun
 
 
 def test_an_episode_begins_from_nothing_whatever_was_driven_before(random_bundle):
-    policy = find_task("car-racing").make_policy(random_bundle)
+    policy = find_task("car-racing").make_policy(Assignment.of("car-racing", random_bundle))
     random = np.random.default_rng(1)
     parameters = random.normal(size=random_bundle.controller_shape.size).astype(np.float32)
     pictures = random.integers(0, 256, (5, 64, 64, 3), dtype=np.uint8)
@@ -100,7 +104,7 @@ def test_a_job_is_scored_under_the_controller_that_its_run_names(random_bundle):
 
 def test_a_controller_of_another_size_is_refused(random_bundle):
     with pytest.raises(ControllerError, match="15 parameters"):
-        find_task("car-racing").make_policy(random_bundle).begin(np.zeros(15, np.float32))
+        find_task("car-racing").make_policy(Assignment.of("car-racing", random_bundle)).begin(np.zeros(15, np.float32))
 
 
 def test_a_turn_is_scored_at_its_jobs_temperature_as_a_run_of_that_temperature_scores(random_bundle):

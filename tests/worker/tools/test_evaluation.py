@@ -5,8 +5,9 @@ import pytest
 
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, ControllerError, DreamfleetError, UsageError
-from dreamfleet.worker.scoring.episode import Course, rollout
-from dreamfleet.worker.tasks.api import find_task
+from dreamfleet.worker.scoring import episode
+from dreamfleet.worker.scoring.episode import Course
+from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.tools.evaluation import Evaluated, bundle_for, evaluate
 from tests.support import tasks
 
@@ -26,7 +27,7 @@ def controller(random_bundle):
 def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
     task = find_task(tasks.JUDGED)
     alone = {
-        seed: rollout(
+        seed: episode.score(
             task.make_judge(None), task.make_policy(None), controller().parameters, Course(seed, 10**6)
         ).fitness
         for seed in SEEDS

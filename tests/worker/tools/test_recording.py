@@ -7,10 +7,12 @@ import pytest
 from dreamfleet.common.bundle import DREAM, write_bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import DreamfleetError, UsageError
-from dreamfleet.worker.scoring.episode import Course, rollout
-from dreamfleet.worker.tasks.api import find_task
+from dreamfleet.worker.scoring import episode
+from dreamfleet.worker.scoring.episode import Course
+from dreamfleet.worker.tasks.api import Assignment
+from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.tools.canvas import AWAKE, DREAMING
-from dreamfleet.worker.tools.recording import FRAMES_PER_SECOND, record
+from dreamfleet.worker.tools.recording import record
 
 SEED, STEPS = 10_003, 8
 
@@ -25,16 +27,16 @@ def controller(random_bundle):
 def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_bundle, tmp_path):
     told = []
     score = record(controller, random_bundle, SEED, STEPS, tmp_path / "new" / "drive.mp4", on_step=told.append)
-    task = find_task("car-racing")
-    judge = task.make_judge(random_bundle)
-    driven = rollout(judge, task.make_policy(random_bundle), controller.parameters, Course(SEED, STEPS))
+    task, assignment = find_task("car-racing"), Assignment.of("car-racing", random_bundle)
+    judge = task.make_judge(assignment)
+    driven = episode.score(judge, task.make_policy(assignment), controller.parameters, Course(SEED, STEPS))
     judge.close()
     assert score == driven.fitness
     assert told == list(range(1, STEPS + 1))
     with av.open(str(tmp_path / "new" / "drive.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
-        assert (stream.width, stream.height, stream.average_rate) == (*DREAMING.size, FRAMES_PER_SECOND)
+        assert (stream.width, stream.height, stream.average_rate) == (*DREAMING.size, 50)
         assert len(list(container.decode(stream))) == STEPS
 
 
@@ -56,7 +58,7 @@ def test_a_bundle_that_cannot_dream_is_recorded_with_two_pictures(controller, ra
 
 def test_another_task_or_an_impossible_place_is_refused(controller, random_bundle, tmp_path):
     moon = Controller(controller.shape, controller.parameters, "moon", controller.bundle)
-    with pytest.raises(UsageError, match="only car-racing"):
+    with pytest.raises(UsageError, match="unknown task"):
         record(moon, random_bundle, SEED, STEPS, tmp_path / "drive.mp4")
     (tmp_path / "file").write_text("")
     with pytest.raises(DreamfleetError, match="choose another --out"):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from dreamfleet.common.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.bundle import DREAM, find_bundle
 from dreamfleet.common.controller import act
 from dreamfleet.common.errors import BundleError
@@ -104,7 +105,7 @@ def test_every_controller_acts_by_its_formula_in_the_dream_and_in_reality(tmp_pa
         :, : bundle.controller_shape.features
     ]
     for row in range(4):
-        expected = act(bundle.controller_shape, parameters[row], seen[row])
+        expected = act(bundle.controller_shape, parameters[row], seen[row], STEERING_GAS_BRAKE)
         np.testing.assert_allclose(real.action[row], expected, atol=2e-6)
     column = 2 * config.hidden  # reality does not know its reward yet
     np.testing.assert_allclose(np.delete(dreamt.state, column, 1), np.delete(real.state, column, 1), atol=1e-5)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from dreamfleet.common.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.bundle import POLICY, write_bundle
 from dreamfleet.common.controller import act
 from dreamfleet.common.errors import BundleError
@@ -45,7 +46,7 @@ def test_the_graph_acts_as_the_controllers_formula(random_bundle, inputs):
     step = PolicyStep(random_bundle).step(*inputs)
     for row in range(ROWS):
         features = np.concatenate([step.latent[row], inputs[2][row, :256]])
-        expected = act(random_bundle.controller_shape, inputs[1][row], features)
+        expected = act(random_bundle.controller_shape, inputs[1][row], features, STEERING_GAS_BRAKE)
         np.testing.assert_allclose(step.action[row], expected, atol=2e-6)
     assert step.action[:, 1:].min() >= 0
     assert np.abs(step.action).max() <= 1

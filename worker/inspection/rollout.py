@@ -1,8 +1,7 @@
-"""A fresh drive in CarRacing, and what the encoder makes of it."""
+"""A fresh rollout in a bundle's own world, and what the encoder makes of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +9,11 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
-from dreamfleet.worker.car_racing.drivers import OrnsteinUhlenbeckDriver
-from dreamfleet.worker.car_racing.task import CarRacing
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.scoring.episode import Course, play
+from dreamfleet.worker.tasks.api import Assignment, Collected, Policy
+from dreamfleet.worker.tasks.policy import Driven
+from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.inference import Encoder
 
 Floats = NDArray[np.float32]
@@ -28,7 +30,7 @@ class DriveConfig:
 
 
 @dataclass(frozen=True)
-class Drive:
+class EncodedRollout:
     """T steps: `picture` (T, side, side, 3) and its `mu`, `logvar` (T, latent); then `action` (T, 3), `reward` (T,)."""
 
     picture: Pictures
@@ -65,34 +67,22 @@ class Drive:
         return told
 
 
-def drive(bundle: Bundle, controller: Controller | None, config: DriveConfig) -> Drive:
-    """Drive one episode: the controller, or without one the random driver that drifts around slight gas."""
-    policy = CarRacing().make_policy(bundle)
+def drive(bundle: Bundle, controller: Controller | None, config: DriveConfig) -> EncodedRollout:
+    """Drive one episode: the controller, or without one the world's second random driver, which drifts."""
+    assignment = Assignment.of(bundle.manifest.task, bundle)
+    task, driver = find_task(bundle.manifest.task), "the run's controller"
+    policy: Policy = task.make_policy(assignment)
     if controller is not None:
         policy.begin(controller.parameters)
-        return _drive(bundle, policy.act, policy.reward, "the run's controller", config)
-    driver = OrnsteinUhlenbeckDriver(np.random.default_rng(config.seed))
-    return _drive(bundle, lambda _picture: driver.act(), lambda _reward: None, "a random driver", config)
-
-
-def _drive(
-    bundle: Bundle, act: Callable[[Pictures], Floats], tell: Callable[[float], None], driver: str, config: DriveConfig
-) -> Drive:
-    environment = CarRacing().make_environment(bundle)
-    observation, _ = environment.reset(seed=config.seed)
-    pictures: list[Pictures] = []
-    actions: list[Floats] = []
-    rewards: list[float] = []
-    ended = False
-    while len(actions) < config.steps and not ended:
-        action = act(observation)
-        pictures.append(observation)
-        observation, reward, terminated, truncated, _ = environment.step(action)
-        tell(float(reward))
-        actions.append(action)
-        rewards.append(float(reward))
-        ended = terminated or truncated
+    elif isinstance(task, Collected):
+        driver = "a random driver"
+        policy = Driven(list(task.drivers.values())[1 % len(task.drivers)](np.random.default_rng(config.seed)))
+    else:
+        raise UsageError(f"task {bundle.manifest.task} has no driver: look at a run, whose controller drives")
+    environment = task.make_environment(assignment)
+    moments = list(play(environment, policy, Course(config.seed, config.steps)))
     environment.close()
-    seen = np.stack(pictures)
+    seen = np.stack([moment.seen for moment in moments])
     mu, logvar = Encoder(bundle).encode(seen)
-    return Drive(seen, mu, logvar, np.stack(actions), np.array(rewards), driver)
+    actions, rewards = np.stack([moment.action for moment in moments]), np.array([each.reward for each in moments])
+    return EncodedRollout(seen, mu, logvar, actions, rewards, driver)

@@ -1,0 +1,73 @@
+"""Tasks by name, as both sides find them: which are registered, and what a new run must know of one.
+
+A name is one that a package registers under the entry-point group `dreamfleet.tasks`; a family's name with what makes
+one of it (`gym:LunarLander-v3`); or `module:attribute`, for a task that no package registers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
+
+GROUP = "dreamfleet.tasks"
+GYM = "gym"  # the family of gymnasium's environments: they need no bundle
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a run freezes of a task that needs no bundle."""
+
+    observations: int  # inputs of a controller
+    outputs: int  # of a controller
+    packages: tuple[str, ...] = NUMERIC_PACKAGES  # whose versions a fitness may depend on
+    version: int = 1
+    options: str = ""  # canonical JSON
+
+
+def registered_tasks() -> dict[str, EntryPoint]:
+    """The registered tasks and families by name."""
+    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+
+
+def family_of(name: str) -> str:
+    """What a worker announces to know a task: the registered name or family, or the whole of `module:attribute`."""
+    head, colon, _ = name.partition(":")
+    return head if colon and head in registered_tasks() else name
+
+
+def load_task(name: str) -> Any:
+    """The object that stands for a task; `UsageError` says what is known, or why it cannot be loaded."""
+    points = registered_tasks()
+    head, colon, rest = name.partition(":")
+    try:
+        if head in points:
+            make = points[head].load()
+            return make(rest) if colon else make()
+        if colon:
+            return getattr(import_module(head), rest)()
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"task {name!r} cannot be loaded: no module {error.name!r} here; install the package that has it"
+        ) from error
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise UsageError(f"task {name!r} cannot be loaded: {error}") from error
+    known = ", ".join(f"{each}:ENVIRONMENT" if each == GYM else each for each in points) or "none"
+    raise UsageError(f"unknown task {name!r}: known are {known}")
+
+
+def describe_task(name: str, options: Mapping[str, Any]) -> Description:
+    """What a new run must know of a task that needs no bundle; `UsageError` if it does not say.
+
+    The task's package must be installed where the run is begun, and only there and on workers.
+    """
+    task = load_task(name)
+    if not callable(getattr(task, "describe", None)):
+        raise UsageError(f"task {name!r} needs a world model: give one with --bundle")
+    description: Description = task.describe(options)
+    return description

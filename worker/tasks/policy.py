@@ -1,0 +1,60 @@
+"""Policies that need no world model: a controller on a flat vector of observations, and a driver that does not look."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.actions import Actions
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.errors import ControllerError
+
+Floats = NDArray[np.float32]
+
+
+class FlatPolicy:
+    """Linear, or through one layer of tanh units; observations are shifted and scaled by what the run froze."""
+
+    def __init__(self, shape: ControllerShape, actions: Actions, mean: Any = 0.0, deviation: Any = 1.0) -> None:
+        """`mean` and `deviation` `(observations,)` of the observations, as they were when the run began."""
+        if shape.actions != actions.outputs:
+            raise ControllerError(f"a controller of {shape.actions} outputs does not fit {actions.outputs} actions")
+        self._shape, self._actions = shape, actions
+        self._mean = np.asarray(mean, dtype=np.float32)
+        self._scale = np.float32(1) / np.asarray(deviation, dtype=np.float32)
+        self._layers: list[tuple[Floats, Floats]] = []
+
+    def begin(self, parameters: Floats) -> None:
+        """Begin an episode with this controller's flat vector."""
+        self._layers = self._shape.unpack(parameters.astype(np.float32))
+
+    def act(self, observation: Any) -> Any:
+        """The action for one observation of any shape, flattened."""
+        value = (np.asarray(observation, dtype=np.float32).reshape(-1) - self._mean) * self._scale
+        *before, (weights, biases) = self._layers
+        for each, offsets in before:
+            value = np.tanh(each @ value + offsets)
+        return self._actions.of(weights @ value + biases)
+
+
+class Driver(Protocol):
+    """Chooses actions without looking: what the first world model learns from."""
+
+    def act(self) -> Floats:
+        """The next action."""
+
+
+class Driven:
+    """A driver as a policy."""
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+
+    def begin(self, parameters: Floats) -> None:
+        """A driver has none."""
+
+    def act(self, _observation: Any) -> Any:
+        """The driver's next action."""
+        return self._driver.act()

@@ -1,0 +1,26 @@
+"""The world that a data set is of, as training asks for it."""
+
+from __future__ import annotations
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.tasks.api import Collected, Preprocessing
+from dreamfleet.worker.tasks.registry import find_task
+
+WORLD = "car-racing"  # of data sets that do not say another
+
+
+def find_world(name: str = WORLD) -> Collected:
+    """The task of that name; `UsageError` if nothing can be collected in it."""
+    task = find_task(name)
+    if not isinstance(task, Collected):
+        raise UsageError(f"task {name!r} has no drivers and pictures to collect: docs/tasks.md tells what it takes")
+    return task
+
+
+def preprocessing_to(size: int, world: str = WORLD) -> Preprocessing:
+    """The world's preprocessing whose pictures are so many pixels wide; `UsageError` if there is none."""
+    known = find_world(world).preprocessings.values()
+    for each in known:
+        if each.size == size:
+            return each
+    raise UsageError(f"pictures are {' or '.join(str(each.size) for each in known)} pixels wide, not {size}")
