@@ -1,0 +1,1 @@
+"""Any gymnasium environment as a task, without a world model: `gym:LunarLander-v3`."""

@@ -1,0 +1,144 @@
+"""One of gymnasium's environments as a task: a controller on its flat observation, no bundle.
+
+The name is `gym:` and the environment's id, in gymnasium's own form where its package must be imported first:
+`gym:LunarLander-v3`, `gym:my_package:MyWorld-v0`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib.metadata import packages_distributions
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from dreamfleet.common.actions import Actions, Continuous, Discrete
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.tasks import GYM
+from dreamfleet.worker.tasks.api import Assignment, Description, Policy, Task, World
+from dreamfleet.worker.tasks.policy import FlatPolicy
+
+OPTIONS = ("environment", "normalise", "seed")
+NORMALISING_EPISODES = 20
+# What gymnasium's own environments compute with; of any other the distribution that its module is from.
+ENGINES = {
+    "gymnasium.envs.box2d": ("box2d", "box2d-py"),
+    "gymnasium.envs.mujoco": ("mujoco",),
+    "gymnasium.envs.classic_control": (),
+    "gymnasium.envs.toy_text": (),
+}
+
+
+class GymTask(Task):
+    """The task `gym:ENVIRONMENT`; Box observations of any shape, Box or Discrete actions."""
+
+    def __init__(self, environment: str) -> None:
+        self.name = f"{GYM}:{environment}"
+        self._id = environment
+        self._made: World | None = None
+
+    @property
+    def world(self) -> World:  # type: ignore[override]
+        """What the environment's own spaces and registration say; `UsageError` where they cannot be used."""
+        if self._made is None:
+            environment = self._make({})
+            try:
+                self._made = _world_of(environment, self._id)
+            finally:
+                environment.close()
+        return self._made
+
+    def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
+        """The environment, made with what the run froze of its arguments."""
+        return self._make(assignment.spec.option("environment", {}))
+
+    def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+        """The same environment."""
+        arguments = dict(assignment.spec.option("environment", {}))
+        return self._make(arguments if render_mode is None else {**arguments, "render_mode": render_mode})
+
+    def make_policy(self, assignment: Assignment) -> Policy:
+        """A controller on the flat observation, normalised as it was when the run began."""
+        normal = assignment.spec.option("normal", {"mean": 0.0, "deviation": 1.0})
+        return FlatPolicy(assignment.controller, self.world.actions, normal["mean"], normal["deviation"])
+
+    def describe(self, options: Mapping[str, Any]) -> Description:
+        """Sizes, packages, and the options that a run freezes.
+
+        `environment`: arguments of `gymnasium.make`; `normalise`: observations are shifted and scaled by their mean and
+        deviation in 20 episodes of random actions from `seed` on, which are part of the run from then on.
+        """
+        if unknown := set(options) - set(OPTIONS):
+            raise UsageError(f"task {self.name} knows no option {', '.join(sorted(unknown))}: {', '.join(OPTIONS)}")
+        arguments = dict(options.get("environment") or {})
+        environment = self._make(arguments)
+        try:
+            world = _world_of(environment, self._id)
+            frozen: dict[str, Any] = {"environment": arguments} if arguments else {}
+            if options.get("normalise"):
+                mean, deviation = _normal(environment, int(options.get("seed", 0)))
+                frozen["normal"] = {"mean": mean.tolist(), "deviation": deviation.tolist()}
+            observations = int(np.prod(environment.observation_space.shape or (1,)))
+        finally:
+            environment.close()
+        text = json.dumps(frozen, sort_keys=True) if frozen else ""
+        return Description(observations, world.actions.outputs, world.packages, world.version, text)
+
+    def _make(self, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
+        try:
+            return gymnasium.make(self._id, disable_env_checker=True, **arguments)
+        except gymnasium.error.DependencyNotInstalled as error:
+            raise UsageError(f"{self._id} lacks a package on this host: {error}") from error
+        except (gymnasium.error.Error, ModuleNotFoundError) as error:
+            raise UsageError(
+                f"gymnasium makes no environment {self._id!r} here ({error}); an environment of another package is "
+                f"written {GYM}:its_module:Its-v0"
+            ) from error
+        except TypeError as error:
+            raise UsageError(f"{self._id} takes no such arguments: {error}") from error
+
+
+def _world_of(environment: gymnasium.Env[Any, Any], name: str) -> World:
+    observations = environment.observation_space
+    if not isinstance(observations, spaces.Box):
+        raise UsageError(f"{name} observes {observations}: only Box observations can be flattened for a controller")
+    module = str(environment.unwrapped.__class__.__module__)
+    engine = next((packages for prefix, packages in ENGINES.items() if module.startswith(prefix)), None)
+    if engine is None:
+        engine = tuple(sorted(set(packages_distributions().get(module.partition(".")[0], ()))))
+    rate = environment.metadata.get("render_fps") or World.frames_per_second
+    return World(
+        actions=_actions(environment.action_space, name),
+        packages=("numpy", "gymnasium", *engine),
+        frames_per_second=int(rate),
+    )
+
+
+def _actions(space: Any, name: str) -> Actions:
+    if isinstance(space, spaces.Discrete):
+        return Discrete(int(space.n), int(space.start))
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+            raise UsageError(f"{name} takes actions without bounds: wrap it so that its actions have a range")
+        return Continuous.between(space.low, space.high)
+    raise UsageError(f"{name} takes actions {space}: a controller gives a Discrete action or a flat Box")
+
+
+def _normal(environment: gymnasium.Env[Any, Any], seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and deviation `(observations,)` over episodes of random actions; a constant one is left as it is."""
+    environment.action_space.seed(seed)
+    seen = []
+    for episode in range(NORMALISING_EPISODES):
+        observation, _ = environment.reset(seed=seed + episode)
+        over = False
+        while not over:
+            seen.append(np.asarray(observation, dtype=np.float64).reshape(-1))
+            observation, _, terminated, truncated, _ = environment.step(environment.action_space.sample())
+            over = terminated or truncated
+    values = np.stack(seen)
+    deviation = values.std(axis=0)
+    return values.mean(axis=0), np.where(deviation > 1e-6, deviation, 1.0)
