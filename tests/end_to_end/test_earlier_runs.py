@@ -1,0 +1,69 @@
+"""Runs that the version before this layout recorded: they open, replay and go on, to the bit on an equal host.
+
+`tests/fixtures` holds their journals, the controllers that they reported, their world model, and what the version that
+wrote them gave when it continued them.
+"""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.fingerprint import fingerprint
+from dreamfleet.common.runs import open_run
+
+pytestmark = pytest.mark.timeout(300)
+FIXTURES = Path(__file__).parents[1] / "fixtures"
+CONTINUED = json.loads((FIXTURES / "continued.json").read_text())
+NAMES = sorted(CONTINUED)
+
+
+@pytest.fixture
+def runs(processes):
+    """The recorded runs, each with its world model."""
+    for name in NAMES:
+        shutil.copytree(FIXTURES / "runs" / name, processes.runs / name)
+        shutil.copyfile(FIXTURES / "small.zip", processes.runs / name / "bundle.zip")
+    return processes.runs
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_they_open(runs, name):
+    with open_run(runs, name) as run:
+        assert len(run.history()) == CONTINUED[name]["first"]
+        assert Bundle.open(run.bundle_path).sha256 == run.spec.bundle
+        controller = Controller.load(run.controller_path)
+        assert (controller.task, controller.bundle) == (run.spec.task, run.spec.bundle)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_their_candidates_are_scored_as_they_were(processes, runs, name):
+    with open_run(runs, name) as run:
+        here = run.fingerprint == fingerprint()
+    code, out, err = processes.call("replay", name, "--runs-dir", runs, "--candidate", "1/2")
+    assert code in (0, 1), err
+    assert not here or (code == 0 and "DIFFERS" not in out)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_they_go_on_as_the_version_that_wrote_them_would(processes, runs, name):
+    expected = CONTINUED[name]
+    with open_run(runs, name) as run:
+        mixed = () if run.fingerprint == fingerprint() else ("--mixed",)
+    coordinator = processes.start(
+        "coordinator", "--resume", name, "--runs-dir", runs, "--listen", processes.endpoint,
+        "--generations", expected["generations"], *mixed,
+    )  # fmt: skip
+    processes.worker("--run", name, "--exit-when-done")
+    code, _ = coordinator.finish(120)
+    assert code == 0, "".join(coordinator.lines)
+    with open_run(runs, name) as run:
+        assert len(run.history()) == expected["generations"]
+        fitness = [[run.fitness(g, i) for i in range(len(row))] for g, row in enumerate(expected["fitness"])]
+        evaluations = [[each.generation, each.mean.hex()] for each in run.evaluations()]
+    if not mixed:
+        assert [[each.hex() for each in row] for row in fitness] == expected["fitness"]
+        assert evaluations == expected["evaluations"]
