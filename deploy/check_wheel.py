@@ -1,45 +1,97 @@
-"""Build the wheel, install it into an empty environment, and see that a coordinator's verbs start there."""
+"""Build the sdist and from it the wheel, install each alone, and see that only `dreamfleet` came, and starts anywhere.
+
+Whatever lies in the current folder, a `worker.py`, a `common/`, a `coordinator.py`, must not be imported for ours.
+"""
 
 import subprocess
 import sys
+import tarfile
 import tempfile
 import venv
+import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-EXPECTED = ("common/pretrained/tiny.zip", "coordinator/service.py", "worker/service.py", "common/py.typed")
+EXPECTED = (
+    "dreamfleet/__init__.py",
+    "dreamfleet/__main__.py",
+    "dreamfleet/py.typed",
+    "dreamfleet/common/pretrained/tiny.zip",
+    "dreamfleet/coordinator/service.py",
+    "dreamfleet/worker/service/worker.py",
+)
+HOSTILE = ("worker.py", "coordinator.py", "common/__init__.py", "tasks.py")
+NAMES = (
+    "import importlib.metadata as m; print(*sorted({p.parts[0] for p in m.files('dreamfleet') if p.suffix == '.py'}))"
+)
 
 
 def main() -> int:
-    """Exit code 0 when the wheel is whole."""
-    with tempfile.TemporaryDirectory() as folder:
-        run(sys.executable, "-m", "build", "--wheel", "--outdir", folder, str(ROOT))
-        (wheel,) = Path(folder).glob("*.whl")
-        environment = Path(folder) / "environment"
-        venv.create(environment, with_pip=True)
-        python = str(environment / "bin" / "python")
-        run(python, "-m", "pip", "install", "--quiet", "--constraint", str(ROOT / "constraints.txt"), str(wheel))
-        files = capture(python, "-m", "pip", "show", "--files", "dreamfleet")
-        missing = [name for name in EXPECTED if name not in files]
-        if missing:
-            print(f"the wheel lacks {', '.join(missing)}", file=sys.stderr)
-            return 1
-        run(str(environment / "bin" / "dreamfleet"), "--help", cwd=folder)
-        run(str(environment / "bin" / "dreamfleet"), "doctor", cwd=folder)
-        print(f"{wheel.name} builds, installs and starts; {wheel.stat().st_size / 1e6:.1f} MB")
+    """Exit code 0 when both are whole."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        run(sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT))
+        (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
+        for kind, files in (
+            ("wheel", files_of(wheel)),
+            ("sdist", [each.partition("/")[2] for each in files_of(sdist)]),
+        ):
+            if missing := [name for name in EXPECTED if name not in files]:
+                return complain(f"the {kind} lacks {', '.join(missing)}")
+            if strange := {file.partition("/")[0] for file in files if file.endswith(".py")} - {
+                "dreamfleet",
+                "setup.py",
+            }:
+                return complain(f"the {kind} holds modules of {', '.join(sorted(strange))}")
+        hostile = folder / "hostile"
+        for file in HOSTILE:
+            (hostile / file).parent.mkdir(parents=True, exist_ok=True)
+            (hostile / file).write_text("raise SystemExit('a module of the current folder was imported')\n")
+        for archive in (wheel, sdist):
+            if problem := try_out(folder / f"environment-{archive.suffix[1:]}", archive, hostile):
+                return complain(f"{archive.name}: {problem}")
+        print(f"{wheel.name} and {sdist.name} build, install and start; {wheel.stat().st_size / 1e6:.1f} MB")
     return 0
 
 
-def run(*command: str, cwd: str | None = None) -> None:
+def try_out(environment: Path, archive: Path, folder: Path) -> str:
+    """Install an archive alone and start verbs in a folder of modules named as ours are; what is wrong, or nothing."""
+    venv.create(environment, with_pip=True)
+    python = str(environment / "bin" / "python")
+    run(python, "-m", "pip", "install", "--quiet", "--constraint", str(ROOT / "constraints.txt"), str(archive))
+    for command in ((str(environment / "bin" / "dreamfleet"),), (python, "-m", "dreamfleet")):
+        run(*command, "--help", cwd=folder)
+        run(*command, "doctor", cwd=folder)
+        run(*command, "runs", "list", cwd=folder)
+    importable = capture(python, "-P", "-c", NAMES, cwd=folder).split()
+    return "" if importable == ["dreamfleet"] else f"installs {importable}"
+
+
+def files_of(archive: Path) -> list[str]:
+    """Names of an archive's files; links count as missing."""
+    if archive.suffix == ".whl":
+        with zipfile.ZipFile(archive) as wheel:
+            return wheel.namelist()
+    with tarfile.open(archive) as sdist:
+        return [member.name for member in sdist if member.isfile()]
+
+
+def complain(text: str) -> int:
+    """Say what is wrong; exit code 1."""
+    print(text, file=sys.stderr)
+    return 1
+
+
+def run(*command: str, cwd: Path | None = None) -> None:
     """Run quietly; show what was said if it fails."""
     done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise SystemExit(f"{' '.join(command)}:\n{done.stdout}{done.stderr}")
 
 
-def capture(*command: str) -> str:
+def capture(*command: str, cwd: Path) -> str:
     """What a command prints."""
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=True).stdout
 
 
 if __name__ == "__main__":
