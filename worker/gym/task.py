@@ -39,18 +39,14 @@ class GymTask(Task):
     def __init__(self, environment: str) -> None:
         self.name = f"{GYM}:{environment}"
         self._id = environment
-        self._made: World | None = None
 
-    @property
-    def world(self) -> World:  # type: ignore[override]
+    def world_of(self, assignment: Assignment) -> World:
         """What the environment's own spaces and registration say; `UsageError` where they cannot be used."""
-        if self._made is None:
-            environment = self._make({})
-            try:
-                self._made = _world_of(environment, self._id)
-            finally:
-                environment.close()
-        return self._made
+        environment = self.make_environment(assignment)
+        try:
+            return _world_of(environment, self._id)
+        finally:
+            environment.close()
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """The environment, made with what the run froze of its arguments."""
@@ -64,7 +60,7 @@ class GymTask(Task):
     def make_policy(self, assignment: Assignment) -> Policy:
         """A controller on the flat observation, normalised as it was when the run began."""
         normal = assignment.spec.option("normal", {"mean": 0.0, "deviation": 1.0})
-        return FlatPolicy(assignment.controller, self.world.actions, normal["mean"], normal["deviation"])
+        return FlatPolicy(assignment.controller, self.world_of(assignment).actions, normal["mean"], normal["deviation"])
 
     def describe(self, options: Mapping[str, Any]) -> Description:
         """Sizes, packages, and the options that a run freezes.

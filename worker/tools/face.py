@@ -1,0 +1,71 @@
+"""What a program of one's own does with a controller; exported by `dreamfleet` itself."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from dreamfleet.common import runs, shelf
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.seeds import TEST
+from dreamfleet.worker.tasks.api import Assignment, Policy
+from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tools import evaluation
+from dreamfleet.worker.tools.evaluation import Evaluated
+
+
+def find_controller(name: str, runs_dir: Path | str | None = None) -> Controller:
+    """A controller's file, a run's own, or one that ships; `ControllerError` names those that do."""
+    controller, _ = shelf.find_controller(name, _folder(runs_dir))
+    return controller
+
+
+def open_run(name: str, runs_dir: Path | str | None = None) -> runs.RunFolder:
+    """A run's journal, read-only; to be closed, or used in a `with`. `JournalError` names those that exist."""
+    return runs.open_run(_folder(runs_dir), name)
+
+
+def make_environment(
+    controller: Controller, bundle: Bundle | None = None, render_mode: str | None = None
+) -> gymnasium.Env[Any, Any]:
+    """The environment that a controller is judged in, observing what its policy takes."""
+    assignment = _assignment(controller, bundle)
+    return find_task(controller.task).make_judge(assignment, render_mode)
+
+
+def make_policy(controller: Controller, bundle: Bundle | None = None) -> Policy:
+    """The policy of a controller, its first episode begun: `act(observation)` gives an action of its environment.
+
+    Of a policy with a `reward` method, tell it each action's reward; some world models look at it.
+    """
+    policy = find_task(controller.task).make_policy(_assignment(controller, bundle))
+    policy.begin(controller.parameters)
+    return policy
+
+
+def evaluate(
+    controller: Controller, bundle: Bundle | None = None, episodes: int = 100, first_seed: int = TEST.start,
+    jobs: int | None = None,
+) -> Evaluated:  # fmt: skip
+    """Scores of whole episodes, one a seed, in `jobs` processes (one a core), as `dreamfleet evaluate` gives them."""
+    if episodes < 1 or first_seed < 0 or (jobs is not None and jobs < 1):
+        raise UsageError("episodes and jobs must be at least 1, first_seed at least 0")
+    seeds = tuple(range(first_seed, first_seed + episodes))
+    world_model = bundle or evaluation.bundle_for(controller, None)
+    scores = dict(evaluation.evaluate(controller, world_model, seeds, jobs or os.cpu_count() or 1))
+    return Evaluated(seeds, tuple(scores[seed] for seed in seeds))
+
+
+def _assignment(controller: Controller, bundle: Bundle | None) -> Assignment:
+    found = bundle or evaluation.bundle_for(controller, None)
+    fitting = None if found is None else found.under(controller.shape)
+    return Assignment(evaluation.spec_for(controller, fitting), fitting)
+
+
+def _folder(runs_dir: Path | str | None) -> Path:
+    return runs.default_runs_dir() if runs_dir is None else Path(runs_dir)
