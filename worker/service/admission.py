@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import queue
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 import zenoh
 
 from dreamfleet.common import keys
+from dreamfleet.common.asking import ask_all
 from dreamfleet.common.codec import Inbox, MalformedError, encode_json, from_plain
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.fingerprint import fingerprint, package_version
@@ -33,7 +32,7 @@ class Admission:
 
 def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> Admission | None:
     """Say hello to `run`, or to the only live one; `None` if nobody answers, `RefusedError` if the answer is no."""
-    replies = [reply for payload in _get(session, keys.hello(run or "*"), encode_json(request))
+    replies = [reply for payload in ask_all(session, [keys.hello(run or "*")], HELLO_TIMEOUT, encode_json(request))
                if (reply := inbox.decode_json(HelloReply, payload)) is not None]  # fmt: skip
     if not replies:
         return None
@@ -46,7 +45,7 @@ def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: I
 def neediest(session: zenoh.Session) -> str | None:
     """The live run that works with the fewest slots; of equals the first by name."""
     found = []
-    for payload in _get(session, keys.status("*"), b""):
+    for payload in ask_all(session, [keys.status("*")], HELLO_TIMEOUT):
         with suppress(ValueError, KeyError, TypeError):  # what answers need not be of this version
             document = json.loads(payload)
             if document["state"] not in ("ended", "paused"):
@@ -78,15 +77,3 @@ def _admission(reply: HelloReply) -> Admission:
             f"({error}); install dreamfleet {reply.package} here"
         ) from error
     return Admission(keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals)
-
-
-def _get(session: zenoh.Session, key: str, payload: bytes) -> list[bytes]:
-    replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    done = object()
-    handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
-    session.get(key, handler, payload=payload, encoding="application/json", timeout=HELLO_TIMEOUT)
-    payloads = []
-    while (reply := replies.get()) is not done:
-        if reply.ok is not None:
-            payloads.append(reply.ok.payload.to_bytes())
-    return payloads
