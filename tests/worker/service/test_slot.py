@@ -50,7 +50,13 @@ class Harness:
         while True:
             event = self.events.get(timeout=TIMEOUT)[1]
             if results := self.slot.handle(event):
-                return results[0], event.done.upload
+                return results[0], event.upload
+
+    def gone(self):
+        """The event that the child is gone, not handled yet."""
+        while (event := self.events.get(timeout=TIMEOUT)[1]).word is not None:
+            self.slot.handle(event)
+        return event
 
     def score(self, episode=0):
         self.wait_ready()
@@ -231,8 +237,8 @@ def test_a_child_that_cannot_start_ends_with_its_reason(harness, tmp_path):
     broken.write_bytes(b"no bundle")
     slot = harness(tasks.TOY, broken)
     for _ in range(FAILED_STARTS - 1):
-        slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1])
-    last = slot.events.get(timeout=TIMEOUT)[1]
+        slot.slot.handle(slot.gone())
+    last = slot.gone()
     with pytest.raises(DreamfleetError, match=r"cannot start: BundleError.*not a whole bundle"):
         slot.slot.handle(last)
 

@@ -13,7 +13,7 @@ from dreamfleet.common.codec import encode
 from dreamfleet.common.errors import BundleError, RefusedError, UsageError
 from dreamfleet.common.messages import MAX_MESSAGE, MAX_PART, Beat, Intervals, ResultBatch, UploadPart
 from dreamfleet.common.session import Network
-from dreamfleet.worker.service import worker as service
+from dreamfleet.worker.service import membership
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.worker import Worker
 from tests.support import tasks
@@ -333,7 +333,7 @@ def test_another_run_of_the_same_name_ends_it(stage, cached):
 
 @pytest.mark.parametrize("when", ["before it joined", "afterwards"])
 def test_it_leaves_when_its_run_is_over_if_it_shall(stage, cached, monkeypatch, when):
-    monkeypatch.setattr(service, "GONE", 0.3)
+    monkeypatch.setattr(membership, "GONE", 0.3)
     hand = stage.hand()
     if when == "before it joined":
         hand.vanish()
