@@ -61,12 +61,9 @@ class Failure:
         lines = str(error).strip().splitlines()
         places = traceback.extract_tb(error.__traceback__)
         place = f"{places[-1].filename}:{places[-1].lineno}" if places else "nowhere"
-        text = f"{type(error).__name__}: {lines[0] if lines else ''}"[:500]
-        return cls(
-            text.encode(errors="replace").decode(),  # it travels, and half a surrogate pair cannot
-            f"{type(error).__name__} at {place}",
-            "".join(traceback.format_exception(error))[-MAX_TRACE:].rstrip(),
-        )
+        name, first = type(error).__name__, lines[0] if lines else ""
+        trace = "".join(traceback.format_exception(error)).rstrip()
+        return cls(_plain(f"{name}: {first}"[:500]), f"{name} at {place}", _plain(trace[-MAX_TRACE:]))
 
 
 @dataclass(frozen=True)
@@ -80,6 +77,11 @@ class Done:
     results: tuple[Result, ...]
     upload: bytes | None = None
     failure: Failure | None = None
+
+
+def _plain(text: str) -> str:
+    """Text that can travel: half a surrogate pair, as in the name of a file, cannot."""
+    return text.encode(errors="replace").decode()
 
 
 class AbandonedError(Exception):
