@@ -11,6 +11,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+# Of CarRacing and its dream, and of runs from before tasks said which.
 NUMERIC_PACKAGES = ("numpy", "onnxruntime", "gymnasium", "pygame-ce", "box2d", "box2d-py")
 # The instruction sets that the inference kernels choose between at run time.
 CPU_FEATURES = ("sse4_1", "avx", "avx2", "fma", "f16c", "avx512f", "avx512bw", "avx512vl", "avx512_vnni", "avx512_bf16",
@@ -37,9 +38,12 @@ def cpu_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:
 
 
 @cache
-def fingerprint() -> str:
-    """One line that is equal on hosts that are expected to compute equal bits; it costs 5 ms to find out, once."""
+def fingerprint(packages: tuple[str, ...] = NUMERIC_PACKAGES) -> str:
+    """One line that is equal on hosts that are expected to compute equal bits; it costs 5 ms to find out, once.
+
+    `packages` are those that a fitness of the run's task may depend on: what else is installed splits no fleet.
+    """
     libc, libc_version = platform.libc_ver()
-    packages = [f"{name}-{found}" for name in NUMERIC_PACKAGES if (found := package_version(name))]
+    versions = [f"{name}-{found}" for name in packages if (found := package_version(name))]
     features = "+".join(cpu_features()) or platform.processor() or "unknown"
-    return " ".join([platform.machine(), features, f"{libc or platform.system()}-{libc_version}", *packages])
+    return " ".join([platform.machine(), features, f"{libc or platform.system()}-{libc_version}", *versions])

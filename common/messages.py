@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.fields import OPTIONAL, written
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 
 MAX_MESSAGE = 48 * 1024
 MAX_PART = 40 * 1024  # room for the envelope around a part's bytes
@@ -50,6 +51,7 @@ Word = Annotated[str, Length(1, 128)]
 Text = Annotated[str, Length(0, 2000)]
 Part = Annotated[bytes, Length(0, MAX_PART)]
 Temperature = Annotated[float, Between(COLDEST, HOTTEST)]
+Packages = Annotated[tuple[Word, ...], Length(0, 64)]
 Kind = Literal["score", "evaluate", "collect"]
 VerdictWord = Literal["accepted", "duplicate", "obsolete", "refused"]
 
@@ -248,6 +250,7 @@ class HelloRequest:
     tasks: Annotated[tuple[Word, ...], Length(0, 256)]
     fingerprint: Text
     slots: Count
+    packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions the fingerprint names
 
 
 @dataclass(frozen=True)
@@ -268,6 +271,9 @@ class HelloReply:
     remedy: Text
     spec: dict[str, Any]
     intervals: dict[str, Any]
+    packages: Packages = field(
+        default=NUMERIC_PACKAGES, metadata=OPTIONAL
+    )  # whose versions the run's fingerprint names
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def lossless(number):
 
 
 class Worker:
-    """One life of a worker process, as `dreamfleet.worker.service.worker` runs it."""
+    """One life of a worker process, as `dreamfleet.worker.service.joined` runs it."""
 
     def __init__(self):
         self.backlog, self.outbox = Backlog(SPEC), Outbox(BEAT)

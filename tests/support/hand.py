@@ -1,6 +1,7 @@
 """A coordinator driven by hand: a real router, the real codec, and no rule but the test's."""
 
 import hashlib
+import json
 import queue
 from dataclasses import asdict
 
@@ -34,23 +35,26 @@ WHOLE = VectorPart(id=samples.VECTOR_ID, dtype="<f4", shape=(16,), offset=0, dat
 class Hand:
     """Answers hello and bundle queries; everything that a worker says is in one queue, in order."""
 
-    def __init__(self, port, bundle, task, run="test"):
+    def __init__(self, port, bundle, task, run="test", beside=None):
         self.run = run
         self.spec = TaskSpec(task=task, bundle=bundle.sha256, horizon=100, patience=0)
         self.nonce, self.incarnation, self.run_uid = FIRST, 1, samples.UID
         self.intervals = Intervals(beat=0.1, repeat=0.1)
         self.refusal = None
         self.worker = None
+        self.slots = 0  # that its status shows
         self.offsets = queue.SimpleQueue()  # of the bundle's parts that were asked for
         self.damage = lambda offset, data: data  # what becomes of a bundle's part; `None`: no answer
         self._held = []
         self._bundle = bundle.path.read_bytes()
         self._said = queue.SimpleQueue()
         self.endpoint = f"tcp/127.0.0.1:{port}"
-        self.session = open_session(Network(listen=(self.endpoint,)))
+        self._shares = beside is not None  # the router of another
+        self.session = beside.session if self._shares else open_session(Network(listen=(self.endpoint,)))
         declare, answer = self.session.declare_subscriber, self.session.declare_queryable
         self._declared = [
             answer(keys.hello(run), _direct(self._hello)),
+            answer(keys.status(run), _direct(self._status)),
             answer(keys.bundle(run, bundle.sha256), _direct(self._part)),
             declare(keys.any_worker("result", run), self._hear(ResultBatch)),
             declare(keys.any_worker("beat", run), self._hear(Beat)),
@@ -68,7 +72,8 @@ class Hand:
     def close(self):
         for query in self._held:
             query.drop()
-        self.session.close()
+        if not self._shares:
+            self.session.close()
 
     def next(self, kind, accept=lambda _: True):
         """The next message of this kind that is as wanted; what came before it is gone."""
@@ -139,6 +144,11 @@ class Hand:
             )  # fmt: skip
             query.reply(keys.hello(self.run), encode_json(reply), encoding="application/json")
         self._said.put(request)
+
+    def _status(self, query):
+        with query:
+            document = {"run": self.run, "state": "running", "slots": self.slots}
+            query.reply(keys.status(self.run), json.dumps(document).encode(), encoding="application/json")
 
     def _part(self, query):
         offset = int(query.parameters.get("offset"))

@@ -112,6 +112,6 @@ def _work(
             continue
         for results in worker.outbox.due(now):
             message = ResultBatch(
-                run_uid=run.run_uid, incarnation=run.incarnation, fingerprint=fingerprint(), results=results
+                run_uid=run.run_uid, incarnation=run.incarnation, fingerprint=fingerprint(run.packages), results=results
             )
             session.put(keys.result(run.run, identity), encode(message), encoding=encoding(ResultBatch))

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-import queue
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import zenoh
 
 from dreamfleet.common import keys
+from dreamfleet.common.asking import ask_all
 from dreamfleet.common.codec import Inbox, MalformedError, encode_json, from_plain
 from dreamfleet.common.errors import RefusedError, UsageError
-from dreamfleet.common.fingerprint import fingerprint, package_version
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, fingerprint, package_version
 from dreamfleet.common.messages import HelloReply, HelloRequest, Intervals, TaskSpec
 
 HELLO_TIMEOUT = 2.0
@@ -29,24 +28,36 @@ class Admission:
     nonce: str
     spec: TaskSpec
     intervals: Intervals
+    packages: tuple[str, ...] = NUMERIC_PACKAGES  # whose versions the run's fingerprint names
 
 
 def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> Admission | None:
-    """Say hello to `run`, or to the only live one; `None` if nobody answers, `RefusedError` if the answer is no."""
-    replies = [reply for payload in _get(session, keys.hello(run or "*"), encode_json(request))
+    """Say hello to `run`, or to the only live one; `None` if nobody answers, `RefusedError` if the answer is no.
+
+    Where the run's fingerprint names other packages than the request's, hello is said again about those.
+    """
+    reply = _say(session, run, request, inbox)
+    if reply is not None and not reply.accepted and reply.packages != request.packages:
+        about = replace(request, packages=reply.packages, fingerprint=fingerprint(reply.packages))
+        reply = _say(session, reply.run, about, inbox)
+    return None if reply is None else _admission(reply)
+
+
+def _say(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> HelloReply | None:
+    replies = [reply for payload in ask_all(session, [keys.hello(run or "*")], HELLO_TIMEOUT, encode_json(request))
                if (reply := inbox.decode_json(HelloReply, payload)) is not None]  # fmt: skip
     if not replies:
         return None
     if len(replies) > 1:
         names = ", ".join(sorted(reply.run for reply in replies))
         raise UsageError(f"several runs are live: choose one with --run: {names}")
-    return _admission(replies[0])
+    return replies[0]
 
 
 def neediest(session: zenoh.Session) -> str | None:
     """The live run that works with the fewest slots; of equals the first by name."""
     found = []
-    for payload in _get(session, keys.status("*"), b""):
+    for payload in ask_all(session, [keys.status("*")], HELLO_TIMEOUT):
         with suppress(ValueError, KeyError, TypeError):  # what answers need not be of this version
             document = json.loads(payload)
             if document["state"] not in ("ended", "paused"):
@@ -77,16 +88,6 @@ def _admission(reply: HelloReply) -> Admission:
             f"run {reply.run} (dreamfleet {reply.package}) describes its task in words that this version does not know "
             f"({error}); install dreamfleet {reply.package} here"
         ) from error
-    return Admission(keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals)
-
-
-def _get(session: zenoh.Session, key: str, payload: bytes) -> list[bytes]:
-    replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    done = object()
-    handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
-    session.get(key, handler, payload=payload, encoding="application/json", timeout=HELLO_TIMEOUT)
-    payloads = []
-    while (reply := replies.get()) is not done:
-        if reply.ok is not None:
-            payloads.append(reply.ok.payload.to_bytes())
-    return payloads
+    return Admission(
+        keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages
+    )

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import logging
-import queue
 from collections.abc import Callable
 from pathlib import Path
 from time import sleep
-from typing import Any
 
 import zenoh
 
 from dreamfleet.common import keys
+from dreamfleet.common.asking import ask_all
 from dreamfleet.common.bundle import Bundle, BundleStore
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.errors import BundleError
@@ -22,7 +21,6 @@ WINDOW = 8  # queries in flight: enough to fill a link with a long way
 ATTEMPTS = 3  # damaged downloads before giving up
 SILENCES = 20  # rounds without progress before giving up
 QUERY_TIMEOUT = 3.0
-LOOK = 0.2  # seconds between looks at whether to stop
 PAUSE = 0.5  # seconds after a round without progress
 
 
@@ -81,19 +79,6 @@ def _download(
 def _ask(
     session: zenoh.Session, key: str, offsets: list[int], inbox: Inbox, stopped: Callable[[], bool]
 ) -> list[BundlePart]:
-    replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    done = object()
-    for offset in offsets:
-        handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
-        session.get(f"{key}?offset={offset};length={MAX_PART}", handler, timeout=QUERY_TIMEOUT)
-    parts, left = [], len(offsets)
-    while left and not stopped():
-        try:
-            reply = replies.get(timeout=LOOK)
-        except queue.Empty:
-            continue
-        if reply is done:
-            left -= 1
-        elif reply.ok is not None and (part := inbox.decode(BundlePart, reply.ok.payload.to_bytes())) is not None:
-            parts.append(part)
-    return parts
+    selectors = [f"{key}?offset={offset};length={MAX_PART}" for offset in offsets]
+    payloads = ask_all(session, selectors, QUERY_TIMEOUT, stopped=stopped)
+    return [part for payload in payloads if (part := inbox.decode(BundlePart, payload)) is not None]

@@ -1,86 +1,48 @@
-"""A slot: a spawned child that scores, so that a crashed simulator costs one job and not the worker.
-
-Spawned, never forked: a forked Zenoh session hangs. The child knows nothing of Zenoh; the parent owns it.
-"""
+"""A slot: one scoring child after another, so that a crashed simulator costs one job and not the worker."""
 
 from __future__ import annotations
 
-import ctypes
-import hashlib
 import logging
-import os
 import queue
-import signal
-import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from multiprocessing import get_context, resource_tracker
-from multiprocessing.connection import Connection
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic, perf_counter, sleep
+from time import monotonic
 from typing import Any
 
-import numpy as np
-
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.messages import MAX_UPLOAD, Job, Result, TaskSpec
-from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.common.messages import Job, Result, TaskSpec
+from dreamfleet.worker.service.child import Ready
+from dreamfleet.worker.service.process import ChildProcess, Word
+from dreamfleet.worker.service.turn import Done, Failure, Turn, Work
 
 log = logging.getLogger(__name__)
 FAILED_STARTS = 3
-ENDING = 2.0  # seconds between a child's last word and its end
+START_LIMIT = 120.0  # seconds that a child may take to load task and world model; doubled with each that took longer
 SHORT = 0.25  # seconds: after turns below it the next one already waits in the child
 SMALL = 64 * 1024  # bytes of vectors that a pipe takes while its child is busy
-_PR_SET_PDEATHSIG = 1
-
-Work = tuple[Job, bytes]
-"""A job and its vector's bytes."""
-
-
-@dataclass(frozen=True)
-class Ready:
-    """A child's first word: it can score, and who draws its picture."""
-
-    drawn_by: str
-
-
-@dataclass(frozen=True)
-class Done:
-    """A child's word that a turn is over: a result of each of its jobs, or none where it was told to give up.
-
-    A file that a job left comes through the pipe, never through a disk.
-    """
-
-    turn: int
-    results: tuple[Result, ...]
-    upload: bytes | None = None
 
 
 @dataclass(frozen=True)
 class SlotEvent:
-    """What a slot tells its worker: ready, a turn done, or that the child is gone."""
+    """What a slot tells its worker: a word of the child of that life, or that it is gone."""
 
     slot: int
     life: int
-    ready: Ready | None = None
-    done: Done | None = None
-    gone: str | None = None
-
-
-@dataclass
-class Turn:
-    """Jobs that a child scores together, at one temperature: one, or as many as its task's width."""
-
-    number: int
-    work: Sequence[Work]
-    unwanted: set[bytes] = field(default_factory=set)
+    word: Word
 
     @property
-    def jobs(self) -> list[Job]:
-        """Its jobs."""
-        return [job for job, _ in self.work]
+    def failure(self) -> Failure | None:
+        """What the child raised: as it started, or in the turn that is over."""
+        if isinstance(self.word, Done):
+            return self.word.failure
+        return self.word if isinstance(self.word, Failure) else None
+
+    @property
+    def upload(self) -> bytes | None:
+        """The file that the turn left."""
+        return self.word.upload if isinstance(self.word, Done) else None
 
 
 class Slot:
@@ -90,7 +52,7 @@ class Slot:
         self,
         number: int,
         spec: TaskSpec,
-        bundle: Path,
+        bundle: Path | None,
         events: queue.SimpleQueue[tuple[str, Any]],
         memory_limit: int = 0,
     ) -> None:
@@ -104,7 +66,7 @@ class Slot:
         self._memory_limit = memory_limit
         self._turns: deque[Turn] = deque()
         self._short = False  # the last turn was
-        self._progress = (0, 0.0)  # steps, and when they were last seen to grow
+        self._progress = (0, 0.0)  # steps, and when they were last seen to grow; while it starts, when that began
         self._life = 0
         self._failed_starts = 0
         self._start()
@@ -132,34 +94,34 @@ class Slot:
     @property
     def steps(self) -> int:
         """Environment steps of the running turn so far, over all of its jobs."""
-        return int(self._steps.value) if self._turns else 0
+        return self._child.steps if self._turns else 0
 
     @property
     def pid(self) -> int:
         """The child's process id."""
-        return self._process.pid or 0
+        return self._child.pid
 
     def submit(self, work: Sequence[Work]) -> None:
-        """Give the child a turn; a child that is gone is noticed by its reader."""
+        """Give the child a turn."""
         self._sent += 1
         turn = Turn(self._sent, work)
         self._turns.append(turn)
         if len(self._turns) == 1:
-            self._begin()
-        self._send(turn)
+            self._watch_anew()
+        self._child.send(turn.number, turn.work)
 
     def check(self, now: float, gap: float) -> None:
-        """Kill a child whose turn makes no step; `gap` is how long this host itself stood still before `now`."""
-        if not self._turns:
-            return
+        """Kill a child that hangs in a turn or as it starts; `gap` is how long this host itself stood still."""
         steps, since = self._progress
         since += gap
-        stall = max(job.stall for job in self.running)
-        if self.steps != steps:
-            since = now
-        elif now - since > stall > 0:
-            self._ended_for = f"no step for {stall:g} s"
-            self._process.kill()
+        if not self.ready:
+            limit = START_LIMIT * 2**self._failed_starts
+            self._kill_after(limit, now - since, f"no word for {limit:g} s as it started")
+        elif self._turns:
+            if self.steps != steps:
+                since = now
+            limit = max(job.stall for job in self.running)
+            self._kill_after(limit, now - since, f"no step for {limit:g} s")
         self._progress = (self.steps, since)
 
     def abandon(self, digest: bytes) -> None:
@@ -168,226 +130,85 @@ class Slot:
             digests = {job.digest for job in turn.jobs}
             turn.unwanted |= {digest} & digests
             if turn.unwanted == digests:
-                self._abandoned[turn.number % 2] = turn.number
+                self._child.give_up(turn.number)
 
     def handle(self, event: SlotEvent) -> tuple[Result, ...]:
         """Take one of this slot's events; the results of its turn, if that has ended."""
         if event.life != self._life:
             return ()
-        if event.ready is not None:
-            self.ready, self.drawn_by = True, event.ready.drawn_by
+        if isinstance(event.word, Ready):
+            self.ready, self.drawn_by = True, event.word.drawn_by
             self._failed_starts = 0
-        elif event.done is not None:
-            return self._end_turn(event.done)
-        elif event.gone is not None:
-            return self._replace(event.gone)
+            self._watch_anew()
+        elif isinstance(event.word, Done):
+            return self._end_turn(event.word)
+        elif isinstance(event.word, Failure):
+            self._last_word = event.word.text
+        else:
+            return self._replace()
         return ()
 
     def stop(self) -> None:
         """End the child."""
         self._life += 1
-        self._process.kill()
-        self._process.join()
-        self._reader.join()  # before its pipe is closed, whose number the next one may have
-        self._pipe.close()
+        self._child.close()
 
-    def _begin(self) -> None:
+    def _watch_anew(self) -> None:
         self._progress = (0, monotonic())
 
-    def _send(self, turn: Turn) -> None:
-        try:
-            self._pipe.send((turn.number, turn.work))
-        except OSError:
-            log.debug("slot %d is gone", self.number)
+    def _kill_after(self, limit: float, quiet: float, why: str) -> None:
+        """Kill a child that has been quiet for longer than `limit` seconds; 0: never."""
+        if quiet > limit > 0:
+            self._ended_for = why
+            self._child.kill()
 
     def _end_turn(self, done: Done) -> tuple[Result, ...]:
         turn = self._turns.popleft()
-        size = sum(len(vector) for _, vector in turn.work)
-        self._short = size <= SMALL and bool(done.results) and sum(each.seconds for each in done.results) < SHORT
-        self._begin()
-        if not self._turns:
-            self._replace_if_swollen()
+        self._short = turn.size <= SMALL and bool(done.results) and sum(each.seconds for each in done.results) < SHORT
+        self._watch_anew()
+        if not self._turns and 0 < self._memory_limit < (held := self._child.memory):
+            log.warning("slot %d holds %d MiB; starting another", self.number, held >> 20)
+            self.stop()
+            self._start()
         return done.results
 
-    def _replace(self, why: str) -> tuple[Result, ...]:
-        until = monotonic() + ENDING
-        while self._process.is_alive() and monotonic() < until:  # `join` would wait for a child that is only silent
-            sleep(0.005)
-        if self._process.is_alive():
-            self._ended_for = self._ended_for or why
-            self._process.kill()
-        self._process.join()
-        code = self._process.exitcode or 0
-        reason = self._ended_for or (f"signal {-code}" if code < 0 else why)
+    def _replace(self) -> tuple[Result, ...]:
+        """Another child in the place of one that is gone; errors for the jobs that it had in its hands."""
+        if not self._child.wait():
+            self._ended_for = self._ended_for or self._last_word
+        steps = self.steps
+        ended_by = self._child.close()
+        reason = self._ended_for or ended_by or self._last_word
         self._failed_starts += not self.ready
         if self._failed_starts >= FAILED_STARTS:
             raise DreamfleetError(f"a slot cannot start: {reason}; `dreamfleet doctor` looks for the cause")
-        log.warning("slot %d ended (%s); starting another", self.number, reason)
-        steps = self.steps
-        lost = self._turns.popleft().jobs if self._turns else []
+        lost = self._turns.popleft().jobs if self.ready and self._turns else []  # one that starts has begun nothing
+        log.warning("slot %d ended (%s)%s; starting another", self.number, reason, _among(lost))
         self._start()
         return tuple(
             Result(job.digest, None, steps // len(lost), 0.0, f"slot crashed ({reason})", None) for job in lost
         )
 
-    def _replace_if_swollen(self) -> None:
-        held = _memory_of(self.pid) if self._memory_limit else 0
-        if held > self._memory_limit:
-            log.warning("slot %d holds %d MiB; starting another", self.number, held >> 20)
-            self.stop()
-            self._start()
-
     def _start(self) -> None:
-        """A new child; what waited in the last one's pipe goes to it."""
+        """A new child; what waited for the last one goes to it."""
         self.ready = self._short = False
-        self._ended_for = ""
-        pin_thread_pools()
-        context = get_context("spawn")
-        self._life += 1
+        self._ended_for, self._last_word = "", "the child ended"
         self._sent = 0  # turns given to this child
-        self._steps: Any = context.Value("Q", 0, lock=False)
-        self._abandoned: Any = context.Array("Q", 2, lock=False)  # turns to give up: an even one, an odd one
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(
-            target=serve_jobs,
-            args=(theirs, self._steps, self._abandoned, self._spec, self._bundle, os.getpid()),
-            daemon=True,
+        self._life += 1
+        number, life, events = self.number, self._life, self._events
+        self._child = ChildProcess(
+            self._spec, self._bundle, lambda word: events.put(("slot", SlotEvent(number, life, word)))
         )
-        with _signals_held():
-            self._process.start()
-        theirs.close()
-        self._reader = threading.Thread(target=self._read, args=(self._pipe, self._life), daemon=True)
-        self._reader.start()
+        self._watch_anew()
         waiting, self._turns = self._turns, deque()
         for turn in waiting:
             if wanted := [work for work in turn.work if work[0].digest not in turn.unwanted]:
                 self.submit(wanted)
 
-    def _read(self, pipe: Connection[Any, Any], life: int) -> None:
-        """In a thread of its own: pass on what the child says, until it is gone."""
-        why = "the child ended"
-        while True:
-            try:
-                said = pipe.recv()
-            except (EOFError, OSError):
-                break
-            if isinstance(said, str):
-                why = said
-            elif isinstance(said, Ready):
-                self._events.put(("slot", SlotEvent(self.number, life, ready=said)))
-            else:
-                self._events.put(("slot", SlotEvent(self.number, life, done=said)))
-        self._events.put(("slot", SlotEvent(self.number, life, gone=why)))
 
-
-class AbandonedError(Exception):
-    """The running turn is not wanted any more."""
-
-
-def serve_jobs(
-    pipe: Connection[Any, Any], steps: Any, abandoned: Any, spec: TaskSpec, bundle: Path, parent: int
-) -> None:
-    """The child: score jobs from the pipe until it closes. `steps` and `abandoned` are shared with the parent."""
-    _die_with(parent)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker decides; Ctrl-C reaches the whole group
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from dreamfleet.common.bundle import Bundle
-    from dreamfleet.worker.scoring.scorer import Scorer
-
-    try:
-        scorer = Scorer(spec, Bundle.open(bundle))
-    except Exception as error:
-        pipe.send(_one_line(error))
-        raise SystemExit(1) from error
-    pipe.send(Ready(scorer.drawn_by))
-
-    while True:
-        try:
-            turn, work = pipe.recv()
-        except EOFError:
-            return
-
-        def count(made: int) -> None:
-            steps.value = made
-            if abandoned[turn % 2] == turn:  # noqa: B023 - called within this round
-                raise AbandonedError
-
-        try:
-            count(0)
-            done = _do(scorer, turn, work, count)
-        except AbandonedError:
-            done = Done(turn, ())
-        pipe.send(done)
-
-
-@contextmanager
-def _signals_held() -> Iterator[None]:
-    """A child started here inherits the mask: Ctrl-C, which reaches the whole group, cannot end it while it imports."""
-    resource_tracker.ensure_running()  # as it starts it would lift the mask
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _do(scorer: Any, turn: int, work: Sequence[Work], count: Callable[[int], None]) -> Done:
-    """A result of each job; whatever a task raises is the jobs' error, not the slot's end."""
-    started, made, upload = perf_counter(), 0, None
-
-    def on_step(done: int) -> None:
-        nonlocal made
-        made = done
-        count(done)
-
-    episodes = [(job.kind, np.frombuffer(vector, dtype="<f4"), job.seeds[0]) for job, vector in work]
-    try:
-        if episodes[0][0] == "collect":
-            _, vector, seed = episodes[0]
-            score, drive = scorer.collect(vector, seed, on_step)
-            scores, upload = [score], _packed(drive)
-        else:
-            scores = scorer.score_all(episodes, on_step, work[0][0].temperature)
-    except AbandonedError:
-        raise
-    except Exception as error:
-        each = made // len(work), (perf_counter() - started) / len(work), _one_line(error)
-        return Done(turn, tuple(Result(job.digest, None, *each, None) for job, _ in work))
-    spent = (perf_counter() - started) / len(work)
-    sha256 = None if upload is None else hashlib.sha256(upload).digest()
-    results = [
-        Result(job.digest, score.fitness, score.steps, spent, None, sha256)
-        for (job, _), score in zip(work, scores, strict=True)
-    ]
-    return Done(turn, tuple(results), upload)
-
-
-def _packed(drive: Any) -> bytes:
-    data: bytes = drive.packed()
-    if len(data) > MAX_UPLOAD:
-        raise ValueError(f"a drive of {len(drive)} steps is larger than {MAX_UPLOAD >> 20} MiB: shorten the horizon")
-    return data
-
-
-def _memory_of(pid: int) -> int:
-    """Bytes of a process that lie in memory; 0 where that is not known."""
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
-        return 0
-
-
-def _one_line(error: Exception) -> str:
-    text = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {text[0] if text else ''}"[:500]
-
-
-def _die_with(parent: int) -> None:
-    """Ask Linux to end this process with its parent; the closed pipe does so elsewhere, a job later."""
-    try:
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    except (OSError, AttributeError):
-        return
-    if os.getppid() != parent:
-        raise SystemExit(1)
+def _among(jobs: list[Job]) -> str:
+    """Which job a crash was in."""
+    if not jobs:
+        return ""
+    first, more = jobs[0], f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""
+    return f" in generation {first.generation}, candidate {first.candidate}, seed {first.seeds[0]}{more}"

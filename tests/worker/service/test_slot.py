@@ -15,7 +15,7 @@ import pytest
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.messages import TaskSpec
-from dreamfleet.worker.service.slot import FAILED_STARTS, Slot
+from dreamfleet.worker.service.slot import FAILED_STARTS, START_LIMIT, Slot
 from tests.support import tasks
 from tests.support.processes import environment
 from tests.support.samples import VECTOR, job
@@ -50,7 +50,13 @@ class Harness:
         while True:
             event = self.events.get(timeout=TIMEOUT)[1]
             if results := self.slot.handle(event):
-                return results[0], event.done.upload
+                return results[0], event.upload
+
+    def gone(self):
+        """The event that the child is gone, not handled yet."""
+        while (event := self.events.get(timeout=TIMEOUT)[1]).word is not None:
+            self.slot.handle(event)
+        return event
 
     def score(self, episode=0):
         self.wait_ready()
@@ -231,10 +237,46 @@ def test_a_child_that_cannot_start_ends_with_its_reason(harness, tmp_path):
     broken.write_bytes(b"no bundle")
     slot = harness(tasks.TOY, broken)
     for _ in range(FAILED_STARTS - 1):
-        slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1])
-    last = slot.events.get(timeout=TIMEOUT)[1]
+        slot.slot.handle(slot.gone())
+    last = slot.gone()
     with pytest.raises(DreamfleetError, match=r"cannot start: BundleError.*not a whole bundle"):
         slot.slot.handle(last)
+
+
+def test_a_child_that_is_stopped_as_it_starts_is_replaced_after_a_generous_while(harness):
+    slot = harness(tasks.TOY)
+    pid, now = slot.slot.pid, monotonic()
+    os.kill(pid, signal.SIGSTOP)
+    slot.slot.check(now + START_LIMIT - 1.0, 0.0)
+    slot.slot.check(now + 2 * START_LIMIT, START_LIMIT)  # so long did the host itself stand still
+    slot.slot.check(now + 2 * START_LIMIT + 2.0, 0.0)
+    slot.slot.handle(slot.gone())
+    assert slot.score().fitness is not None
+    assert slot.slot.pid != pid
+
+
+def test_a_child_that_needs_longer_to_start_is_given_longer_the_next_time(harness):
+    slot = harness(tasks.TOY)
+    os.kill(slot.slot.pid, signal.SIGSTOP)
+    slot.slot.check(monotonic() + START_LIMIT + 2.0, 0.0)
+    slot.slot.handle(slot.gone())
+    pid = slot.slot.pid
+    slot.slot.check(monotonic() + 2 * START_LIMIT - 2.0, 0.0)
+    assert slot.score().fitness is not None
+    assert slot.slot.pid == pid
+
+
+def test_a_child_that_ends_as_it_starts_blames_no_job(harness):
+    slot = harness(tasks.SLOW_TOY)
+    slot.wait_ready()
+    for number in (0, 1):
+        slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    assert slot.result().error == "slot crashed (signal 9)"
+    os.kill(slot.slot.pid, signal.SIGKILL)  # the next child, to which the second job has gone, and which starts
+    scored = slot.result()
+    assert scored.digest == job(1, spec=slot.spec).digest
+    assert scored.fitness is not None
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -1,0 +1,74 @@
+"""Workers against coordinators driven by hand, over real routers."""
+
+import logging
+import queue
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+from dreamfleet.common.session import Network
+from dreamfleet.worker.service.config import WorkerConfig
+from dreamfleet.worker.service.worker import Worker
+from tests.support import tasks
+from tests.support.hand import DEADLINE, Hand
+from tests.support.processes import free_port
+
+
+class Stage:
+    """Workers and hand-driven coordinators that end with the test."""
+
+    def __init__(self, bundle):
+        self.bundle = bundle
+        self.port = free_port()
+        self.workers, self.hands = [], []
+        self._threads = ThreadPoolExecutor()
+
+    def hand(self, task=tasks.TOY, **more):
+        self.hands.append(Hand(self.port, self.bundle, task, **more))
+        return self.hands[-1]
+
+    def also(self, hand, task=tasks.TOY, **more):
+        """Another run's coordinator, whose router is that of `hand`."""
+        self.hands.append(Hand(self.port, self.bundle, task, beside=hand, **more))
+        return self.hands[-1]
+
+    def worker(self, endpoint=None, **config):
+        """A worker and the future of its `serve`."""
+        config = WorkerConfig(**{"run": "test", "slots": 1, **config})
+        made = Worker(config, Network(connect=(endpoint or f"tcp/127.0.0.1:{self.port}",)))
+        self.workers.append((made, self._threads.submit(made.serve)))
+        return self.workers[-1]
+
+    def close(self):
+        for made, served in self.workers:
+            made.stop()
+            made.stop()
+            served.exception(DEADLINE)
+        for each in self.hands:
+            each.close()
+        self._threads.shutdown()
+
+
+@contextmanager
+def listening():
+    """What a worker logs, as a queue of lines."""
+    lines = queue.SimpleQueue()
+    handler = logging.Handler()
+    handler.emit = lambda record: lines.put(record.getMessage())
+    logger = logging.getLogger("dreamfleet.worker")
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    yield lines
+    logger.removeHandler(handler)
+    logger.setLevel(before)
+
+
+def wait_for(lines, text):
+    while text not in (line := lines.get(timeout=DEADLINE)):
+        pass
+    return line
+
+
+def drained(lines):
+    """What was said and not waited for."""
+    return [lines.get_nowait() for _ in range(lines.qsize())]

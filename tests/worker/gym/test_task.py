@@ -1,0 +1,116 @@
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+
+from dreamfleet.common.actions import Continuous, Discrete
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.tasks import describe_task, family_of
+from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tasks.registry import find_task, known_tasks
+
+CARTPOLE = "gym:CartPole-v1"
+
+
+def spec(name, hidden=0, **options):
+    told = describe_task(name, options)
+    shape = ControllerShape(told.observations, told.outputs, hidden)
+    return TaskSpec(name, "", 1000, 0, shape, options=told.options, version=told.version)
+
+
+def test_a_familys_members_are_announced_by_its_name():
+    assert "gym" in known_tasks()
+    assert (family_of(CARTPOLE), family_of("car-racing"), family_of("a.module:Task")) == (
+        "gym", "car-racing", "a.module:Task",
+    )  # fmt: skip
+    assert find_task(CARTPOLE).name == CARTPOLE
+
+
+@pytest.mark.parametrize(
+    ("name", "observations", "outputs", "engine"),
+    [
+        (CARTPOLE, 4, 2, ()),
+        ("gym:Pendulum-v1", 3, 1, ()),
+        ("gym:LunarLander-v3", 8, 4, ("box2d", "box2d-py")),
+        ("gym:CarRacing-v3", 96 * 96 * 3, 3, ("box2d", "box2d-py")),
+    ],
+)
+def test_sizes_and_packages_are_the_environments_own(name, observations, outputs, engine):
+    told = describe_task(name, {})
+    assert (told.observations, told.outputs) == (observations, outputs)
+    assert told.packages == ("numpy", "gymnasium", *engine)
+    assert told.options == ""
+
+
+def test_the_environments_arguments_are_part_of_the_run():
+    told = describe_task("gym:LunarLander-v3", {"environment": {"continuous": True}})
+    assert (told.outputs, json.loads(told.options)) == (2, {"environment": {"continuous": True}})
+    scorer = Scorer(spec("gym:LunarLander-v3", environment={"continuous": True}))
+    assert isinstance(scorer.world.actions, Continuous)
+    assert scorer.score("score", np.zeros(18, np.float32), 1).steps > 10
+    scorer.close()
+
+
+def test_a_score_is_the_environments_own_under_a_controller():
+    scorer = Scorer(spec(CARTPOLE))
+    parameters = np.array([0, 0, -1, -1, 0, 0, 1, 1, 0, 0], np.float32)  # to the side that the pole falls to
+    environment = gymnasium.make("CartPole-v1")
+    observation, _ = environment.reset(seed=7)
+    total, over = 0.0, False
+    while not over:
+        action = int(parameters[:4] @ observation < parameters[4:8] @ observation)
+        observation, reward, terminated, truncated, _ = environment.step(action)
+        total, over = total + reward, terminated or truncated
+    assert scorer.score("evaluate", parameters, 7).fitness == total > 100
+    scorer.close()
+
+
+def test_observations_are_normalised_by_what_the_run_froze():
+    once, again = (spec("gym:Pendulum-v1", normalise=True, seed=3) for _ in range(2))
+    assert once == again
+    normal = once.option("normal")
+    assert len(normal["mean"]) == len(normal["deviation"]) == 3
+    plain, scaled = Scorer(spec("gym:Pendulum-v1")), Scorer(once)
+    parameters = np.array([0.1, -0.2, 0.3, 0.05], np.float32)
+    # A controller that undoes the normalisation drives as the plain one does.
+    deviation, mean = np.array(normal["deviation"]), np.array(normal["mean"])
+    undone = np.array([*(parameters[:3] * deviation), parameters[3] + parameters[:3] @ mean], np.float32)
+    assert scaled.score("score", undone, 5).fitness == pytest.approx(plain.score("score", parameters, 5).fitness, 1e-3)
+    plain.close()
+    scaled.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("gym:Nothing-v0", "makes no environment 'Nothing-v0'"),
+        ("gym:no_such_module:X-v0", "No module named 'no_such_module'"),
+        ("gym:", "makes no environment ''"),
+        ("gym", "cannot be loaded"),
+        ("gym:Blackjack-v1", "only Box observations"),
+        ("car-racing:x", "cannot be loaded"),
+    ],
+)
+def test_what_cannot_be_scored_in_is_refused_with_why(name, says):
+    with pytest.raises(UsageError, match=says):
+        describe_task(name, {})
+
+
+def test_unknown_options_and_arguments_are_refused():
+    with pytest.raises(UsageError, match="knows no option wings: environment, normalise"):
+        describe_task(CARTPOLE, {"wings": 2})
+    with pytest.raises(UsageError, match="takes no such arguments"):
+        describe_task(CARTPOLE, {"environment": {"wings": 2}})
+
+
+def test_a_controller_of_other_outputs_is_refused():
+    with pytest.raises(ControllerError, match="3 outputs does not fit 2 actions"):
+        Scorer(TaskSpec(CARTPOLE, "", 100, 0, ControllerShape(4, 3)))
+
+
+def test_of_equal_outputs_the_first_action_is_taken_and_numbers_begin_where_the_environment_says():
+    assert Discrete(3, first=2).of(np.array([0.0, 1.0, 1.0])) == 3
+    assert Continuous.between([0, -2], [1, 2]).of(np.array([0.0, 100.0])) == pytest.approx([0.5, 2.0])

@@ -1,0 +1,40 @@
+import numpy as np
+import pytest
+
+from dreamfleet.common.bundle import BundleStore, Manifest, default_cache, write_bundle
+from dreamfleet.common.messages import MAX_PART
+from tests.support.bundles import npy
+from tests.support.stage import Stage, listening
+
+PARTS = 6  # of the small bundle
+
+
+@pytest.fixture(scope="module")
+def small_bundle(tmp_path_factory):
+    """No world model, only as many bytes: the toy tasks do not look inside."""
+    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx"), b"x")
+    parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
+    manifest = Manifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
+    path = tmp_path_factory.mktemp("bundle") / "small.zip"
+    return write_bundle(path, manifest, {**parts, "policy.onnx": bytes((PARTS - 1) * MAX_PART)})
+
+
+@pytest.fixture
+def cached(small_bundle):
+    with BundleStore(default_cache()).downloading(small_bundle.sha256) as path:
+        path.write_bytes(small_bundle.path.read_bytes())
+    BundleStore(default_cache()).complete(small_bundle.sha256)
+
+
+@pytest.fixture
+def stage(small_bundle):
+    made = Stage(small_bundle)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def said():
+    """What a worker logs, waited for with `wait_for`."""
+    with listening() as lines:
+        yield lines

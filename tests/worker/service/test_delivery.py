@@ -1,0 +1,142 @@
+"""What a worker takes and what it delivers, whatever is lost, doubled or foreign."""
+
+import hashlib
+
+import pytest
+
+from dreamfleet.common.codec import encode
+from dreamfleet.common.messages import MAX_MESSAGE, MAX_PART, Beat, UploadPart
+from tests.support import tasks
+from tests.support.hand import SECOND, tag
+from tests.support.samples import MSGPACK
+from tests.support.stage import drained, wait_for
+
+pytestmark = pytest.mark.timeout(60)
+
+
+def test_a_result_is_repeated_until_its_verdict_and_then_no_more(stage, cached):
+    hand = stage.hand()
+    stage.worker()
+    hand.ready()
+    first, second = hand.job(0), hand.job(1)
+    hand.send(1, first)
+    told = [hand.result(first) for _ in range(3)]
+    assert told[0].fitness is not None
+    assert told[0] == told[1] == told[2]
+    assert hand.beat(lambda beat: beat.unacked).unacked == (tag(first),)
+    hand.send(2, second, accepted=(first,))
+    hand.beat(lambda beat: tag(first) not in beat.unacked and beat.seen == 2)
+    for _ in range(3):
+        assert hand.results(second) == {second.digest}
+
+
+def test_a_batch_number_that_came_already_is_ignored(stage, cached):
+    hand = stage.hand()
+    stage.worker()
+    hand.ready()
+    first, smuggled, last = hand.job(0), hand.job(1), hand.job(2)
+    hand.send(1, first)
+    hand.send(1, smuggled)
+    hand.send(2, last)
+    assert hand.results(first, last) == {first.digest, last.digest}
+    assert hand.beat(lambda beat: beat.seen == 2 and not beat.running).unacked == (tag(first), tag(last))
+
+
+def test_a_lost_batch_shows_in_the_beats_until_it_is_sent_again(stage, cached):
+    hand = stage.hand()
+    stage.worker()
+    hand.ready()
+    lost, later = hand.job(0), hand.job(1)
+    hand.send(1)
+    hand.send(3, later)
+    hand.result(later)
+    assert hand.beat().seen == 1
+    hand.send(2, lost)
+    hand.result(lost)
+    assert hand.beat(lambda beat: beat.seen != 1).seen == 3
+
+
+def test_what_is_foreign_or_malformed_is_dropped_and_counted(stage, cached):
+    hand = stage.hand()
+    made, _ = stage.worker()
+    hand.ready()
+    foreign, mine = hand.job(0), hand.job(1)
+    hand.send(1, foreign, nonce=SECOND)
+    hand.send(1, foreign, run_uid="f" * 32)
+    for payload in (b"", b"\xc1", bytes(MAX_MESSAGE + 1), encode(MSGPACK["beat"])):
+        hand.put(payload)
+    hand.send(1, mine)
+    assert hand.results(mine) == {mine.digest}
+    assert made.inbox.dropped == {"foreign coordinator": 2, "not msgpack": 2, "oversize": 1, "wrong fields": 1}
+
+
+def test_a_job_that_is_not_what_its_digest_says_is_an_error(stage, cached):
+    hand = stage.hand()
+    stage.worker()
+    hand.ready()
+    job = MSGPACK["job"].jobs[0]  # of another run's task
+    hand.send(1, job)
+    assert "digest" in hand.result(job).error
+
+
+def test_a_drive_is_uploaded_again_until_its_verdict_and_then_no_more(stage, cached):
+    hand = stage.hand(tasks.HEAVY)
+    stage.worker()
+    hand.ready()
+    kept, other = hand.job(0, "collect"), hand.job(1)
+    hand.send(1, kept)
+    data = hand.upload(kept)
+    assert len(data) > 3 * MAX_PART
+    assert hand.result(kept).upload == hashlib.sha256(data).digest()
+    assert hand.upload(kept) == data
+    hand.send(2, other, accepted=(kept,))
+    hand.beat(lambda beat: beat.seen == 2 and tag(kept) not in beat.unacked)
+    for _ in range(3):
+        assert isinstance(hand.next((UploadPart, Beat)), Beat)
+
+
+def test_a_cancelled_job_is_not_started(stage, cached):
+    hand = stage.hand(tasks.SLOW_TOY)
+    stage.worker()
+    hand.ready()
+    running, cancelled, last = (hand.job(number) for number in range(3))
+    hand.send(1, running, cancelled, last)
+    hand.beat(lambda beat: tag(cancelled) in beat.queued and tag(running) in {each.tag for each in beat.running})
+    hand.send(2, cancels=(cancelled.digest,))
+    assert hand.results(running, last) == {running.digest, last.digest}
+
+
+def test_its_queue_stands_still_while_too_many_results_have_no_verdict(stage, cached):
+    hand = stage.hand()
+    stage.worker()
+    hand.ready()
+    jobs = [hand.job(number) for number in range(8)]
+    hand.send(1, *jobs)
+    stuck = hand.beat(lambda beat: len(beat.unacked) == 5)
+    assert stuck.queued == tuple(tag(job) for job in jobs[5:])
+    hand.send(2, accepted=jobs[:5])
+    hand.beat(lambda beat: beat.unacked == tuple(tag(job) for job in jobs[5:]))
+
+
+def test_a_failing_task_leaves_its_traceback_in_the_log_once_with_the_job_that_met_it(stage, said, cached):
+    hand = stage.hand(tasks.RAISING)
+    stage.worker()
+    hand.ready()
+    jobs = [hand.job(number) for number in range(3)]
+    hand.send(1, *jobs)
+    hand.results(*jobs)
+    told = wait_for(said, "the road has ended")
+    assert told.startswith(
+        f"task {tasks.RAISING}: RuntimeError: the road has ended (score in generation 7, candidate 2"
+    )
+    assert f"seed {jobs[0].seeds[0]})" in told
+    assert 'raise RuntimeError("the road has ended")' in told
+    assert not [line for line in drained(said) if "Traceback" in line]
+
+
+def test_a_crash_names_the_job_that_it_was_in(stage, said, cached):
+    hand = stage.hand(tasks.CRASHING)
+    stage.worker()
+    hand.ready()
+    hand.send(1, hand.job())
+    assert f"in generation 7, candidate 2, seed {hand.job().seeds[0]}; starting" in wait_for(said, "slot 0 ended")

@@ -1,0 +1,91 @@
+"""A worker and the next life of its coordinator, or a coordinator that may have forgotten it."""
+
+import pytest
+
+from dreamfleet.common.errors import RefusedError
+from dreamfleet.common.messages import Intervals, ResultBatch, UploadPart
+from tests.support import tasks
+from tests.support.hand import DEADLINE, SECOND, tag
+from tests.support.relay import Relay
+
+pytestmark = pytest.mark.timeout(60)
+SLOW_BEATS = Intervals(beat=2 * DEADLINE, repeat=0.1)
+
+
+def test_it_follows_its_run_into_the_coordinators_next_life(stage, cached):
+    hand = stage.hand(tasks.SLOW_TOY)
+    stage.worker()
+    hand.ready()
+    done, running, queued = (hand.job(number) for number in range(3))
+    hand.send(1, done, running, queued)
+    hand.result(done)
+    hand.beat(lambda beat: [each.tag for each in beat.running] == [tag(running)])
+    hand.vanish()
+    hand.nonce, hand.incarnation = SECOND, 2
+    hand.appear()
+    hand.hello()
+    beat = hand.beat(lambda beat: beat.nonce == SECOND)
+    assert (beat.incarnation, beat.seen, beat.queued) == (2, 0, ())
+    assert tag(done) in beat.unacked
+    assert hand.next(ResultBatch).incarnation == 2
+    assert hand.results(done, running) == {done.digest, running.digest}
+    hand.send(1, queued)
+    assert hand.result(queued).fitness is not None
+
+
+def test_a_coordinators_next_life_hears_a_drive_from_the_beginning(stage, cached):
+    hand = stage.hand(tasks.HEAVY)
+    stage.worker()
+    hand.ready()
+    kept = hand.job(0, "collect")
+    hand.send(1, kept)
+    data = hand.upload(kept)
+    hand.vanish()
+    hand.nonce, hand.incarnation = SECOND, 2
+    hand.appear()
+    hand.beat(lambda beat: beat.nonce == SECOND and tag(kept) in beat.unacked)
+    assert hand.next(UploadPart).incarnation == 2
+    assert hand.upload(kept) == data
+
+
+@pytest.fixture
+def relay(stage):
+    made = Relay(stage.port)
+    yield made
+    made.close()
+
+
+def test_a_cut_connection_makes_it_say_hello_again(stage, relay, cached):
+    hand = stage.hand()
+    hand.intervals = SLOW_BEATS  # so that no silence is long enough to be what it notices
+    stage.worker(relay.endpoint)
+    hand.ready()
+    first, second = hand.job(0), hand.job(1)
+    hand.send(1, first)
+    hand.result(first)
+    relay.cut()
+    hand.hello()
+    assert hand.beat(lambda beat: beat.seen == 0).unacked == (tag(first),)
+    hand.send(1, second)
+    assert hand.results(first, second) == {first.digest, second.digest}
+
+
+@pytest.mark.parametrize("owed", [True, False])
+def test_a_coordinator_that_has_nothing_to_say_is_asked_whether_it_knows_the_worker(stage, cached, owed):
+    hand = stage.hand()
+    stage.worker()
+    hand.ready()
+    if owed:
+        hand.send(1, hand.job())
+        hand.result(hand.job())
+    hand.hello()
+
+
+def test_another_run_of_the_same_name_ends_it(stage, cached):
+    hand = stage.hand()
+    _, served = stage.worker()
+    hand.ready()
+    hand.vanish()
+    hand.nonce, hand.run_uid = SECOND, "f" * 32
+    hand.appear()
+    assert isinstance(served.exception(DEADLINE), RefusedError)

@@ -1,0 +1,85 @@
+"""A child process that scores: it knows nothing of Zenoh, takes turns from a pipe, and dies with its parent.
+
+This module imports nothing heavy, so that a child has asked to die with its parent before it loads a simulator.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import faulthandler
+import os
+import signal
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+    from pathlib import Path
+
+    from dreamfleet.common.messages import TaskSpec
+    from dreamfleet.worker.scoring.scorer import Scorer
+
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A child's first word: it can score, and who draws its picture."""
+
+    drawn_by: str
+
+
+def serve_jobs(
+    pipe: Connection[Any, Any], steps: Any, abandoned: Any, spec: TaskSpec, bundle: Path | None, parent: int
+) -> None:
+    """Score jobs from the pipe until it closes. `steps` and `abandoned` are shared with the parent."""
+    _die_with(parent)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker decides; Ctrl-C reaches the whole group
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    with suppress(OSError, AttributeError, ValueError, RuntimeError):  # no stderr: no traceback of a crash
+        faulthandler.enable()
+    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    scorer = _make_scorer(pipe, spec, bundle)
+    pipe.send(Ready(scorer.drawn_by))
+    _take_turns(pipe, scorer, steps, abandoned)
+
+
+def _make_scorer(pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None) -> Scorer:
+    """Load task and world model; what keeps them from loading is this child's last word."""
+    from dreamfleet.common.bundle import Bundle
+    from dreamfleet.worker.scoring.scorer import Scorer
+    from dreamfleet.worker.service.turn import Failure
+
+    try:
+        return Scorer(spec, None if bundle is None else Bundle.open(bundle))
+    except Exception as error:
+        pipe.send(Failure.of(error))
+        raise SystemExit(1) from error
+
+
+def _take_turns(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandoned: Any) -> None:
+    from dreamfleet.worker.service.turn import AbandonedError, do_turn
+
+    while True:
+        try:
+            turn, work = pipe.recv()
+        except EOFError:
+            return
+
+        def count(made: int) -> None:
+            steps.value = made
+            if abandoned[turn % 2] == turn:  # noqa: B023 - called within this round
+                raise AbandonedError
+
+        pipe.send(do_turn(scorer, turn, work, count))
+
+
+def _die_with(parent: int) -> None:
+    """Ask Linux to end this process with its parent; the closed pipe does so elsewhere, a job later."""
+    try:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    except (OSError, AttributeError):
+        return
+    if os.getppid() != parent:
+        raise SystemExit(1)

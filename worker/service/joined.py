@@ -1,0 +1,220 @@
+"""A worker's time in one run: it takes jobs, has them scored, and delivers until each result has its verdict.
+
+One owner thread and one queue; Zenoh's callbacks and the slots' readers only enqueue. What is decided lies in pure
+parts (`Membership`, `Backlog`, `Outbox`, `Uploads`); here they meet the clock, the session and the slots.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from time import monotonic
+from typing import Any
+
+import zenoh
+
+from dreamfleet.common import keys
+from dreamfleet.common.codec import Inbox
+from dreamfleet.common.errors import RefusedError
+from dreamfleet.common.messages import JobBatch, Result
+from dreamfleet.common.session import enqueue_into
+from dreamfleet.worker.service.admission import Admission
+from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.membership import Hands, Membership
+from dreamfleet.worker.service.outbox import Outbox
+from dreamfleet.worker.service.post import Post, Rate
+from dreamfleet.worker.service.slot import SlotEvent
+from dreamfleet.worker.service.slots import Slots
+from dreamfleet.worker.service.uploads import PACE, Uploads
+
+log = logging.getLogger(__name__)
+CLOCK_GAP = 2.0  # seconds between turns of the loop that mean a suspended host
+
+Events = queue.SimpleQueue[tuple[str, Any]]
+
+
+@dataclass(frozen=True)
+class Line:
+    """How this worker reaches coordinators: its session and name, and what it decodes with."""
+
+    session: zenoh.Session
+    identity: str
+    inbox: Inbox
+    say_hello: Callable[[str], Admission | None]  # to a run by name; `None` if nobody answers
+    pause: Callable[[], float]  # seconds until hello may be said again
+
+
+class JoinedRun:
+    """The run that this worker has joined; `serve` returns when the worker leaves it."""
+
+    def __init__(self, line: Line, admission: Admission, membership: Membership, slots: Slots, events: Events) -> None:
+        self._line = line
+        self._admission = admission
+        self._membership = membership
+        self._slots = slots
+        self._events = events
+        self._post = Post(line.session, line.identity, admission)
+        self._backlog = Backlog(admission.spec)
+        self._outbox = Outbox(admission.intervals.repeat)
+        self._uploads = Uploads(admission.intervals.repeat)
+        self._rate = Rate(monotonic())
+        self._beat_at = 0.0
+        self._finished = self._steps_finished = 0
+
+    def serve(self) -> None:
+        """Work until told to leave, or until the run is over; ends neither the slots nor the session."""
+        declared = self._startup()
+        self._main_loop()
+        self._shutdown(declared)
+
+    def _startup(self) -> list[Any]:
+        run, session = self._admission.run, self._line.session
+        self._membership.join(self._admission.nonce, self._admission.intervals.beat, monotonic())
+        coordinators = keys.live_coordinator(run, "*")
+        declared = [
+            session.declare_subscriber(keys.job(run, self._line.identity), enqueue_into(self._events, "job")),
+            session.liveliness().declare_subscriber(
+                coordinators, enqueue_into(self._events, "coordinator"), history=True
+            ),
+            session.liveliness().declare_token(keys.live_worker(run, self._line.identity)),
+        ]
+        log.info("joined run %s as %s, %d slots", run, self._line.identity, len(self._slots))
+        return declared
+
+    def _main_loop(self) -> None:
+        now = monotonic()
+        while not self._membership.over(now, busy=self._slots.busy or len(self._outbox) > 0):
+            before = now
+            self._wait()
+            now = monotonic()
+            self._slots.check(now, gap=now - before if now - before > CLOCK_GAP else 0.0)
+            if self._membership.must_drain(now):
+                self._hand_back()
+                log.info("draining: running episodes finish, queued jobs go back")
+            self._fill_slots(now)
+            self._send(now)
+            if self._membership.must_rejoin(now, self._hands()):
+                self._rejoin(now)
+
+    def _shutdown(self, declared: list[Any]) -> None:
+        for each in declared:
+            each.undeclare()
+        log.info("leaving: %d jobs, %d environment steps", self._finished, self._steps_finished)
+
+    def _wait(self) -> None:
+        """Handle what has arrived, waiting until the next beat or repetition at most."""
+        timeout = min(max(self._beat_at - monotonic(), 0.0), self._admission.intervals.repeat / 4)
+        timeout = min(timeout, PACE) if len(self._uploads) else timeout
+        with suppress(queue.Empty):
+            self._handle(*self._events.get(timeout=timeout))
+            while True:
+                self._handle(*self._events.get_nowait())
+
+    def _handle(self, kind: str, event: Any) -> None:
+        if kind == "job":
+            self._take_batch(event.payload.to_bytes())
+        elif kind == "slot":
+            self._take_slot_event(event)
+        elif kind == "coordinator":
+            self._take_token(event)
+
+    def _take_token(self, event: zenoh.Sample) -> None:
+        nonce = str(event.key_expr).rsplit("/", 1)[-1]
+        if event.kind == zenoh.SampleKind.DELETE:
+            self._membership.vanish(nonce, monotonic())
+        else:
+            self._membership.appear(nonce)
+
+    def _take_batch(self, payload: bytes) -> None:
+        batch = self._line.inbox.decode(JobBatch, payload)
+        if batch is None:
+            return
+        if (batch.run_uid, batch.nonce) != (self._admission.run_uid, self._admission.nonce):
+            self._line.inbox.dropped["foreign coordinator"] += 1
+            return
+        self._membership.hear(monotonic())
+        for job, why in self._backlog.take_in(batch):
+            self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
+        judged = [verdict.digest for verdict in batch.verdicts]
+        self._outbox.settle(judged)
+        self._uploads.settle(judged)
+        for digest in batch.cancels:
+            self._slots.abandon(digest)
+        if self._membership.draining:  # jobs that were on their way: the next beat shows that they are not here
+            self._backlog.clear()
+
+    def _take_slot_event(self, event: SlotEvent) -> None:
+        now = monotonic()
+        self._membership.hear(now)
+        capacity = self._slots.capacity
+        results = self._slots.handle(event)
+        if self._slots.capacity > capacity:
+            self._beat_at = 0.0  # new capacity is told at once
+        for result in results:
+            self._finished += 1
+            self._steps_finished += result.steps
+            self._outbox.add(result)
+        if results:
+            if event.upload is not None:
+                self._uploads.add(results[0].digest, event.upload)
+            self._fill_slots(now)  # before the other slots' events are looked at
+
+    def _fill_slots(self, now: float) -> None:
+        if not self._membership.leaving(now):
+            self._slots.fill(self._backlog, undelivered=len(self._outbox))
+
+    def _hand_back(self) -> None:
+        """Begin nothing more; the next beat shows what is no longer here."""
+        self._backlog.clear()
+        self._slots.hand_back()
+
+    def _send(self, now: float) -> None:
+        for results in self._outbox.due(now):
+            self._post.results(results)
+        if now >= self._beat_at:
+            self._beat_at = now + self._admission.intervals.beat
+            self._post.beat(
+                self._slots,
+                seen=self._backlog.seen,
+                capacity=0 if self._membership.draining else self._slots.capacity,
+                queued=self._backlog.queued,
+                unacked=self._outbox.digests,
+                rate=self._rate.read(now, self._steps_finished + self._slots.steps),
+            )
+        for piece in self._uploads.due(now):  # after the beat, which says that the job is in these hands
+            self._post.upload(piece)
+
+    def _hands(self) -> Hands:
+        return Hands(idle=self._slots.idle, owed=len(self._outbox) > 0, uploading=len(self._uploads) > 0)
+
+    def _rejoin(self, now: float) -> None:
+        """Say hello again; what runs goes on, what is unacknowledged is kept, what is queued is given again."""
+        self._membership.ask(now, self._line.pause())
+        admission = self._line.say_hello(self._admission.run)
+        if admission is None:
+            return
+        if (admission.run_uid, admission.spec) != (self._admission.run_uid, self._admission.spec):
+            raise RefusedError(f"run {admission.run} is another run now; start this worker again to join it")
+        self._admission = admission
+        self._post = Post(self._line.session, self._line.identity, admission)
+        self._drop_batches()
+        self._backlog.begin()
+        self._backlog.clear()
+        self._outbox.resend_all()
+        self._uploads.resend_all()
+        self._beat_at = 0.0
+        self._membership.rejoin(admission.nonce, monotonic())
+        log.info("joined run %s again, incarnation %d", admission.run, admission.incarnation)
+
+    def _drop_batches(self) -> None:
+        """Batches that wait in the queue are of the numbering that has ended, and would pass for later ones."""
+        kept = []
+        with suppress(queue.Empty):
+            while True:
+                kept.append(self._events.get_nowait())
+        for kind, event in kept:
+            if kind != "job":
+                self._events.put((kind, event))

@@ -1,0 +1,88 @@
+"""What a worker says to its run's coordinator, as messages on its keys."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+
+import zenoh
+
+from dreamfleet.common import keys
+from dreamfleet.common.codec import encode, encoding
+from dreamfleet.common.fingerprint import fingerprint
+from dreamfleet.common.messages import MAX_LEASES, TAG_BYTES, Beat, Message, Result, ResultBatch, Running, UploadPart
+from dreamfleet.worker.service.admission import Admission
+from dreamfleet.worker.service.slots import Slots
+from dreamfleet.worker.service.uploads import Piece
+
+SMOOTHING = 0.3  # weight of the newest interval in the throughput
+
+
+class Rate:
+    """Environment steps a second, smoothed over the intervals between two readings."""
+
+    def __init__(self, now: float) -> None:
+        self._value = 0.0
+        self._last = (now, 0)
+
+    def read(self, now: float, steps: int) -> float:
+        """The rate, with `steps` made in all until now."""
+        (then, before), self._last = self._last, (now, steps)
+        if now > then:
+            self._value += SMOOTHING * (max(steps - before, 0) / (now - then) - self._value)
+        return self._value
+
+
+class Post:
+    """Sends to the coordinator's life that `admission` names; a new life makes a new one."""
+
+    def __init__(self, session: zenoh.Session, identity: str, admission: Admission) -> None:
+        self._session = session
+        self._identity = identity
+        self._run = admission
+
+    def results(self, results: tuple[Result, ...]) -> None:
+        """One message of finished jobs."""
+        batch = ResultBatch(
+            run_uid=self._run.run_uid,
+            incarnation=self._run.incarnation,
+            fingerprint=fingerprint(self._run.packages),
+            results=results,
+        )
+        self._put(keys.result(self._run.run, self._identity), batch)
+
+    def upload(self, piece: Piece) -> None:
+        """One part of a job's file."""
+        part = UploadPart(
+            run_uid=self._run.run_uid, incarnation=self._run.incarnation, digest=piece.digest, sha256=piece.sha256,
+            offset=piece.offset, total=piece.total, data=piece.data,
+        )  # fmt: skip
+        self._put(keys.upload(self._run.run, self._identity), part)
+
+    def beat(
+        self, slots: Slots, *, seen: int, capacity: int, queued: Sequence[bytes], unacked: Sequence[bytes], rate: float
+    ) -> None:
+        """What this worker holds: batches up to `seen`, jobs queued and running, results without a verdict."""
+        running: list[Running] = slots.running
+        beat = Beat(
+            run_uid=self._run.run_uid,
+            incarnation=self._run.incarnation,
+            nonce=self._run.nonce,
+            seen=seen,
+            capacity=capacity,
+            slots=len(slots),
+            queued=_tags([*queued, *(job.digest for job in slots.waiting)]),
+            running=tuple(running[:MAX_LEASES]),
+            unacked=_tags(unacked),
+            load=os.getloadavg()[0],
+            steps_per_second=rate,
+            drawn_by=slots.drawn_by,
+        )
+        self._put(keys.beat(self._run.run, self._identity), beat)
+
+    def _put(self, key: str, message: Message) -> None:
+        self._session.put(key, encode(message), encoding=encoding(type(message)))
+
+
+def _tags(digests: Iterable[bytes]) -> tuple[bytes, ...]:
+    return tuple(digest[:TAG_BYTES] for digest in list(digests)[:MAX_LEASES])

@@ -1,0 +1,109 @@
+"""The parent's hold on a child process: how it is spawned, spoken to, heard and ended.
+
+Spawned, never forked: a forked Zenoh session hangs.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context, resource_tracker
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.worker.service.child import Ready, serve_jobs
+from dreamfleet.worker.service.turn import Done, Failure, Work
+
+ENDING = 2.0  # seconds between a child's last word and its end
+
+Word = Ready | Done | Failure | None
+"""What a child says; `None`, from the reader itself, is that it says nothing any more."""
+
+
+class ChildProcess:
+    """A running child; `hear` is called in a thread of its own with each word, and with `None` at the end."""
+
+    def __init__(self, spec: TaskSpec, bundle: Path | None, hear: Callable[[Word], None]) -> None:
+        pin_thread_pools()
+        context = get_context("spawn")
+        self._steps: Any = context.Value("Q", 0, lock=False)
+        self._abandoned: Any = context.Array("Q", 2, lock=False)  # turns to give up: an even one, an odd one
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=serve_jobs, args=(theirs, self._steps, self._abandoned, spec, bundle, os.getpid()), daemon=True
+        )
+        with _signals_held():
+            self._process.start()
+        theirs.close()
+        self._reader = threading.Thread(target=self._read, args=(hear,), daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid or 0
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of the turn in its hands so far."""
+        return int(self._steps.value)
+
+    @property
+    def memory(self) -> int:
+        """Bytes of it that lie in memory; 0 where that is not known."""
+        try:
+            return int(Path(f"/proc/{self.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        except (OSError, ValueError, IndexError):
+            return 0
+
+    def send(self, turn: int, work: Sequence[Work]) -> None:
+        """Give it a turn; one that is gone is noticed by its reader."""
+        with suppress(OSError):
+            self._pipe.send((turn, work))
+
+    def give_up(self, turn: int) -> None:
+        """Have it end a turn at its next step; of two turns that it has, both can be given up."""
+        self._abandoned[turn % 2] = turn
+
+    def kill(self) -> None:
+        """End it; its reader then says so."""
+        self._process.kill()
+
+    def wait(self) -> bool:
+        """Wait a moment until it has ended by itself; whether it has."""
+        until = monotonic() + ENDING
+        while self._process.is_alive() and monotonic() < until:  # `join` would wait for a child that is only silent
+            sleep(0.005)
+        return not self._process.is_alive()
+
+    def close(self) -> str:
+        """End it if it lives, and release its pipe; the signal that it ended with, in words, or nothing."""
+        self._process.kill()
+        self._process.join()
+        self._reader.join()  # before its pipe is closed, whose number the next one may have
+        self._pipe.close()
+        code = self._process.exitcode or 0
+        return f"signal {-code}" if code < 0 else ""
+
+    def _read(self, hear: Callable[[Word], None]) -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                hear(self._pipe.recv())
+        hear(None)
+
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """A child started here inherits the mask: Ctrl-C, which reaches the whole group, cannot end it while it imports."""
+    resource_tracker.ensure_running()  # as it starts it would lift the mask
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

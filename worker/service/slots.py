@@ -1,0 +1,115 @@
+"""All scoring slots of a worker, as one."""
+
+from __future__ import annotations
+
+import logging
+import queue
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.messages import MAX_LEASES, TAG_BYTES, Job, Result, Running, TaskSpec
+from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.failures import Failures
+from dreamfleet.worker.service.slot import Slot, SlotEvent
+from dreamfleet.worker.tasks.registry import find_task
+
+log = logging.getLogger(__name__)
+
+
+class Slots:
+    """So many slots that score in one task; `stop` ends their children."""
+
+    def __init__(
+        self,
+        count: int,
+        spec: TaskSpec,
+        bundle: Path | None,
+        events: queue.SimpleQueue[tuple[str, Any]],
+        memory_limit: int,
+    ) -> None:
+        """`memory_limit` in bytes a slot; 0: none."""
+        self._task = spec.task
+        self._width = find_task(spec.task).width
+        self._failures = Failures()
+        self._slots = [Slot(number, spec, bundle, events, memory_limit) for number in range(count)]
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    @property
+    def busy(self) -> bool:
+        """Whether any scores."""
+        return any(slot.running for slot in self._slots)
+
+    @property
+    def idle(self) -> bool:
+        """Whether any could score and none does."""
+        return any(slot.ready for slot in self._slots) and not self.busy
+
+    @property
+    def capacity(self) -> int:
+        """Jobs that they score at once."""
+        return min(sum(slot.ready for slot in self._slots) * self._width, MAX_LEASES // 2)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of what runs so far."""
+        return sum(slot.steps for slot in self._slots)
+
+    @property
+    def running(self) -> list[Running]:
+        """Each running job, with its share of its turn's steps."""
+        return [
+            Running(job.digest[:TAG_BYTES], slot.steps // len(slot.running))
+            for slot in self._slots
+            for job in slot.running
+        ]
+
+    @property
+    def waiting(self) -> list[Job]:
+        """Jobs that lie in a slot and have not begun."""
+        return [job for slot in self._slots for job in slot.waiting]
+
+    @property
+    def drawn_by(self) -> str:
+        """Whose picture they see; `-` where that is not known yet."""
+        return next((slot.drawn_by for slot in self._slots if slot.ready), "-")
+
+    def fill(self, backlog: Backlog, undelivered: int) -> None:
+        """Take turns from the backlog, unless too many results have no verdict yet: `undelivered`."""
+        room = 4 * len(self._slots) * self._width - undelivered
+        idle = [slot for slot in self._slots if slot.idle and room >= 0]
+        ahead = [slot for slot in self._slots if slot.takes_more and room > 0]
+        for slot in idle + ahead:
+            if work := backlog.take(self._width):
+                slot.submit(work)
+
+    def handle(self, event: SlotEvent) -> tuple[Result, ...]:
+        """Take a slot's event; the results that it brings."""
+        slot = self._slots[event.slot]
+        if event.failure is not None:
+            # A child that is starting has begun nothing, so no job is to blame.
+            text = self._failures.tell(event.failure, self._task, slot.running if slot.ready else ())
+            if text is not None:
+                log.error("%s", text)
+        return slot.handle(event)
+
+    def check(self, now: float, gap: float) -> None:
+        """Kill what hangs; `gap` is how long this host itself stood still before `now`."""
+        for slot in self._slots:
+            slot.check(now, gap)
+
+    def abandon(self, digest: bytes) -> None:
+        """A job is not wanted any more."""
+        for slot in self._slots:
+            slot.abandon(digest)
+
+    def hand_back(self) -> None:
+        """Give up what has not begun."""
+        for job in self.waiting:
+            self.abandon(job.digest)
+
+    def stop(self) -> None:
+        """End all children."""
+        for slot in self._slots:
+            slot.stop()
