@@ -1,34 +1,41 @@
-"""Asking a run over Zenoh how it is: status, its parts, and watching generations end. Read-only but for `control`."""
+"""Asking a run over Zenoh how it is, watching it, and fetching its controller. Read-only but for `control`."""
 
 from __future__ import annotations
 
-import json
+import base64
 import queue
 from collections.abc import Iterator
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 import zenoh
 
 from dreamfleet.common import keys
-from dreamfleet.common.codec import MalformedError, decode_json
-from dreamfleet.common.errors import ConnectionFailedError, RefusedError, UsageError
+from dreamfleet.common.codec import MalformedError, decode_json, from_plain
+from dreamfleet.common.controller import Controller, ControllerShape
+from dreamfleet.common.errors import ConnectionFailedError, ControllerError, RefusedError, UsageError
+from dreamfleet.common.fields import known
 from dreamfleet.common.messages import ControlReply
-from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.runs import StoredGeneration
+from dreamfleet.common.session import Network, enqueue_into, open_session
+from dreamfleet.common.status import OVER, Population, Status, WorkerStatus, read_document, read_status
 
 QUERY_TIMEOUT = 3.0
+FAREWELL = 1.0  # seconds that the last status may take once its coordinator no longer answers
+CHANGES = 5  # controllers that may replace one another while one is fetched in parts
 
 
 class Client:
     """A connection to the router of one or more runs; use it in a `with`.
 
     >>> with Client(("tcp/127.0.0.1:7447",)) as client:  # doctest: +SKIP
-    ...     print(client.status("my-run")["state"])
+    ...     print(client.status("my-run").state)
     """
 
     def __init__(self, connect: tuple[str, ...]) -> None:
         self._where = ", ".join(connect)
-        self._session = open_session(Network(connect=connect))
+        self.session = open_session(Network(connect=connect))  # also for what asks in other words, as for a bundle
 
     def __enter__(self) -> Client:
         return self
@@ -36,31 +43,99 @@ class Client:
     def __exit__(
         self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
     ) -> None:
-        self._session.close()  # type: ignore[no-untyped-call]
+        self.session.close()  # type: ignore[no-untyped-call]
 
     def runs(self) -> list[str]:
         """Names of the live runs."""
-        return sorted(document["run"] for document in self._ask(keys.status("*")))
+        return sorted(str(document["run"]) for document in self._ask(keys.status("*")) if "run" in document)
 
-    def status(self, run: str | None = None, part: str = "") -> dict[str, Any]:
-        """The status document of `run`, or of the only live run; `part` as in `keys.status`."""
-        documents = self._ask(keys.status(keys.check_run_name(run) if run else "*", part))
+    def status(self, run: str | None = None) -> Status:
+        """How `run` is, or the only live run; `MalformedError` if its version is not understood."""
+        return read_status(self.document(run))
+
+    def document(self, run: str | None = None, part: str = "", parameters: str = "") -> dict[str, Any]:
+        """What answers for `run`, or for the only live run, as the wire has it; `part` is one of `status.PARTS`."""
+        key = keys.status(keys.check_run_name(run) if run else "*", part)
+        documents = self._ask(f"{key}?{parameters}" if parameters else key)
         if len(documents) > 1:
-            names = ", ".join(sorted(document["run"] for document in documents))
+            names = ", ".join(sorted(str(document.get("run")) for document in documents))
             raise UsageError(f"several runs are live: name one with --run: {names}")
         if not documents:
-            which = f"run {run!r}" if run else "any run"
-            raise ConnectionFailedError(
-                f"no coordinator of {which} answers through {self._where}: it is not running, or you lack the "
-                "right to ask"
-            )
+            raise self._nobody(f"run {run!r}" if run else "any run")
         return documents[0]
 
+    def watch(self, run: str, pause: float) -> Iterator[Status]:
+        """How `run` is every `pause` seconds, and at last how its coordinator left it.
+
+        `ConnectionFailedError` if the coordinator vanished without a word.
+        """
+        return map(read_status, self.watch_documents(run, pause))
+
+    def watch_documents(self, run: str, pause: float) -> Iterator[dict[str, Any]]:
+        """As `watch`, but as the wire has it."""
+        farewells: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        heard = enqueue_into(farewells, "status")
+        subscriber: Any = self.session.declare_subscriber(keys.event_status(keys.check_run_name(run)), heard)
+        try:
+            while True:
+                silent = False
+                try:
+                    document = self.document(run)
+                except ConnectionFailedError:
+                    silent = True
+                else:
+                    yield document
+                    if document.get("state") in OVER:
+                        return
+                try:
+                    _, sample = farewells.get(timeout=FAREWELL if silent else pause)
+                except queue.Empty:
+                    if silent:
+                        raise self._nobody(f"run {run!r}") from None
+                else:
+                    yield read_document(sample.payload.to_bytes())
+                    return
+        finally:
+            subscriber.undeclare()
+
+    def workers(self, run: str) -> list[WorkerStatus]:
+        """All workers that the coordinator of `run` knows."""
+        return [from_plain(WorkerStatus, known(WorkerStatus, row)) for row in self.pages("workers", run)]
+
+    def history(self, run: str) -> list[StoredGeneration]:
+        """All closed generations of `run`, oldest first."""
+        return [from_plain(StoredGeneration, known(StoredGeneration, row)) for row in self.pages("history", run)]
+
+    def candidates(self, run: str, generation: int) -> list[Population]:
+        """All candidates of the open generation of `run`, or of the one before it, in parts; the open one otherwise."""
+        parts: list[Population] = []
+        seen = 0
+        while not parts or seen < parts[0].total:
+            document = self.document(run, "candidates", f"offset={seen};generation={generation}")
+            parts.append(from_plain(Population, known(Population, document)))
+            seen += len(parts[-1].done)
+            if not parts[-1].done:
+                break
+        return parts
+
+    def controller(self, run: str) -> Controller:
+        """What `run` reports now: its best evaluated mean, else its last one; `ControllerError` before the first."""
+        for _ in range(CHANGES):
+            data, about = b"", self._controller_part(run, 0)
+            sha256, total = about["sha256"], 4 * int(about["total"])
+            while about["sha256"] == sha256:
+                part = base64.b64decode(about["parameters"])
+                data += part
+                if len(data) >= total or not part:
+                    return _controller(about, data)
+                about = self._controller_part(run, len(data) // 4)
+        raise ControllerError(f"the controller of run {run} changes faster than it can be fetched; ask again")
+
     def pages(self, part: str, run: str) -> Iterator[dict[str, Any]]:
-        """All rows of a paged part: `workers` or `history`."""
+        """All rows of a paged part as the wire has them: `workers` or `history`."""
         offset = 0
         while True:
-            document = self._ask(f"{keys.status(run, part)}?offset={offset}")[0]
+            document = self.document(run, part, f"offset={offset}")
             yield from document[part]
             offset += len(document[part])
             if offset >= document["total"] or not document[part]:
@@ -68,27 +143,48 @@ class Client:
 
     def control(self, run: str, verb: str) -> None:
         """Ask the coordinator to `pause`, `resume`, `drain` or `stop`; `RefusedError` says why it does not."""
-        for reply in self._session.get(keys.control(keys.check_run_name(run), verb), timeout=QUERY_TIMEOUT):
+        for reply in self.session.get(keys.control(keys.check_run_name(run), verb), timeout=QUERY_TIMEOUT):
             if reply.ok is not None:
                 answer = decode_json(ControlReply, reply.ok.payload.to_bytes())
                 if not answer.accepted:
                     raise RefusedError(answer.why)
                 return
-        raise ConnectionFailedError(
-            f"no coordinator of run {run!r} answers through {self._where}: it is not running, or you lack the right "
-            "to ask"
+        raise self._nobody(f"run {run!r}")
+
+    def _controller_part(self, run: str, offset: int) -> dict[str, Any]:
+        about = self.document(run, "best", f"offset={offset}").get("controller")
+        if about is None:
+            raise ControllerError(f"run {run} reports no controller yet: wait until its first generation is closed")
+        if not isinstance(about, dict) or not about.keys() >= {"sha256", "total", "parameters", "shape", "task"}:
+            raise MalformedError(f"run {run} gives a controller that this version cannot read: update dreamfleet")
+        return about
+
+    def _nobody(self, whose: str) -> ConnectionFailedError:
+        return ConnectionFailedError(
+            f"no coordinator of {whose} answers through {self._where}: it is not running, or you lack the right to ask"
         )
 
     def _ask(self, selector: str) -> list[dict[str, Any]]:
         replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
         done = object()
         handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
-        self._session.get(selector, handler, timeout=QUERY_TIMEOUT)
+        self.session.get(selector, handler, timeout=QUERY_TIMEOUT)
         documents = []
         while (reply := replies.get()) is not done:
             if reply.ok is not None:
-                try:
-                    documents.append(json.loads(reply.ok.payload.to_bytes()))
-                except ValueError as error:
-                    raise MalformedError("not JSON") from error
+                documents.append(read_document(reply.ok.payload.to_bytes()))
         return documents
+
+
+def _controller(about: dict[str, Any], data: bytes) -> Controller:
+    try:
+        shape = from_plain(ControllerShape, known(ControllerShape, about["shape"]))
+        parameters = np.frombuffer(data, dtype="<f4").astype(np.float32)
+        controller = Controller(
+            shape, parameters, str(about["task"]), str(about["bundle"]), dict(about.get("provenance", {}))
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise ControllerError(f"the run's controller cannot be read ({error}): update dreamfleet") from error
+    if controller.sha256 != about["sha256"]:
+        raise ControllerError("the controller arrived damaged; ask again")
+    return controller

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgpack
 
+from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.fields import optionals
 from dreamfleet.common.keys import PROTOCOL_VERSION
 from dreamfleet.common.messages import MAX_MESSAGE, Between, Length, Message
@@ -27,8 +28,8 @@ T = TypeVar("T")
 MAX_ITEMS = 4096  # of a list without a bound of its own
 
 
-class MalformedError(ValueError):
-    """A message that is not of the schema; `args[0]` is the reason to count it under."""
+class MalformedError(DreamfleetError, ValueError):
+    """A message that is not of the schema; `args[0]` is the reason to count it under, or for people to read."""
 
 
 def encoding(kind: type[Any]) -> str:
@@ -155,7 +156,7 @@ def _compile(hint: Any) -> Check:
     if hint is float:
         return _finite
     if origin is dict:
-        return _object
+        return _object if get_args(hint)[1] is Any else _mapping_checker(get_args(hint)[1])
     return _exactly(hint)
 
 
@@ -248,6 +249,15 @@ def _object(value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise MalformedError("wrong type")
     return value
+
+
+def _mapping_checker(hint: Any) -> Check:
+    check = _checker(hint)
+
+    def mapping(value: Any) -> dict[str, Any]:
+        return {name: check(each) for name, each in _object(value).items()}
+
+    return mapping
 
 
 def _exactly(kind: type[Any]) -> Check:

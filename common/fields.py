@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, Field, asdict, fields
+from dataclasses import MISSING, Field, asdict, fields, is_dataclass
 from functools import cache
-from typing import Any
+from types import NoneType, UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 OPTIONAL = {"optional": True}  # `field(default=..., metadata=OPTIONAL)`
 
@@ -35,3 +36,25 @@ def _drop_defaults(document: Any, plain: dict[str, Any]) -> None:
 
 def _default(each: Field[Any]) -> Any:
     return each.default if each.default_factory is MISSING else each.default_factory()
+
+
+def known(hint: Any, plain: Any) -> Any:
+    """A plain document without the fields that the dataclasses of `hint` do not have, at any depth."""
+    origin = get_origin(hint)
+    if origin is Annotated:
+        return known(get_args(hint)[0], plain)
+    if origin in (Union, UnionType):
+        inner = [each for each in get_args(hint) if each is not NoneType]
+        return known(inner[0], plain) if plain is not None and len(inner) == 1 else plain
+    if origin is tuple and isinstance(plain, (list, tuple)):
+        return [known(get_args(hint)[0], each) for each in plain]
+    if is_dataclass(hint) and isinstance(plain, dict):
+        kind: Any = hint  # mypy takes no class for hashable
+        hints = _hints(kind)
+        return {name: known(hints[name], value) for name, value in plain.items() if name in hints}
+    return plain
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)

@@ -67,7 +67,7 @@ def live_coordinator(run: str, nonce: str) -> str:
 
 
 def status(run: str, part: str = "") -> str:
-    """Read-only JSON for people and tools; `part` is empty, generation, workers, history or best."""
+    """Read-only JSON for people and tools; `part` is one of `dreamfleet.common.status.PARTS`."""
     return f"{_PREFIX}/{run}/status/{part}" if part else f"{_PREFIX}/{run}/status"
 
 
@@ -89,6 +89,11 @@ def upload(run: str, worker: str) -> str:
 def event_generation(run: str) -> str:
     """Coordinator to anyone, as each generation ends."""
     return f"{_PREFIX}/{run}/event/generation"
+
+
+def event_status(run: str) -> str:
+    """Coordinator to anyone, as it leaves: the last status."""
+    return f"{_PREFIX}/{run}/event/status"
 
 
 def view(run: str, worker: str) -> str:

@@ -2,121 +2,150 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
-from rich.console import Group, RenderableType
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.panel import Panel
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
+
+from dreamfleet.common.runs import StoredEvaluation, StoredGeneration
+from dreamfleet.common.status import FailureStatus, OpenGeneration, Progress, Status, WorkerStatus
 
 STATE_STYLES = {
     "running": "green",
     "evaluating": "cyan",
     "paused": "bold red",
     "ended": "bold",
+    "left": "bold yellow",
     "waiting for workers": "yellow",
 }
 SPARKS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 60
+MOST_WORKERS = 20
+PAD = 2  # columns of air on each side of a cell
+COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
+    "worker": lambda each: each.worker,
+    "state": lambda each: each.state,
+    "slots": lambda each: str(each.slots),
+    "leases": lambda each: str(each.leases),
+    "finished": lambda each: str(each.finished),
+    "steps/s": lambda each: f"{each.steps_per_second:.0f}",
+    "load": lambda each: str(each.load),
+    "picture": lambda each: each.drawn_by,
+}
+LEAST_FIRST = ("picture", "load", "leases", "finished", "slots", "steps/s", "state")
+LEFT = ("worker", "state", "picture")
 
 
-def run_panel(
-    status: dict[str, Any], workers: Sequence[dict[str, Any]], history: Sequence[dict[str, Any]]
-) -> RenderableType:
+def run_panel(status: Status) -> RenderableType:
     """The whole picture: state, generation, fitness, fleet."""
-    state = status["state"]
-    title = f"[bold]{status['run']}[/] · [{STATE_STYLES.get(state, '')}]{state}[/]"
+    title = f"[bold]{status.run}[/] · [{STATE_STYLES.get(status.state, '')}]{status.state}[/]"
     parts: list[RenderableType] = [_facts(status)]
-    if status["why"]:
-        parts.append(Text(status["why"], style="bold red" if state == "paused" else ""))
-    elif status["failures"]:
-        parts.append(Text(_failure(status["failures"][0]), style="red"))
+    if status.why:
+        parts.append(Text(status.why, style="bold red" if status.state == "paused" else ""))
+    elif status.failures:
+        parts.append(Text(_failure(status.failures[0]), style="red"))
     parts.append(_progress(status))
-    if history:
-        parts.append(Text.assemble(("mean fitness by generation  ", "dim"), _sparkline(history)))
-    parts.append(_worker_table(workers))
+    if status.recent:
+        parts.append(Text.assemble(("mean fitness by generation  ", "dim"), _sparkline(status.recent)))
+    parts.append(_worker_table(status))
     return Panel(Group(*parts), title=title, title_align="left", padding=(0, 1))
 
 
-def _facts(status: dict[str, Any]) -> Table:
-    settings, task = status["settings"], status["settings"]["task"]
-    last, best, evaluation = status["last"], status["best"], status["evaluation"]
-    waste = status["waste"]
+def _facts(status: Status) -> Table:
+    settings, task, waste = status.settings, status.settings.task, status.waste
     grid = Table.grid(padding=(0, 3, 0, 1))
     grid.add_column(style="dim")
     grid.add_column()
     grid.add_column(style="dim")
     grid.add_column()
-    temperature = status["generation"].get("temperature")  # which an older coordinator does not tell
+    temperature = status.generation.temperature
     warm = "" if temperature is None else f", temperature {temperature:g}"
     grid.add_row(
-        "task", f"{task['task']}, {task['horizon']} steps{warm}", "population",
-        f"{settings['population']} x {settings['episodes']}",
-    )  # fmt: skip
+        "task", f"{task.task}, {task.horizon} steps{warm}", "population", f"{settings.population} x {settings.episodes}"
+    )
     grid.add_row(
-        "last generation", _spread(last) if last else "-",
-        "step size", f"{status['generation']['sigma']:.4f} ({settings['covariance']})",
+        "last generation", _spread(status.last) if status.last else "-",
+        "step size", f"{status.generation.sigma:.4f} ({settings.covariance})",
     )  # fmt: skip
-    grid.add_row("evaluated mean", _evaluated(evaluation), "best", _evaluated(best))
-    steps, rate = status["throughput"]["environment_steps"], status["throughput"]["steps_per_second"]
+    grid.add_row("evaluated mean", _evaluated(status.evaluation), "best", _evaluated(status.best))
+    steps, rate = status.throughput.environment_steps, status.throughput.steps_per_second
     grid.add_row(
         "throughput", f"{rate:,.0f} steps/s, {steps:,} in all",
-        "waste", f"{waste['share']:.1%}, {waste['reissued']} jobs issued again",
+        "waste", f"{waste.share:.1%}, {waste.reissued} jobs issued again",
     )  # fmt: skip
-    dropped = sum(status["dropped"].values())
-    if dropped:
-        grid.add_row("dropped messages", ", ".join(f"{count} {why}" for why, count in status["dropped"].items()))
+    if sum(status.dropped.values()):
+        grid.add_row("dropped messages", ", ".join(f"{count} {why}" for why, count in status.dropped.items()))
     return grid
 
 
-def _spread(last: dict[str, Any]) -> str:
-    return f"{last['mean']:.1f} ± {last['std']:.1f}  ({last['worst']:.0f} to {last['best']:.0f})"
+def _spread(last: StoredGeneration) -> str:
+    return f"{last.mean:.1f} ± {last.std:.1f}  ({last.worst:.0f} to {last.best:.0f})"
 
 
-def _evaluated(each: dict[str, Any] | None) -> str:
+def _evaluated(each: StoredEvaluation | None) -> str:
     if each is None:
         return "-"
-    return f"{each['mean']:.1f} ± {each['std']:.1f} on {each['episodes']} tracks (generation {each['generation']})"
+    return f"{each.mean:.1f} ± {each.std:.1f} on {each.episodes} tracks (generation {each.generation})"
 
 
-def _failure(failure: dict[str, Any]) -> str:
-    worker, error = next(iter(failure["errors"].items()))
-    return f"candidate {failure['candidate']} failed on {worker}: {error}; another worker will try"
+def _failure(failure: FailureStatus) -> str:
+    worker, error = next(iter(failure.errors.items()))
+    return f"candidate {failure.candidate} failed on {worker}: {error}; another worker will try"
 
 
-def _progress(status: dict[str, Any]) -> Table:
-    generation, evaluating = status["generation"], status["evaluating"]
-    collecting = status.get("collecting", {"episodes": 0})  # which an older coordinator does not tell
+def _progress(status: Status) -> Table:
     grid = Table.grid(padding=(0, 2, 0, 1))
-    parts = {f"generation {generation['number']}": generation, "evaluation": evaluating, "kept drives": collecting}
+    parts: dict[str, OpenGeneration | Progress] = {
+        f"generation {status.generation.number}": status.generation,
+        "evaluation": status.evaluating,
+        "kept drives": status.collecting,
+    }
     for label, part in parts.items():
-        if part["episodes"] and not (part is generation and status["state"] in ("ended", "evaluating")):
-            done, wanted = part["episodes_done"], part["episodes"]
+        if part.episodes and not (part is status.generation and status.state in ("ended", "evaluating")):
+            done, wanted = part.episodes_done, part.episodes
             grid.add_row(label, ProgressBar(wanted, done, width=40), f"{done}/{wanted} episodes")
     return grid
 
 
-def _sparkline(history: Sequence[dict[str, Any]]) -> Text:
-    means = [each["mean"] for each in history][-SPARK_WIDTH:]
+def _sparkline(history: Sequence[StoredGeneration]) -> Text:
+    means = [each.mean for each in history][-SPARK_WIDTH:]
     low, high = min(means), max(means)
     scale = (len(SPARKS) - 1) / (high - low) if high > low else 0.0
     bars = "".join(SPARKS[round((mean - low) * scale)] for mean in means)
     return Text.assemble(f"{low:.0f} ", (bars, "green"), f" {high:.0f}")
 
 
-def _worker_table(workers: Sequence[dict[str, Any]]) -> RenderableType:
-    if not workers:
+def _worker_table(status: Status) -> RenderableType:
+    if not status.worker_list:
         return Text("no workers yet: start one with  dreamfleet worker --connect tcp/HOST:PORT", style="yellow")
-    table = Table(box=None, padding=(0, 2), header_style="dim")
-    for column in ("worker", "state", "slots", "leases", "finished", "steps/s", "load", "picture"):
-        table.add_column(column, justify="left" if column in ("worker", "state", "picture") else "right")
-    for each in workers[:20]:
-        style = "" if each["state"] == "present" else "red"
-        values = (each["slots"], each["leases"], each["finished"], f"{each['steps_per_second']:.0f}", each["load"],
-                  each["drawn_by"])  # fmt: skip
-        table.add_row(each["worker"], each["state"], *map(str, values), style=style)
-    if len(workers) > 20:
-        table.add_row(f"and {len(workers) - 20} more")
-    return table
+    return WorkerTable(status.worker_list[:MOST_WORKERS], status.workers.known)
+
+
+class WorkerTable:
+    """Workers, a row each: where the terminal is narrow, the columns that matter least are left out, never a name."""
+
+    def __init__(self, workers: Sequence[WorkerStatus], known: int) -> None:
+        self._workers = workers
+        self._known = known
+
+    def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
+        """As many columns as fit, in their order."""
+        cells = {name: [tell(each) for each in self._workers] for name, tell in COLUMNS.items()}
+        widths = {name: max(map(cell_len, (name, *column))) + 2 * PAD for name, column in cells.items()}
+        kept = list(COLUMNS)
+        for name in LEAST_FIRST:
+            if sum(widths[each] for each in kept) > options.max_width:
+                kept.remove(name)
+        table = Table(box=None, padding=(0, PAD), header_style="dim")
+        for name in kept:
+            justify = "left" if name in LEFT else "right"
+            table.add_column(name, justify=justify, overflow="fold")  # type: ignore[arg-type]
+        for row, each in enumerate(self._workers):
+            table.add_row(*(cells[name][row] for name in kept), style="" if each.state == "present" else "red")
+        if self._known > len(self._workers):
+            table.add_row(f"and {self._known - len(self._workers)} more")
+        yield table

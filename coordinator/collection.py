@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Container
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.files import write_aside
+from dreamfleet.common.messages import Job, Result, TaskSpec
+from dreamfleet.common.runs import rollout_path
 from dreamfleet.common.seeds import collection_seed
 from dreamfleet.coordinator.jobs import Work, make_work
+from dreamfleet.coordinator.uploads import Uploads
 
 
 @dataclass(frozen=True)
@@ -21,3 +27,54 @@ class Collection:
         """Its jobs."""
         seeds = [collection_seed(run_seed, self.generation, episode) for episode in range(self.episodes)]
         return make_work(spec, "collect", self.generation, 0, self.vector, seeds)
+
+
+class Collections:
+    """A run's kept drives: which are still to come, and each one's file in the run's `folder` once it is whole."""
+
+    def __init__(self, folder: Path) -> None:
+        self.uploads = Uploads()
+        self._folder = folder
+        self._missing: set[bytes] = set()  # digests
+        self._scheduled = 0  # drives, ever
+
+    def open(self, work: list[Work], known: Container[bytes]) -> list[Work]:
+        """Want these drives, of which some may be kept already; the missing jobs."""
+        missing = [each for each in work if each.job.digest not in known]
+        self._scheduled += len(work)
+        self._missing.update(each.job.digest for each in missing)
+        return missing
+
+    def finish(self, digest: bytes) -> None:
+        """Count a drive whose result was accepted."""
+        self._missing.discard(digest)
+
+    @property
+    def in_progress(self) -> int:
+        """Drives that are still to come."""
+        return len(self._missing)
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Drives of the whole run: kept, wanted."""
+        return self._scheduled - len(self._missing), self._scheduled
+
+    def receive(self, worker: str, result: Result, work: Work | None) -> Result | None:
+        """The result as it may be judged, its drive on disk if it has one; `None` while the drive is on its way."""
+        if work is None or work.job.kind != "collect" or result.fitness is None:
+            return result
+        if result.upload is None:
+            return replace(result, fitness=None, error="the drive was not kept: update dreamfleet on this host")
+        data = self.uploads.take(worker, result.digest, result.upload)
+        if data is None:
+            return None
+        self._keep(work.job, data)
+        return result
+
+    def _keep(self, job: Job, data: bytes) -> None:
+        path = rollout_path(self._folder, job.generation, job.episode)
+        try:
+            with write_aside(path) as file:
+                file.write(data)
+        except OSError as error:
+            raise JournalError(f"cannot write {path}: {error.strerror}; make room and continue the run") from error

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -134,12 +134,8 @@ class Demo:
     def _watch(self, client: Client, coordinator: subprocess.Popen[bytes], run: str) -> None:
         with Live(console=self._console, refresh_per_second=4) as live:
             while coordinator.poll() is None:
-                try:
-                    status = client.status(run)
-                    workers = list(client.pages("workers", run))
-                    live.update(run_panel(status, workers, list(client.pages("history", run))))
-                except (ConnectionFailedError, IndexError):
-                    pass  # it is starting, or has just ended
+                with suppress(ConnectionFailedError):  # it is starting, or has just ended
+                    live.update(run_panel(client.status(run)))
                 try:
                     coordinator.wait(REFRESH)
                 except subprocess.TimeoutExpired:

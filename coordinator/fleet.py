@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from dreamfleet.common.messages import TAG_BYTES, Beat, Kind, Result, Verdict, VerdictWord
+from dreamfleet.coordinator.failure import Failure
 from dreamfleet.coordinator.jobs import Work
 from dreamfleet.coordinator.member import Lease, Member, Sent
 from dreamfleet.coordinator.packing import Content, pack
@@ -223,15 +224,15 @@ class Fleet:
         return sum(len(member.leases) for member in self.members.values())
 
     @property
-    def failures(self) -> list[tuple[Work, dict[str, str]]]:
-        """Wanted jobs that failed somewhere, with each worker's error."""
-        return [(wanted.work, dict(wanted.failed)) for wanted in self._failing.values()]
+    def failures(self) -> list[Failure]:
+        """Wanted jobs that failed somewhere."""
+        return [_failure(wanted) for wanted in self._failing.values()]
 
-    def poison(self) -> tuple[Work, dict[str, str]] | None:
+    def poison(self) -> Failure | None:
         """A job that failed on two different workers, or again and again on the only one there is."""
         for wanted in self._failing.values():
             if len(wanted.failed) > 1 or any(count >= ATTEMPTS for count in wanted.attempts.values()):
-                return wanted.work, dict(wanted.failed)
+                return _failure(wanted)
         return None
 
     def pardon(self) -> None:
@@ -365,3 +366,7 @@ class Fleet:
     def _slack_slots(self) -> int:
         """Drives of a mean fill the tail of a generation and never more than a quarter of the slots."""
         return max(1, sum(member.slots for member in self.members.values() if member.present) // 4)
+
+
+def _failure(wanted: Wanted) -> Failure:
+    return Failure(wanted.work, dict(wanted.failed), dict(wanted.attempts))

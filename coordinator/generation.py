@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.coordinator.jobs import Work, make_work
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A generation's candidates at one moment: a column each, in the order of the population."""
+
+    generation: int
+    done: list[int]  # episodes scored
+    wanted: list[int]  # episodes, as far as that is known
+    fitness: list[float | None]  # the mean of the scored episodes; `None` before the first
 
 
 class Generation:
@@ -72,6 +83,14 @@ class Generation:
     def fitness(self) -> NDArray[np.float64]:
         """What the strategy is told `(population,)`: the mean of each candidate's own episodes."""
         return np.asarray(np.nanmean(self._scores, axis=1))
+
+    def standing(self) -> Standing:
+        """How each candidate is doing now."""
+        scored = np.isfinite(self._scores)
+        done = scored.sum(axis=1)
+        totals = np.where(scored, self._scores, 0.0).sum(axis=1)
+        means = [total / count if count else None for total, count in zip(totals.tolist(), done.tolist(), strict=True)]
+        return Standing(self.number, done.tolist(), (self._wanted | scored).sum(axis=1).tolist(), means)
 
     def _pass_barrier(self) -> bool:
         first = self._scores[:, : self._first]

@@ -69,7 +69,7 @@ class Journal:
                 schema.migrate(connection, 0)
                 created = datetime.now(UTC).isoformat(timespec="seconds")
                 facts = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": created}
-                connection.executemany("INSERT INTO run VALUES (?, ?)", facts.items())
+                connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", facts.items())
                 connection.commit()
                 connection.close()
             aside.replace(path)
@@ -94,7 +94,7 @@ class Journal:
 
     def set_fact(self, key: str, value: str) -> None:
         """Write one of the run's facts."""
-        self._write("INSERT OR REPLACE INTO run VALUES (?, ?)", key, value)
+        self._write("INSERT OR REPLACE INTO run (key, value) VALUES (?, ?)", key, value)
 
     def drop_fact(self, key: str) -> None:
         """Forget one of the run's facts."""
@@ -117,7 +117,7 @@ class Journal:
         )  # fmt: skip
         rows = [(number, index, vector) for index, vector in enumerate(vectors)]
         self._write_all("INSERT INTO candidate (generation, number, vector) VALUES (?, ?, ?)", rows)
-        self._write("INSERT INTO strategy VALUES (?, ?)", number, state)
+        self._write("INSERT INTO strategy (generation, state) VALUES (?, ?)", number, state)
         self._write("DELETE FROM strategy WHERE generation < ?", number - 1)
 
     def close_generation(self, closed: StoredGeneration, fitness: NDArray[np.float64]) -> None:
@@ -135,7 +135,8 @@ class Journal:
     def add_result(self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int) -> None:
         """Write an accepted result."""
         self._write(
-            "INSERT INTO result VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
+            "fingerprint, incarnation) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], result.fitness,
             result.steps, result.seconds, worker, fingerprint, incarnation,
         )  # fmt: skip
@@ -165,13 +166,18 @@ class Journal:
 
     def last_generation(self) -> OpenGeneration | None:
         """The generation that was open when the last incarnation ended; `None` in a new run."""
+        row = self._read("SELECT max(number) FROM generation").fetchone()
+        return None if row[0] is None else self.generation(row[0])
+
+    def generation(self, number: int) -> OpenGeneration | None:
+        """One of the last two generations, as it was asked; `None` if its state is not kept any more."""
         row = self._read(
-            "SELECT number, state, seeds FROM generation JOIN strategy ON number = generation ORDER BY number DESC"
+            "SELECT state, seeds FROM generation JOIN strategy ON number = generation WHERE number = ?", number
         ).fetchone()
         if row is None:
             return None
-        vectors = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", row[0]).fetchall()
-        return OpenGeneration(row[0], row[1], tuple(json.loads(row[2])), tuple(vector for (vector,) in vectors))
+        vectors = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number).fetchall()
+        return OpenGeneration(number, row[0], tuple(json.loads(row[1])), tuple(vector for (vector,) in vectors))
 
     def closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
         """Every closed generation and finished evaluation, oldest first."""

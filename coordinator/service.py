@@ -40,9 +40,11 @@ from dreamfleet.common.messages import (
 )
 from dreamfleet.common.runs import BUNDLE
 from dreamfleet.common.session import LEASE_MS, Network, enqueue_into, open_session
+from dreamfleet.common.status import PARTS
+from dreamfleet.coordinator import answers
 from dreamfleet.coordinator.fleet import Send
 from dreamfleet.coordinator.run import Run
-from dreamfleet.coordinator.status import PARTS, Snapshot, take_snapshot
+from dreamfleet.coordinator.status import Snapshot, left, take_snapshot
 
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a loss waits to be acted upon
@@ -86,9 +88,12 @@ class Service:
                      self._run.generation.number)  # fmt: skip
             on_ready(self._run)
             self._loop(session)
-            self._snapshot = self._take_snapshot()
+            self._run.leave()
+            self._snapshot = left(self._take_snapshot())
             for each in declared:
                 each.undeclare()
+            farewell = answers.status(self._snapshot)
+            session.put(keys.event_status(self._name), farewell, encoding="application/json")
         return self._run
 
     def _claim(self, session: zenoh.Session, stack: ExitStack) -> Any:
@@ -149,15 +154,15 @@ class Service:
         while not self._stopping and self._run.ended is None:
             self._drain_events()
             now = monotonic()
-            self._run.fleet.tick(now)
+            self._run.tick(now)
             if self._run.advance(now):
-                self._put(session, self._run.fleet.dispatch(now, durable=False))  # workers need not wait for the disk
+                self._put(session, self._run.dispatch(now, durable=False))  # workers need not wait for the disk
             self._run.commit()
-            self._put(session, self._run.fleet.dispatch(now))
+            self._put(session, self._run.dispatch(now))
             self._run.prepare()
             self._publish_closed(session)
             self._write_notes()
-            if self._draining and not self._run.fleet.leased:
+            if self._draining and not self._run.leased:
                 self.stop()
             if now - taken >= SNAPSHOT_INTERVAL:
                 self._snapshot, taken = self._take_snapshot(), now
@@ -167,10 +172,8 @@ class Service:
             session.put(keys.job(self._name, send.identity), self._batch(send), encoding=encoding(JobBatch))
 
     def _write_notes(self) -> None:
-        notes = self._run.fleet.notes
-        for note in notes:
+        for note in self._run.take_notes():
             log.info("%s", note)
-        notes.clear()
 
     def _drain_events(self) -> None:
         """Handle what has arrived, waiting at most a tick for the first; what follows closely shares its commit."""
@@ -178,7 +181,7 @@ class Service:
             self._handle(*self._events.get(timeout=TICK))
             until = monotonic() + LINGER
             for _ in range(DRAIN):
-                left = until - monotonic() if self._run.fleet.open else 0.0  # else a generation's end waits for us
+                left = until - monotonic() if self._run.jobs else 0.0  # else a generation's end waits for us
                 self._handle(*self._events.get(timeout=max(left, 0.0)))
         except queue.Empty:
             pass
@@ -191,7 +194,7 @@ class Service:
             self._control(event)
         elif kind == "token":
             if event.kind == zenoh.SampleKind.DELETE:
-                self._run.fleet.depart(keys.worker_of(str(event.key_expr)), now)
+                self._run.depart(keys.worker_of(str(event.key_expr)), now)
         elif kind == "result":
             results = self._inbox.decode(ResultBatch, event.payload.to_bytes())
             if results is not None and self._ours(results.run_uid):
@@ -199,8 +202,7 @@ class Service:
         elif kind == "beat":
             beat = self._inbox.decode(Beat, event.payload.to_bytes())
             if beat is not None and self._ours(beat.run_uid) and beat.nonce == self._nonce:
-                self._run.fleet.beat(keys.worker_of(str(event.key_expr)), beat, now)
-
+                self._run.beat(keys.worker_of(str(event.key_expr)), beat, now)
         elif kind == "upload":
             part = self._inbox.decode(UploadPart, event.payload.to_bytes())
             if part is not None and self._ours(part.run_uid):
@@ -298,7 +300,7 @@ class Service:
                 worst=closed.worst,
                 sigma=closed.sigma,
                 seconds=closed.seconds,
-                environment_steps=self._run.steps,
+                environment_steps=self._run.history.steps,
             )
             session.put(keys.event_generation(self._name), encode_json(event), encoding="application/json")
             log.info("generation %d: mean %.1f, best %.1f", closed.number, closed.mean, closed.best)
@@ -306,7 +308,7 @@ class Service:
     def _take_snapshot(self) -> Snapshot:
         now = monotonic()
         with self._lock:
-            dropped = self._inbox.dropped + self._run.uploads.dropped + self._overflow
+            dropped = self._inbox.dropped + self._run.dropped + self._overflow
         return take_snapshot(self._run, self._name, dropped, now - self._started, now)
 
     def _answer_status(self, part: str) -> Callable[[zenoh.Query], None]:
@@ -314,7 +316,7 @@ class Service:
 
         def answer(query: zenoh.Query) -> None:
             with query:
-                payload = self._snapshot.answer(part, query.parameters)
+                payload = answers.answer(self._snapshot, part, query.parameters)
                 query.reply(keys.status(self._name, part), payload, encoding="application/json")
 
         return answer

@@ -1,152 +1,158 @@
-"""One immutable snapshot of a run, as JSON documents; every view reads it and none touches the run."""
+"""One immutable snapshot of a run; every view reads it and none touches the run.
+
+Taking one costs the same however long the run is. What may be long is cut into pages as it is asked for.
+"""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from dataclasses import asdict, dataclass, replace
+from functools import cache
 
 from dreamfleet.common.fingerprint import package_version
+from dreamfleet.common.status import (
+    SCHEMA,
+    FailureStatus,
+    OpenGeneration,
+    Population,
+    Progress,
+    Status,
+    Throughput,
+    Waste,
+    WorkerCount,
+    WorkerStatus,
+)
+from dreamfleet.coordinator.failure import Failure, shorten
+from dreamfleet.coordinator.generation import Standing
+from dreamfleet.coordinator.history import HistoryView
 from dreamfleet.coordinator.member import Member
+from dreamfleet.coordinator.report import Reported
 from dreamfleet.coordinator.run import Run
 
-SCHEMA = 1
-PARTS = ("", "generation", "workers", "history", "best")
-PAGE = 100  # rows of a page at most, so that a reply stays under the message limit
-
-
-class Parameters(Protocol):
-    """A query's parameters."""
-
-    def get(self, key: str) -> str | None:
-        """One of them, if it was given."""
+MOST_FAILURES, MOST_NAMED = 3, 3  # failed jobs that are told, and workers of each
+LONGEST = 200  # characters of an error
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What `status` and its parts answer."""
+    """A run at one moment: its status without heads, and all that the heads and pages are cut from."""
 
-    status: dict[str, Any]
-    generation: dict[str, Any]
-    workers: list[dict[str, Any]]
-    history: list[dict[str, Any]]
-    best: dict[str, Any]
-
-    def answer(self, part: str, parameters: Parameters) -> bytes:
-        """The JSON of one part; `workers` and `history` are paged by `offset` and `limit`."""
-        head = {"schema": SCHEMA, "run": self.status["run"], "run_uid": self.status["run_uid"]}
-        if part in ("workers", "history"):
-            rows = self.workers if part == "workers" else self.history
-            offset, limit = _number(parameters.get("offset"), 0), min(_number(parameters.get("limit"), PAGE), PAGE)
-            page = {"offset": offset, "total": len(rows), part: rows[offset : offset + limit]}
-            return json.dumps({**head, **page}).encode()
-        document = {"generation": self.generation, "best": self.best}.get(part, self.status)
-        return json.dumps({**head, **document}).encode()
+    status: Status
+    workers: tuple[WorkerStatus, ...]
+    history: HistoryView
+    standing: Standing
+    last: Standing | None
+    reported: Reported | None
 
 
 def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float) -> Snapshot:
     """The run as it is at `now`, seconds of the monotonic clock; `uptime` in seconds."""
-    members = list(run.fleet.members.values())
-    generation = {
-        "number": run.generation.number,
-        "episodes_done": run.generation.done,
-        "episodes": run.generation.total,
-        "seconds": round(now - run.opened, 1),
-        "sigma": run.sigma,
-        "temperature": run.temperature,
-    }
-    last = asdict(run.history[-1]) if run.history else None
-    evaluation = asdict(run.evaluations[-1]) if run.evaluations else None
-    best = asdict(run.best) if run.best else None
-    done, wanted = run.evaluation_progress
-    kept, to_keep = run.collection_progress
-    status = {
-        "run": name,
-        "run_uid": run.uid,
-        "incarnation": run.incarnation,
-        "package": package_version("dreamfleet"),
-        "state": _state(run, members),
-        "why": run.paused or run.ended or "",
-        "settings": asdict(run.settings),
-        "limits": asdict(run.limits),
-        "uptime": round(uptime, 1),
-        "generation": generation,
-        "last": last,
-        "evaluation": evaluation,
-        "evaluating": {"episodes_done": done, "episodes": wanted},
-        "collecting": {"episodes_done": kept, "episodes": to_keep},
-        "best": best,
-        "workers": {"present": sum(member.present for member in members), "known": len(members)},
-        "slots": sum(member.slots for member in members if member.present),
-        "fingerprint": run.fingerprint,
-        "throughput": {
-            "steps_per_second": round(sum(member.steps_per_second for member in members if member.present), 1),
-            "environment_steps": run.steps + run.generation.steps,
-        },
-        "waste": _waste(run),
-        "failures": [_failure(work.job.generation, work.job.candidate, errors) for work, errors in run.fleet.failures],
-        "dropped": dict(dropped),
-    }
-    return Snapshot(
-        status,
-        {**generation, "last": last},
-        [_member(member, now) for member in members],
-        [asdict(each) for each in run.history],
-        {"best": best, "evaluations": len(run.evaluations)},
+    workers = tuple(_worker(member, now) for member in run.members)
+    present = [member for member in run.members if member.present]
+    standing, evaluations, failures = run.generation.standing(), run.slack.evaluations, run.failures
+    status = Status(
+        schema=SCHEMA,
+        run=name,
+        run_uid=run.uid,
+        incarnation=run.incarnation,
+        package=_package(),
+        state=run.state,
+        why=run.paused or run.ended or "",
+        settings=run.settings,
+        limits=asdict(run.limits),
+        uptime=round(uptime, 1),
+        generation=_open_generation(run, now),
+        generations=len(run.history),
+        last=run.history.last,
+        recent=(),
+        population=_headless(standing),
+        last_population=None if run.last is None else _headless(run.last),
+        evaluation=evaluations.last,
+        best=evaluations.best,
+        evaluations=len(evaluations),
+        evaluating=Progress(*evaluations.progress),
+        collecting=Progress(*run.slack.collections.progress),
+        workers=WorkerCount(len(present), len(workers)),
+        worker_list=(),
+        slots=sum(member.slots for member in present),
+        fingerprint=run.fingerprint,
+        throughput=Throughput(
+            steps_per_second=round(sum(member.steps_per_second for member in present), 1),
+            environment_steps=run.history.steps + run.generation.steps,
+        ),
+        waste=_waste(run.counts),
+        failing=len(failures),
+        failures=tuple(_failure(each) for each in failures[:MOST_FAILURES]),
+        dropped=dict(dropped),
+    )
+    return Snapshot(status, workers, run.history.view(), standing, run.last, run.slack.report.current)
+
+
+def left(snapshot: Snapshot) -> Snapshot:
+    """The last snapshot of a coordinator that leaves its run open."""
+    if snapshot.status.state == "ended":
+        return snapshot
+    return replace(snapshot, status=replace(snapshot.status, state="left"))
+
+
+def _open_generation(run: Run, now: float) -> OpenGeneration:
+    return OpenGeneration(
+        number=run.generation.number,
+        episodes_done=run.generation.done,
+        episodes=run.generation.total,
+        seconds=round(max(now - run.opened, 0.0), 1),
+        sigma=run.sigma,
+        temperature=run.temperature,
     )
 
 
-def _state(run: Run, members: list[Member]) -> str:
-    if run.ended is not None:
-        return "ended"
-    if run.paused is not None:
-        return "paused"
-    if not any(member.present and member.capacity for member in members):
-        return "waiting for workers"
-    return "evaluating" if run.fleet.hurry else "running"
+def _headless(standing: Standing) -> Population:
+    return Population(standing.generation, 0, len(standing.done), (), (), ())
 
 
-def _waste(run: Run) -> dict[str, Any]:
-    counts = run.fleet.counts
+def _waste(counts: Mapping[str, int]) -> Waste:
     discarded, accepted = counts["discarded_steps"], counts["accepted_steps"]
-    return {
-        "discarded_steps": discarded,
-        "share": round(discarded / (discarded + accepted), 4) if discarded else 0.0,
-        **{
-            name: counts[name]
-            for name in (
-                "reissued",
-                "recalled",
-                "copied",
-                "duplicate",
-                "obsolete",
-                "errors",
-                "resent_batches",
-                "silences",
-            )
-        },
-    }
+    return Waste(
+        discarded_steps=discarded,
+        share=round(discarded / (discarded + accepted), 4) if discarded else 0.0,
+        reissued=counts["reissued"],
+        recalled=counts["recalled"],
+        copied=counts["copied"],
+        duplicate=counts["duplicate"],
+        obsolete=counts["obsolete"],
+        errors=counts["errors"],
+        resent_batches=counts["resent_batches"],
+        silences=counts["silences"],
+    )
 
 
-def _failure(generation: int, candidate: int, errors: Mapping[str, str]) -> dict[str, Any]:
-    return {"candidate": f"{generation}/{candidate}", "errors": dict(errors)}
+def _failure(failure: Failure) -> FailureStatus:
+    job, names = failure.work.job, list(failure.errors)[:MOST_NAMED]
+    return FailureStatus(
+        candidate=f"{job.generation}/{job.candidate}",
+        kind=job.kind,
+        seeds=job.seeds,
+        errors={name: shorten(failure.errors[name], LONGEST) for name in names},
+        attempts={name: failure.attempts[name] for name in names},
+    )
 
 
-def _member(member: Member, now: float) -> dict[str, Any]:
-    return {
-        "worker": member.identity,
-        "state": "lost" if member.lost is not None else "silent" if member.silent else "present",
-        "slots": member.slots,
-        "leases": len(member.leases),
-        "finished": member.finished,
-        "steps_per_second": round(member.steps_per_second, 1),
-        "load": round(member.load, 2),
-        "drawn_by": member.drawn_by,
-        "heard": round(now - member.heard, 1),
-        "fingerprint": member.fingerprint,
-    }
+def _worker(member: Member, now: float) -> WorkerStatus:
+    return WorkerStatus(
+        worker=member.identity,
+        state="lost" if member.lost is not None else "silent" if member.silent else "present",
+        slots=member.slots,
+        leases=len(member.leases),
+        finished=member.finished,
+        steps_per_second=round(member.steps_per_second, 1),
+        load=round(member.load, 2),
+        drawn_by=member.drawn_by,
+        heard=round(now - member.heard, 1),
+        fingerprint=member.fingerprint,
+    )
 
 
-def _number(text: str | None, default: int) -> int:
-    return int(text) if text is not None and text.isdecimal() else default
+@cache
+def _package() -> str | None:
+    """Found out once: it costs 5 ms."""
+    return package_version("dreamfleet")

@@ -27,7 +27,7 @@ class ControlVerb:
         from dreamfleet.common.client import Client
 
         with Client(tuple(args.connect)) as client:
-            name = args.run_name or client.status()["run"]
+            name = args.run_name or client.status().run
             client.control(name, self.name)
         print(f"run {name} {self.outcome}")
         return 0

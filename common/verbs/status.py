@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
+from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.session import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from dreamfleet.common.client import Client
 
 SUMMARY = "show how a run is: generation, population, best, workers, throughput, waste"
 EXTRAS = ()
@@ -18,40 +20,49 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--connect", nargs="+", default=[DEFAULT_ENDPOINT], help=f"router (default {DEFAULT_ENDPOINT})")
     parser.add_argument("--run", help="name of the run (default: the only live one)")
-    parser.add_argument("--json", action="store_true", help="print the documents as the wire has them")
-    parser.add_argument("--watch", action="store_true", help="stay and refresh until the run ends or Ctrl-C")
+    parser.add_argument(
+        "--json", action="store_true", help="print the document as the wire has it; with --watch one line each time"
+    )
+    parser.add_argument("--watch", action="store_true", help="stay and refresh until the coordinator leaves or Ctrl-C")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the status."""
-    from rich.console import Console
-    from rich.live import Live
-
     from dreamfleet.common.client import Client
-    from dreamfleet.common.table import run_panel
 
     with Client(tuple(args.connect)) as client:
-        status = client.status(args.run)
-        name = status["run"]
-        if args.json and not args.watch:
-            workers = list(client.pages("workers", name))
-            print(json.dumps({**status, "worker_list": workers}, indent=2))
-            return 0
-        if not args.watch:
-            Console().print(run_panel(status, list(client.pages("workers", name)), list(client.pages("history", name))))
-            return 0
-        with Live(refresh_per_second=4) as live:
-            while status["state"] != "ended":
-                if args.json:
-                    live.console.print_json(data=status)
-                else:
-                    live.update(
-                        run_panel(status, list(client.pages("workers", name)), list(client.pages("history", name)))
-                    )
-                time.sleep(REFRESH)
-                try:
-                    status = client.status(name)
-                except ConnectionFailedError:
-                    live.console.print(f"run {name}: the coordinator left")
-                    return 0
+        document = client.document(args.run)
+        if args.watch:
+            name = str(document.get("run"))
+            return _print_lines(client, name) if args.json else _show(client, name)
+        if args.json:
+            print(json.dumps(document, indent=2))
+        else:
+            _print_once(document)
+    return 0
+
+
+def _print_once(document: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    from dreamfleet.common.status import read_status
+    from dreamfleet.common.table import run_panel
+
+    Console().print(run_panel(read_status(document)))
+
+
+def _print_lines(client: Client, name: str) -> int:
+    for document in client.watch_documents(name, REFRESH):
+        print(json.dumps(document), flush=True)
+    return 0
+
+
+def _show(client: Client, name: str) -> int:
+    from rich.live import Live
+
+    from dreamfleet.common.table import run_panel
+
+    with Live(refresh_per_second=4) as live:
+        for status in client.watch(name, REFRESH):
+            live.update(run_panel(status), refresh=True)
     return 0

@@ -1,7 +1,7 @@
 import pytest
 
 from dreamfleet.common.runs import StoredEvaluation
-from dreamfleet.coordinator.evaluation import parted
+from dreamfleet.coordinator.evaluation import Evaluations
 
 
 def evaluations(*means):
@@ -23,4 +23,4 @@ def evaluations(*means):
     ],
 )
 def test_dream_and_reality_have_parted_when_the_last_means_lie_clearly_below_the_best(means, count, expected):
-    assert parted(evaluations(*means), count) == expected
+    assert Evaluations(evaluations(*means)).parted(count) == expected

@@ -161,7 +161,7 @@ def test_an_error_is_no_fitness_and_another_worker_tries():
     assert digests(fleet.dispatch(0.1), B) == [digest]
     assert fleet.poison() is None
     fleet.result(B, result(digest, error="boom"), 0.2)
-    _, errors = fleet.poison()
+    errors = fleet.poison().errors
     assert errors == {A: "boom", B: "boom"}
 
 
@@ -171,7 +171,7 @@ def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
         assert fleet.poison() is None
         (digest,) = digests(fleet.dispatch(attempt), A)
         fleet.result(A, result(digest, error="boom"), attempt)
-    assert fleet.poison()[1] == {A: "boom"}
+    assert fleet.poison().errors == {A: "boom"}
 
 
 def test_a_failed_job_waits_for_another_worker_that_is_busy():
@@ -179,7 +179,7 @@ def test_a_failed_job_waits_for_another_worker_that_is_busy():
     first, *_ = digests(fleet.dispatch(0.0), A)
     fleet.result(A, result(first, error="boom"), 0.1)
     assert digests(fleet.dispatch(0.2), A) == []
-    assert [errors for _, errors in fleet.failures] == [{A: "boom"}]
+    assert [failure.errors for failure in fleet.failures] == [{A: "boom"}]
 
 
 def test_evaluations_wait_for_slack_and_take_a_quarter_of_the_slots():

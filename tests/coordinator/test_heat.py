@@ -136,10 +136,10 @@ def test_a_generation_waits_for_the_check_that_decides_its_temperature_and_for_n
 
 def test_the_temperature_is_told_as_it_rises(heated):
     bench, told = heated("night"), []
-    driven(bench, lambda _: 0, lambda: told.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
-    assert {status["generation"]["temperature"] for status in told} == {1.0, 1.5, 2.25}
+    driven(bench, lambda _: 0, lambda: told.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0)))
+    assert {each.status.generation.temperature for each in told} == {1.0, 1.5, 2.25}
     console = Console(file=io.StringIO(), width=120)
-    console.print(run_panel(told[-1], [], []))
+    console.print(run_panel(told[-1].status))
     assert "temperature 2.25" in console.file.getvalue()
     notes = [note for note in bench.run.fleet.notes if "dreams at" in note]
     assert notes == [

@@ -147,10 +147,10 @@ def test_a_result_has_no_verdict_before_its_drive_is_on_disk(bench):
     bench.deliver(name, result_of(job))
     assert bench.verdicts() == [(name, job.digest, "accepted")]
     assert bench.kept() == [drive_of(job)]
-    assert bench.run.collection_progress == (1, DRIVES)
+    assert bench.run.slack.collections.progress == (1, DRIVES)
     bench.deliver(name, result_of(job))
     assert bench.verdicts() == [(name, job.digest, "duplicate")]
-    assert len(bench.run.uploads) == 0
+    assert len(bench.run.slack.collections.uploads) == 0
 
 
 def test_the_end_waits_for_every_drive(bench):
@@ -169,8 +169,8 @@ def test_parts_of_a_job_that_nobody_gave_are_dropped_and_counted(bench):
     part = bench.parts(job)[0]
     for stranger, each in (("x/0badc0de", part), (name, replace(part, digest=b"x" * 32))):
         bench.upload(stranger, each)
-    assert bench.run.uploads.dropped == {"unwanted upload": 2}
-    assert len(bench.run.uploads) == 0
+    assert bench.run.dropped == {"unwanted upload": 2}
+    assert len(bench.run.slack.collections.uploads) == 0
 
 
 def test_a_drive_without_its_upload_is_an_error(bench):
@@ -178,7 +178,7 @@ def test_a_drive_without_its_upload_is_an_error(bench):
     bench.verdicts()
     bench.deliver(name, replace(result_of(job), upload=None))
     assert ("refused" in verdict for *_, verdict in bench.verdicts())
-    assert "not kept" in next(iter(bench.run.fleet.failures[0][1].values()))
+    assert "not kept" in next(iter(bench.run.fleet.failures[0].errors.values()))
 
 
 def test_a_restart_in_mid_upload_asks_again_and_what_was_kept_stays(bench):
@@ -188,7 +188,7 @@ def test_a_restart_in_mid_upload_asks_again_and_what_was_kept_stays(bench):
     bench.deliver(name, result_of(job))
     bench.upload(name, bench.parts(other)[0])
     bench.restart()
-    assert bench.run.collection_progress == (1, DRIVES)
+    assert bench.run.slack.collections.progress == (1, DRIVES)
     bench.beat(B, unacked=[other.digest])  # it was driven in the last life
     for part in bench.parts(other):
         bench.upload(B, part)
@@ -225,7 +225,7 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
             bench.beat(what[0], unacked=[jobs[what[1]].digest])
         elif kind == "wait":
             bench.now += what[0]
-            bench.run.fleet.tick(bench.now)
+            bench.run.tick(bench.now)
             bench.run.advance(bench.now)
             bench.run.commit()
         elif kind == "restart" and bench.run.ended is None:
@@ -233,7 +233,7 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
         accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
         whole = {drive_of(job) for job in jobs}
         assert set(bench.kept()) <= whole, "what counts is whole"
-        assert len(bench.kept()) == bench.run.collection_progress[0]
+        assert len(bench.kept()) == bench.run.slack.collections.progress[0]
     for job in jobs:  # two rounds that come through: a spoilt part ends the first
         for _ in range(2):
             bench.beat(A, unacked=[job.digest])

@@ -26,7 +26,7 @@ def fitness(processes, name):
 
 
 def slots(processes):
-    return sum(status["slots"] for status in processes.statuses())
+    return sum(status.slots for status in processes.statuses())
 
 
 def test_a_host_that_is_cut_off_costs_no_bit_and_comes_back(processes, hosts, random_bundle):

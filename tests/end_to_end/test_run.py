@@ -85,7 +85,7 @@ def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
     processes.worker("--task", tasks.SLOW_TOY)
     coordinator.wait_for("generation 1: mean")
     ours = processes.status()
-    assert (ours["schema"], ours["run"], ours["state"], ours["slots"]) == (1, "test", "running", 1)
+    assert (ours["schema"], ours["run"], ours["state"], ours["slots"]) == (2, "test", "running", 1)
     assert ours["worker_list"][0]["state"] == "present"
     tool = Path(sys.executable).parent / "zenoh"
     command = [tool, "--mode", "client", "--connect", processes.endpoint, "get", "-s", "dreamfleet/v1/test/status"]
@@ -239,7 +239,7 @@ def test_several_runs_on_one_router_never_see_each_other_and_a_worker_serves_the
     for number in range(2):
         workers.append(processes.worker("--task", tasks.SLOW_TOY, "--any", "--name", f"any{number}"))
         workers[-1].wait_for("joined run")
-        while not all(each["slots"] for each in processes.statuses()[: number + 1]):
+        while not all(each.slots for each in processes.statuses()[: number + 1]):
             pass
     assert sorted(line.split("joined run ")[1].split()[0] for each in workers for line in each.lines
                   if "joined run" in line) == ["first", "second"]  # fmt: skip

@@ -42,7 +42,7 @@ def run_with_a_death(processes):
     coordinator = processes.coordinator(*SETTINGS, "--evaluate-every", 0, name="three")
     workers = [processes.worker("--run", "three", "--name", f"w{number}") for number in range(3)]
     coordinator.wait_for("generation 0: mean")
-    while (generation := processes.statuses()[0]["generation"])["episodes_done"] == generation["episodes"]:
+    while (generation := processes.statuses()[0].generation).episodes_done == generation.episodes:
         pass  # between two generations
     os.kill(workers[1].popen.pid, signal.SIGKILL)
     code, _ = coordinator.finish(120)

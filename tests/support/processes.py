@@ -131,7 +131,7 @@ class Processes:
     def statuses(self):
         """Of every live run, those with most slots first."""
         with Client((self.endpoint,)) as client:
-            return sorted((client.status(run) for run in client.runs()), key=lambda status: -status["slots"])
+            return sorted((client.status(run) for run in client.runs()), key=lambda status: -status.slots)
 
     def end(self):
         for process in self._started:

@@ -2,6 +2,7 @@
 
 import hashlib
 
+from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.messages import (
     Beat,
     BundlePart,
@@ -20,6 +21,18 @@ from dreamfleet.common.messages import (
     VectorPart,
     Verdict,
     ViewFrame,
+)
+from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.status import (
+    FailureStatus,
+    OpenGeneration,
+    Population,
+    Progress,
+    Status,
+    Throughput,
+    Waste,
+    WorkerCount,
+    WorkerStatus,
 )
 
 UID = "0123456789abcdef" * 2
@@ -81,3 +94,20 @@ JSON = {
     "intervals": Intervals(beat=1.0, repeat=1.0),
     "task-spec": SPEC,
 }  # fmt: skip
+
+CLOSED = StoredGeneration(6, 90.5, 20.25, 140.0, -12.5, 0.095, 64000, 12.5)
+BEST = StoredEvaluation(4, 16, 120.5, 30.25)
+STATUS = Status(
+    schema=2, run="night", run_uid=UID, incarnation=3, package="0.1.0", state="running", why="",
+    settings=RunSettings(SPEC, ControllerShape(288), 4, 2, 0.1, "diagonal", 1, 5, 16), limits={"generations": 100},
+    uptime=99.5, generation=OpenGeneration(7, 3, 8, 2.5, 0.09, None), generations=7, last=CLOSED, recent=(CLOSED,),
+    population=Population(7, 0, 4, (2, 1, 0, 0), (2, 2, 2, 2), (101.5, -3.25, None, None)),
+    last_population=Population(6, 0, 4, (2, 2, 2, 2), (2, 2, 2, 2), (140.0, 112.0, 122.5, -12.5)),
+    evaluation=BEST, best=BEST, evaluations=1, evaluating=Progress(0, 0), collecting=Progress(8, 8),
+    workers=WorkerCount(1, 1),
+    worker_list=(WorkerStatus("host-a/0a1b2c3d", "present", 8, 12, 400, 987.5, 1.5, "native", 0.3, "x86_64 avx2"),),
+    slots=8, fingerprint="x86_64 avx2", throughput=Throughput(987.5, 448000),
+    waste=Waste(100, 0.01, 1, 2, 3, 4, 5, 6, 7, 8), failing=1,
+    failures=(FailureStatus("7/1", "score", (1048576,), {"host-a/0a1b2c3d": "boom"}, {"host-a/0a1b2c3d": 2}),),
+    dropped={"not msgpack": 2},
+)  # fmt: skip

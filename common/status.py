@@ -1,0 +1,197 @@
+"""How a run is, as one document: what a coordinator answers under `status`, and what every view reads.
+
+It is one consistent moment. What may be long comes as its head, with the total beside it, so that the answer stays
+under the message limit; the parts `workers`, `history` and `candidates` give the rest page by page.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from dreamfleet.common.codec import MalformedError, from_plain
+from dreamfleet.common.fields import known
+from dreamfleet.common.messages import MAX_MESSAGE, Count, Length, Seconds, Text, Word
+from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
+
+SCHEMA = 2
+PARTS = ("", "generation", "workers", "history", "candidates", "best")
+OVER = ("ended", "left")  # the states in which a coordinator leaves
+Long = Annotated[str, Length(0, 10_000)]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Episodes of something in progress."""
+
+    episodes_done: Count
+    episodes: Count
+
+
+@dataclass(frozen=True)
+class OpenGeneration:
+    """The generation that is being scored."""
+
+    number: Count
+    episodes_done: Count
+    episodes: Count  # as far as that is known: racing decides on half of them later
+    seconds: Seconds  # since it was opened
+    sigma: float  # the strategy's step size
+    temperature: float | None  # at which it dreams; `None` where a task has none
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One candidate of a generation: its fitness so far is the mean of the episodes that are done."""
+
+    generation: int
+    index: int
+    done: int
+    wanted: int
+    fitness: float | None  # `None` before the first episode
+
+
+@dataclass(frozen=True)
+class Population:
+    """Candidates of one generation from index `offset` on, of `total`: a column for each property."""
+
+    generation: Count
+    offset: Count
+    total: Count
+    done: tuple[Count, ...]  # episodes
+    wanted: tuple[Count, ...]  # episodes, as far as that is known
+    fitness: tuple[float | None, ...]
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """The same, a row for each candidate."""
+        columns = zip(self.done, self.wanted, self.fitness, strict=True)
+        return tuple(Candidate(self.generation, index, *row) for index, row in enumerate(columns, self.offset))
+
+
+@dataclass(frozen=True)
+class WorkerStatus:
+    """What the coordinator believes of one worker."""
+
+    worker: Word
+    state: Word  # present, silent or lost
+    slots: Count
+    leases: Count
+    finished: Count
+    steps_per_second: float
+    load: float
+    drawn_by: Word
+    heard: float  # seconds ago
+    fingerprint: Text
+
+
+@dataclass(frozen=True)
+class WorkerCount:
+    """How many workers there are."""
+
+    present: Count
+    known: Count
+
+
+@dataclass(frozen=True)
+class Throughput:
+    """How fast the fleet is, and what it has done."""
+
+    steps_per_second: float
+    environment_steps: Count
+
+
+@dataclass(frozen=True)
+class Waste:
+    """What was done twice or for nothing; `share` is that of environment steps."""
+
+    discarded_steps: Count
+    share: float
+    reissued: Count
+    recalled: Count
+    copied: Count
+    duplicate: Count
+    obsolete: Count
+    errors: Count
+    resent_batches: Count
+    silences: Count
+
+
+@dataclass(frozen=True)
+class FailureStatus:
+    """A wanted job that failed somewhere."""
+
+    candidate: Word  # generation/index
+    kind: Word
+    seeds: tuple[Count, ...]
+    errors: dict[str, str]  # the last of each worker
+    attempts: dict[str, int]  # how often each worker failed
+
+
+@dataclass(frozen=True)
+class Status:
+    """A run at one moment."""
+
+    schema: Count
+    run: Word
+    run_uid: Word
+    incarnation: Count
+    package: Word | None  # version of the coordinator's dreamfleet
+    state: Word  # running, evaluating, waiting for workers, paused, ended, left
+    why: Long  # it is paused, or ended
+    settings: RunSettings
+    limits: dict[str, Any]
+    uptime: Seconds
+    generation: OpenGeneration
+    generations: Count  # closed ones
+    last: StoredGeneration | None
+    recent: tuple[StoredGeneration, ...]  # the last of the closed ones, oldest first
+    population: Population  # the head of the open generation's candidates
+    last_population: Population | None  # the head of those of the one that was closed last
+    evaluation: StoredEvaluation | None  # the last one
+    best: StoredEvaluation | None
+    evaluations: Count  # finished ones
+    evaluating: Progress
+    collecting: Progress
+    workers: WorkerCount
+    worker_list: tuple[WorkerStatus, ...]  # the first of those that are known
+    slots: Count
+    fingerprint: Text | None
+    throughput: Throughput
+    waste: Waste
+    failing: Count  # wanted jobs that failed somewhere
+    failures: tuple[FailureStatus, ...]  # the first of them
+    dropped: dict[str, int]  # messages, by reason
+
+    @property
+    def over(self) -> bool:
+        """Whether its coordinator leaves, because the run ended or was left open."""
+        return self.state in OVER
+
+
+def read_status(document: dict[str, Any]) -> Status:
+    """The typed form of a `status` answer; what a later version added is ignored.
+
+    `MalformedError` says what to install where it is not understood.
+    """
+    try:
+        return from_plain(Status, known(Status, document))
+    except MalformedError as error:
+        run, schema = document.get("run", "?"), document.get("schema", "?")
+        package = document.get("package") or "another version"
+        raise MalformedError(
+            f"run {run} describes its status in words that this version does not know (schema {schema}, not {SCHEMA}: "
+            f"{error}); install the coordinator's dreamfleet ({package}) here"
+        ) from error
+
+
+def read_document(payload: bytes) -> dict[str, Any]:
+    """The JSON object in an answer; `MalformedError` if it is none."""
+    try:
+        document = json.loads(payload) if len(payload) <= MAX_MESSAGE else None
+    except (ValueError, RecursionError):
+        document = None
+    if not isinstance(document, dict):
+        raise MalformedError("what answers for the run is no status: install the same dreamfleet here and there")
+    return document

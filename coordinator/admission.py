@@ -1,0 +1,22 @@
+"""Who may join a run: workers that know its task, on hosts that compute the same bits. Pure."""
+
+from __future__ import annotations
+
+from dreamfleet.common.messages import HelloRequest
+
+
+def refusal(request: HelloRequest, task: str, fingerprint: str | None) -> tuple[str, str] | None:
+    """Why a worker cannot join a run of `task` and what to do about it; `None` if it may.
+
+    `fingerprint` is the one that the run admits; `None` admits any.
+    """
+    if task not in request.tasks:
+        known = ", ".join(request.tasks) or "none"
+        return f"this run scores in {task!r}, which the worker does not know (it knows: {known})", (
+            "install the package that registers this task on the worker's host"
+        )
+    if fingerprint in (None, request.fingerprint):
+        return None
+    return f"fingerprints differ: the run has [{fingerprint}], the worker [{request.fingerprint}]", (
+        "install the same package versions on a host of the same CPU features, or start the coordinator with --mixed"
+    )

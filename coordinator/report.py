@@ -1,0 +1,89 @@
+"""What a run reports: its best evaluated mean, else the last mean; never the luckiest sample."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.runs import RunSettings
+
+PACE = 5.0  # seconds between two writings of a mean that was not evaluated: each waits for the disk
+
+
+@dataclass(frozen=True)
+class Reported:
+    """A mean `(size,)`, as float32 bytes, with the generation that it is of and its evaluated score, if it has one."""
+
+    run_uid: str
+    settings: RunSettings
+    generation: int
+    vector: bytes
+    score: float | None
+    steps: int  # environment steps that the run had made by then
+
+    def controller(self) -> Controller:
+        """As it is saved."""
+        provenance = {
+            "run_uid": self.run_uid,
+            "generation": self.generation,
+            "validation_mean": self.score,
+            "settings": asdict(self.settings),
+            "steps": self.steps,
+        }
+        parameters = np.frombuffer(self.vector, dtype="<f4").astype(np.float32)
+        return Controller(
+            self.settings.controller, parameters, self.settings.task.task, self.settings.task.bundle, provenance
+        )
+
+
+class Report:
+    """Follows a run's means and keeps the file at `path` up to date."""
+
+    def __init__(self, path: Path, run_uid: str, settings: RunSettings) -> None:
+        self.current: Reported | None = None  # `None` before the first generation is closed
+        self._path = path
+        self._run_uid = run_uid
+        self._settings = settings
+        self._saved: Reported | None = None
+        self._due = False
+        self._next = float("-inf")  # when a mean that was not evaluated may be written again
+
+    def closed(self, generation: int, mean: bytes, steps: int, now: float) -> None:
+        """A generation was closed: its mean is reported, unless one was evaluated."""
+        if self.current is not None and self.current.score is not None:
+            generation, mean = self.current.generation, self.current.vector
+        score = self.current.score if self.current is not None else None
+        self.current = Reported(self._run_uid, self._settings, generation, mean, score, steps)
+        self._due = self._due or now >= self._next
+        if self._due:
+            self._next = now + PACE
+
+    def evaluated(self, generation: int, mean: bytes, score: float, steps: int) -> None:
+        """A mean is the best of those that were evaluated."""
+        self.current = Reported(self._run_uid, self._settings, generation, mean, score, steps)
+        self._due = True
+
+    def finish(self) -> None:
+        """The run ends: whatever is reported now is to be written."""
+        self._due = True
+
+    def save(self, *, at_once: bool = False) -> None:
+        """Write the controller if it is due, or if it is not what the file holds and must be written `at_once`."""
+        if self.current is None or self.current == self._saved or not (self._due or at_once):
+            return
+        try:
+            self.current.controller().save(self._path)
+        except OSError as error:
+            raise JournalError(
+                f"cannot write {self._path}: {error.strerror}; make room and continue the run"
+            ) from error
+        self._saved, self._due = self.current, False
+
+    @property
+    def path(self) -> Path | None:
+        """Where the reported controller lies; `None` before it was written."""
+        return self._path if self._saved is not None else None

@@ -1,0 +1,61 @@
+"""The status document: golden, forgiving towards later versions, clear about what it cannot read."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.codec import MalformedError, encode_json
+from dreamfleet.common.status import Candidate, read_document, read_status
+from tests.support.samples import STATUS
+
+GOLDEN = Path(__file__).parent / "golden" / "status.v2.json"
+
+
+def test_the_golden_status_is_read_for_ever():
+    assert read_status(read_document(GOLDEN.read_bytes())) == STATUS
+
+
+def test_what_is_written_today_reads_as_what_was_written():
+    assert read_status(read_document(encode_json(STATUS))) == STATUS
+    assert json.loads(encode_json(STATUS)) == json.loads(GOLDEN.read_bytes())
+
+
+def test_fields_of_later_versions_are_ignored_at_any_depth():
+    document = json.loads(GOLDEN.read_bytes())
+    later = {"later": {"anything": [1]}}
+    document |= later
+    for part in (document["settings"], document["settings"]["task"], document["worker_list"][0], document["waste"],
+                 document["population"], document["recent"][0], document["best"]):  # fmt: skip
+        part.update(later)
+    assert read_status(document) == STATUS
+
+
+@pytest.mark.parametrize("missing", ["waste", "population", "worker_list", "recent"])
+def test_a_missing_field_is_an_error_that_names_what_to_install(missing):
+    document = json.loads(GOLDEN.read_bytes())
+    del document[missing]
+    with pytest.raises(MalformedError, match=r"run night .* install the coordinator's dreamfleet \(0\.1\.0\) here"):
+        read_status(document)
+
+
+def test_the_first_schema_is_refused_with_its_number():
+    with pytest.raises(MalformedError, match=r"schema 1, not 2"):
+        read_status({"schema": 1, "run": "night", "package": "0.0.9", "state": "running"})
+
+
+@pytest.mark.parametrize("payload", [b"", b"[]", b"\xff", b"{" * 20000, b"1"])
+def test_what_is_no_document_is_an_error_for_people(payload):
+    with pytest.raises(MalformedError, match="install the same dreamfleet"):
+        read_document(payload)
+
+
+def test_a_population_is_columns_on_the_wire_and_rows_to_a_reader():
+    population = dataclasses.replace(STATUS.population, offset=4)
+    assert population.candidates[1] == Candidate(7, 5, 1, 2, -3.25)
+    assert population.candidates[2].fitness is None
+
+
+if __name__ == "__main__" and not GOLDEN.exists():
+    GOLDEN.write_bytes(encode_json(STATUS))
