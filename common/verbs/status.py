@@ -7,7 +7,7 @@ import json
 import time
 
 from dreamfleet.common.errors import ConnectionFailedError
-from dreamfleet.common.session import DEFAULT_ENDPOINT
+from dreamfleet.common.site import offer
 
 SUMMARY = "show how a run is: generation, population, best, workers, throughput, waste"
 EXTRAS = ()
@@ -16,7 +16,7 @@ REFRESH = 0.5  # seconds
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--connect", nargs="+", default=[DEFAULT_ENDPOINT], help=f"router (default {DEFAULT_ENDPOINT})")
+    offer(parser, "connect")
     parser.add_argument("--run", help="name of the run (default: the only live one)")
     parser.add_argument("--json", action="store_true", help="print the documents as the wire has them")
     parser.add_argument("--watch", action="store_true", help="stay and refresh until the run ends or Ctrl-C")
