@@ -1,22 +1,29 @@
 """The command line: finds verbs through the entry-point group `dreamfleet.verbs`; each side registers its own.
 
 A verb is a module with `SUMMARY`, `EXTRAS`, `configure(parser)` and `run(args)`. A dot in its name is a space on the
-command line: `train.vae` is `dreamfleet train vae`. Verbs import what is heavy when they run.
+command line: `train.vae` is `dreamfleet train vae`. Verbs import what is heavy when they run, and only the module of
+the verb that is asked for is loaded.
 """
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import logging
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint, entry_points, version
-from typing import Protocol
+from typing import NoReturn, Protocol
 
-from dreamfleet.common.errors import DreamfleetError, MissingExtraError
+from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 
 GROUP = "dreamfleet.verbs"
 INTERRUPTED = 130
+DESCRIPTION = "Evolve World-Models controllers on whatever machines you have."
+EXIT_CODES = (
+    "Exit codes: 0 done; 1 it failed, was refused, or the answer is no; 2 the command or a setting is wrong; 130 it "
+    "was interrupted, or left a run that can be continued."
+)
 
 
 class Verb(Protocol):
@@ -32,13 +39,29 @@ class Verb(Protocol):
         """Do it; the exit code."""
 
 
+class Parser(argparse.ArgumentParser):
+    """A verb's parser: an unknown flag names the near one."""
+
+    def parse_all(self, words: Sequence[str]) -> argparse.Namespace:
+        """Parse `words`, all of which must be known."""
+        args, unknown = self.parse_known_args(words)
+        if unknown:
+            self._refuse(unknown)
+        return args
+
+    def _refuse(self, unknown: Sequence[str]) -> NoReturn:
+        flags = [word.split("=")[0] for word in unknown if word.startswith("--")]
+        near = [each for flag in flags for each in difflib.get_close_matches(flag, self._option_string_actions, n=1)]
+        hint = f"; did you mean {', '.join(dict.fromkeys(near))}?" if near else ""
+        self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; an expected error is one line on stderr and an exit code that is not 0."""
     logging.basicConfig(format="%(asctime)s %(levelname)s %(name)s: %(message)s", level=logging.WARNING)
-    parser = build_parser(entry_points(group=GROUP))
-    args = parser.parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
     try:
-        return run_verb(args)
+        return run_verb({point.name: point for point in entry_points(group=GROUP)}, words)
     except DreamfleetError as error:
         print(f"dreamfleet: {error}", file=sys.stderr)
         return error.exit_code
@@ -50,34 +73,88 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
 
-def build_parser(points: Iterable[EntryPoint]) -> argparse.ArgumentParser:
-    """The tree of verbs; their modules are import-light, so it needs no extra."""
-    parser = argparse.ArgumentParser(
-        prog="dreamfleet", description="Evolve World-Models controllers on whatever machines you have."
-    )
-    parser.add_argument("--version", action="version", version=f"dreamfleet {version('dreamfleet')}")
-    branches = {"": parser.add_subparsers(metavar="VERB", required=True)}
-    for point in sorted(points, key=lambda point: point.name):
-        path, _, name = point.name.rpartition(".")
-        if path not in branches:
-            group = branches[""].add_parser(path, help=f"{path} ...: see `dreamfleet {path} --help`")
-            branches[path] = group.add_subparsers(metavar=path.upper(), required=True)
-        verb: Verb = point.load()
-        leaf = branches[path].add_parser(name, help=verb.SUMMARY, description=verb.SUMMARY)
-        verb.configure(leaf)
-        leaf.set_defaults(verb=verb, extras=verb.EXTRAS)
-    return parser
+def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:
+    """Find the verb that `words` begin with, parse the rest, run it; without a verb, `--help` lists them all."""
+    name = ".".join(words[:2]) if ".".join(words[:2]) in points else "".join(words[:1])
+    if name not in points:
+        _overview(points, words)
+    verb = _load(points[name])
+    args = parser_of(name, verb).parse_all(words[name.count(".") + 1 :])
+    from dreamfleet.common.site import settle
 
-
-def run_verb(args: argparse.Namespace) -> int:
-    """Run the chosen verb; a package that is not there becomes the line that installs it."""
+    settle(args)
     try:
-        code: int = args.verb.run(args)
+        return verb.run(args)
     except ModuleNotFoundError as error:
-        if not args.extras:
+        if not verb.EXTRAS:
             raise
-        wanted = ",".join(args.extras)
+        wanted = ",".join(verb.EXTRAS)
         raise MissingExtraError(
             f"the package {error.name!r} is not installed; this needs: pip install 'dreamfleet[{wanted}]'"
         ) from error
-    return code
+
+
+def parser_of(name: str, verb: Verb) -> Parser:
+    """The parser of one verb, with the flags that every verb has."""
+    from dreamfleet.common.site import offer_everywhere
+
+    spoken = name.replace(".", " ")
+    parser = Parser(prog=f"dreamfleet {spoken}", description=verb.SUMMARY, epilog=EXIT_CODES)
+    verb.configure(parser)
+    offer_everywhere(parser)
+    return parser
+
+
+def _load(point: EntryPoint) -> Verb:
+    try:
+        verb: Verb = point.load()
+    except Exception as error:
+        owner = point.dist.name if point.dist else point.module
+        raise DreamfleetError(
+            f"the verb {point.name!r} cannot be loaded from {point.value}: {type(error).__name__}: {error}; update or "
+            f"uninstall {owner}"
+        ) from error
+    return verb
+
+
+def _overview(points: Mapping[str, EntryPoint], words: Sequence[str]) -> NoReturn:
+    """Answer words that name no verb: help, the version, or what is wrong with them."""
+    first = words[0] if words else ""
+    group = [name for name in points if name.startswith(f"{first}.")] if first else []
+    spoken = list(words[: 2 if group else 1])
+    if spoken and not spoken[-1].startswith("-") and (not group or len(spoken) == 2):
+        raise UsageError(_unknown(" ".join(spoken), points))
+    parser = _listing(f"dreamfleet {first}", group, points) if group else _listing("dreamfleet", _top(points), points)
+    parser.add_argument("--version", action="version", version=f"dreamfleet {version('dreamfleet')}")
+    parser.parse_args(words[1:] if group else words)
+    parser.error("name a verb; --help lists them")
+
+
+def _top(points: Iterable[str]) -> list[str]:
+    return sorted({name.partition(".")[0] for name in points})
+
+
+def _listing(prog: str, names: Iterable[str], points: Mapping[str, EntryPoint]) -> argparse.ArgumentParser:
+    """A parser whose help lists verbs and groups of verbs; a verb that cannot be loaded is listed as such."""
+    parser = argparse.ArgumentParser(prog=prog, description=DESCRIPTION, epilog=EXIT_CODES)
+    verbs = parser.add_subparsers(metavar="VERB")
+    for name in sorted(names):
+        spoken = name.rpartition(".")[2]
+        if name in points:
+            verbs.add_parser(spoken, help=_summary(points[name]).replace("%", "%%"))
+        else:
+            verbs.add_parser(spoken, help=f"{spoken} ...: see `dreamfleet {spoken} --help`")
+    return parser
+
+
+def _summary(point: EntryPoint) -> str:
+    try:
+        return _load(point).SUMMARY
+    except DreamfleetError as error:
+        return f"BROKEN: {error}"
+
+
+def _unknown(spoken: str, points: Iterable[str]) -> str:
+    known = sorted({*(name.replace(".", " ") for name in points), *_top(points)})
+    near = difflib.get_close_matches(spoken, known, n=1)
+    return f"unknown verb {spoken!r}" + (f": did you mean {near[0]!r}?" if near else "; `dreamfleet --help` lists them")

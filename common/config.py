@@ -1,7 +1,8 @@
 """Configuration: frozen dataclasses from defaults, a preset, a TOML file, environment and flags, in this order.
 
-A section is one dataclass: `[run]` in TOML, `DREAMFLEET_RUN_...` in the environment, its field names as flags. A key
-that no section knows is refused, with the nearest one named.
+A section is one dataclass: `[run]` in TOML, `DREAMFLEET_RUN_...` in the environment, its field names as flags. The
+section without a name is the top of the file and `DREAMFLEET_...`. A key that no section knows is refused, with the
+nearest one named. The field `preset` of a section, where it has one, names the preset.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import argparse
 import difflib
 import tomllib
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -26,14 +27,32 @@ def option(default: Any, text: str, *, alias: str = "") -> Any:
     return field(default=default, metadata={"help": text, "alias": alias})
 
 
-def add_flags(parser: argparse.ArgumentParser, *sections: type[Any]) -> None:
-    """A flag for each field of the sections; absent flags leave no trace in the namespace."""
+def add_flags(
+    parser: argparse.ArgumentParser,
+    *sections: type[Any],
+    only: Iterable[str] | None = None,
+    texts: Mapping[str, str] | None = None,
+    default: str | None = None,
+) -> None:
+    """A flag for each field of the sections, or for those named in `only`; absent flags leave no trace.
+
+    `texts` replaces a field's help; `default` is shown instead of the defaults, where these are not what counts.
+    """
+    wanted = None if only is None else frozenset(only)
     for section in sections:
-        group = parser.add_argument_group(section.__name__.removesuffix("Config").lower())
+        group = _group(parser, section.__name__.removesuffix("Config").lower())
         hints = get_type_hints(section)
         for each in fields(section):
-            aliases = [alias] if (alias := each.metadata.get("alias")) else []
-            group.add_argument(_flag(each), *aliases, **_flag_options(each, hints[each.name]))
+            if wanted is None or each.name in wanted:
+                aliases = [alias] if (alias := each.metadata.get("alias")) else []
+                text = (texts or {}).get(each.name) or each.metadata["help"] + _shown_default(each, default)
+                group.add_argument(_flag(each), *aliases, **_flag_options(each, hints[each.name], text))
+
+
+def _group(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:
+    """The group of that title, which an earlier call may have made."""
+    made = next((each for each in parser._action_groups if each.title == title), None)
+    return made or parser.add_argument_group(title)
 
 
 def load(
@@ -43,19 +62,39 @@ def load(
     flags: argparse.Namespace | None = None,
     environment: Mapping[str, str] | None = None,
     file: Table | None = None,
-    preset: Table | None = None,
+    base: Table | None = None,
+    preset: Callable[[str], Table] | None = None,
 ) -> T:
-    """The section `name`, each key from the strongest source that has it; `UsageError` for an unknown key or value."""
-    known = {each.name: hint for each, hint in zip(fields(section), _hints(section), strict=True)}  # type: ignore[arg-type]
-    chosen: dict[str, Any] = dict(preset or {})
-    chosen.update(_from_table(known, name, (file or {}).get(name, {})))
-    chosen.update(_from_environment(known, name, environment or {}))
+    """The section `name`, each key from the strongest source that has it; `UsageError` for an unknown key or value.
+
+    Weaker than every other source is what `preset` finds under the name that the key of that name has; weaker still
+    is `base`.
+    """
+    known = _known(section)
+    chosen = given(section, name, file, environment)
     chosen.update({key: value for key, value in vars(flags or argparse.Namespace()).items() if key in known})
-    return section(**chosen)
+    named = chosen.get("preset")
+    return section(**{**(base or {}), **(preset(named) if preset and named is not None else {}), **chosen})
 
 
-def read_toml(path: Path | None, sections: Iterable[str]) -> dict[str, Any]:
-    """The tables of a configuration file; a table that is not among `sections` is refused."""
+def given(section: type[Any], name: str, file: Table | None, environment: Mapping[str, str] | None) -> dict[str, Any]:
+    """What the file and the environment say of the section `name`, checked."""
+    known = _known(section)
+    table = (file or {}).get(name, {}) if name else {key: (file or {})[key] for key in known if key in (file or {})}
+    return {
+        **read_table(section, f"[{name}]" if name else "", table),
+        **_from_environment(known, name, environment or {}),
+    }
+
+
+def read_table(section: type[Any], where: str, table: Table) -> dict[str, Any]:
+    """The values of a table, each of its field's type; `UsageError` for what does not fit, saying `where`."""
+    known = _known(section)
+    return _from_table(known, where, table)
+
+
+def read_toml(path: Path | None, tables: Iterable[str], top: Iterable[str] = ()) -> dict[str, Any]:
+    """A configuration file: its tables, and the keys before the first of them; others are refused."""
     if path is None:
         return {}
     try:
@@ -64,43 +103,39 @@ def read_toml(path: Path | None, sections: Iterable[str]) -> dict[str, Any]:
         raise UsageError(f"no configuration file at {path}") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UsageError(f"{path} cannot be read as TOML: {error}") from error
-    known = sorted(sections)
+    known, keys = sorted(tables), sorted(top)
     for name, value in table.items():
+        if name in keys:
+            continue
         if name not in known:
-            raise UsageError(f"{path}: unknown table [{name}]{_nearest(name, known)}")
+            what = f"table [{name}]" if isinstance(value, dict) else f"key {name!r}"
+            raise UsageError(f"{path}: unknown {what}{nearest(name, [*known, *keys])}")
         if not isinstance(value, dict):
             raise UsageError(f"{path}: {name} must be a table, written [{name}]")
     return table
 
 
-def choose_preset(presets: Mapping[str, Table], name: str | None) -> Table:
-    """The preset of that name, empty without one; `UsageError` names those that exist."""
-    if name is None:
-        return {}
-    if name not in presets:
-        raise UsageError(f"unknown preset {name!r}: choose one of {', '.join(sorted(presets))}")
-    return presets[name]
-
-
-def _from_table(known: Mapping[str, Any], section: str, table: Table) -> dict[str, Any]:
+def _from_table(known: Mapping[str, Any], where: str, table: Table) -> dict[str, Any]:
     values = {}
     for key, value in table.items():
         if key not in known:
-            raise UsageError(f"unknown key {key!r} in [{section}]{_nearest(key, known)}")
-        values[key] = _fit(known[key], value, f"{key} in [{section}]")
+            raise UsageError(f"unknown key {key!r} in {where}{nearest(key, known)}")
+        values[key] = _fit(known[key], value, f"{key} in {where}" if where else key)
     return values
 
 
 def _from_environment(known: Mapping[str, Any], section: str, environment: Mapping[str, str]) -> dict[str, Any]:
-    prefix = f"DREAMFLEET_{section.upper()}_"
+    prefix = f"DREAMFLEET_{section.upper()}_" if section else "DREAMFLEET_"
     values = {}
     for variable, text in environment.items():
         if not variable.startswith(prefix):
             continue
+        if not section and variable.removeprefix(prefix).lower() not in known:
+            continue  # of another section
         key = variable.removeprefix(prefix).lower()
         if key not in known:
             names = [prefix + each.upper() for each in known]
-            raise UsageError(f"unknown environment variable {variable}{_nearest(variable, names)}")
+            raise UsageError(f"unknown environment variable {variable}{nearest(variable, names)}")
         values[key] = _parse(known[key], text, variable)
     return values
 
@@ -158,11 +193,15 @@ def _flag(each: Field[Any]) -> str:
     return "--" + each.name.replace("_", "-")
 
 
-def _flag_options(each: Field[Any], hint: Any) -> dict[str, Any]:
-    base = _base(hint)
+def _shown_default(each: Field[Any], instead: str | None) -> str:
     default = each.default if each.default is not MISSING else None
-    shown = "" if default in (None, (), False, "") else f" (default {default})"
-    options: dict[str, Any] = {"default": argparse.SUPPRESS, "dest": each.name, "help": each.metadata["help"] + shown}
+    shown = "" if default in (None, (), False, "") else str(default)
+    return f" (default {instead or shown})" if instead or shown else ""
+
+
+def _flag_options(each: Field[Any], hint: Any, text: str) -> dict[str, Any]:
+    base = _base(hint)
+    options: dict[str, Any] = {"default": argparse.SUPPRESS, "dest": each.name, "help": text}
     if base is bool:
         return {**options, "action": argparse.BooleanOptionalAction}
     if get_origin(base) is tuple:
@@ -179,12 +218,14 @@ class _TupleAction(argparse.Action):
         setattr(namespace, self.dest, tuple(values))
 
 
-def _hints(section: type[Any]) -> list[Any]:
+def _known(section: type[Any]) -> dict[str, Any]:
+    """The type of each field."""
     hints = get_type_hints(section)
-    return [hints[each.name] for each in fields(section)]
+    return {each.name: hints[each.name] for each in fields(section)}
 
 
-def _nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The end of a sentence about an unknown name: the near one, or all of them."""
     names = list(known)
     near = difflib.get_close_matches(name, names, n=1)
     return f": did you mean {near[0]!r}?" if near else f"; known are {', '.join(names)}"

@@ -13,9 +13,15 @@ from pathlib import Path
 from dreamfleet.common.bundle import Bundle, default_cache, shipped_bundles
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.fingerprint import package_version
-from dreamfleet.common.runs import default_runs_dir
 
 GROUP = "dreamfleet.checks"
+# What a role stands on, as findings name it; each extra installs the last part.
+ROLES = {
+    "coordinator": ("everything",),
+    "worker": ("everything", "worker"),
+    "views": ("everything", "worker", "views"),
+    "train": ("everything", "worker", "train"),
+}
 # distribution -> (module, extra); the empty extra is what every role needs
 PACKAGES = {
     "eclipse-zenoh": ("zenoh", ""),
@@ -37,7 +43,10 @@ LEAST_FREE_BYTES = 200_000_000
 
 @dataclass(frozen=True)
 class Finding:
-    """One check: what was found, which role needs it, and what to do if it is not there."""
+    """One check: what was found, what it is for, whether that cannot do without it, and what to do if it lacks.
+
+    `role` is `everything` or one of `ROLES`.
+    """
 
     name: str
     ok: bool
@@ -47,11 +56,16 @@ class Finding:
     remedy: str
 
 
-def examine() -> list[Finding]:
+def examine(runs_dir: Path) -> list[Finding]:
     """Every check, ours and those that the sides register under `dreamfleet.checks`."""
     registered = [finding for point in entry_points(group=GROUP) for finding in point.load()()]
-    folders = [_writable("cache", default_cache()), _writable("runs", default_runs_dir())]
+    folders = [_writable("cache", default_cache()), _writable("runs", runs_dir)]
     return [*_packages(), _one_box2d(), *_bundles(), *registered, *folders]
+
+
+def lacking(role: str, findings: list[Finding]) -> list[Finding]:
+    """What keeps this installation from a role; empty if it can be played."""
+    return [each for each in findings if each.role in ROLES[role] and each.needed and not each.ok]
 
 
 def _packages() -> Iterator[Finding]:
@@ -59,7 +73,7 @@ def _packages() -> Iterator[Finding]:
         found = package_version(name) or (package_version("box2d-py") if name == "box2d" else None)
         remedy = f"pip install 'dreamfleet[{extra}]'" if extra else "pip install dreamfleet"
         ok = found is not None and find_spec(module) is not None
-        yield Finding(name, ok, not extra, found or "-", extra or "everything", remedy)
+        yield Finding(name, ok, True, found or "-", extra or "everything", remedy)
 
 
 def _one_box2d() -> Finding:
@@ -75,9 +89,9 @@ def _bundles() -> Iterator[Finding]:
             found, ok = Bundle.open(path).sha256[:12], True
         except DreamfleetError as error:
             found, ok = str(error), False
-        yield Finding(f"bundle {name}", ok, True, found, "world model", "reinstall dreamfleet")
+        yield Finding(f"bundle {name}", ok, True, found, "everything", "reinstall dreamfleet")
     if not paths:
-        yield Finding("bundle", False, True, "none shipped", "world model", "reinstall dreamfleet")
+        yield Finding("bundle", False, True, "none shipped", "everything", "reinstall dreamfleet")
 
 
 def _writable(name: str, path: Path) -> Finding:

@@ -212,6 +212,10 @@ class RunFolder:
         row = self._one("SELECT state FROM strategy ORDER BY generation DESC LIMIT 1")
         return None if row is None else bytes(row[0])
 
+    def fact(self, key: str) -> str | None:
+        """One of the run's facts, such as the limits that it was last served with; `None` if it has no such fact."""
+        return self._fact(key)
+
     def _fact(self, key: str) -> str | None:
         row = self._one("SELECT value FROM run WHERE key = ?", key)
         return None if row is None else str(row[0])

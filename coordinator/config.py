@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +11,7 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.config import option
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.messages import COLDEST, HOTTEST, TaskSpec
+from dreamfleet.common.presets import check_preset, preset_help
 from dreamfleet.common.runs import RunSettings
 
 
@@ -17,6 +19,7 @@ from dreamfleet.common.runs import RunSettings
 class RunConfig:
     """What is frozen with a run."""
 
+    preset: str | None = option(None, preset_help("run"))
     task: str = option("car-racing", "what candidates are scored in; a worker must know it")
     bundle: str = option("tiny", "the frozen world model: a shipped name or a file")
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
@@ -103,14 +106,16 @@ class LimitsConfig:
         for name in ("generations", "steps", "minutes", "parted"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise UsageError(f"--{name} must not be negative")
+        if self.target is not None and not math.isfinite(self.target):
+            raise UsageError(f"--target must be a number, not {self.target}")
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Where the coordinator is reached; an embedded router listens unless it connects to others."""
+    """Where the coordinator is reached, and how it treats its workers."""
 
     listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
-    connect: tuple[str, ...] = option((), "connect to these stand-alone routers")
+    connect: tuple[str, ...] = option((), "connect to these stand-alone routers, as well where --listen is given")
     beat: float = option(1.0, "seconds between a worker's beats")
     mixed: bool = option(False, "admit workers of any fingerprint; gives up replay to the bit")
 
@@ -136,3 +141,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "frugal": {"population": 32, "episodes": 2, "sigma0": 0.1, "covariance": "diagonal", "patience": 100},
 }
+
+
+def find_preset(name: str) -> dict[str, Any]:
+    """The preset of a run of that name; `UsageError` lists those that exist."""
+    return PRESETS[check_preset("run", name)]

@@ -8,21 +8,21 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 import subprocess
-import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 from rich.live import Live
+from rich.text import Text
 
 from dreamfleet.common.client import Client
 from dreamfleet.common.config import option
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
+from dreamfleet.common.processes import Child, call, spoken
 from dreamfleet.common.runs import CONTROLLER, open_run
 from dreamfleet.common.table import run_panel
 
@@ -86,11 +86,11 @@ class Demo:
         folder = self._runs_dir / best.run
         self._say("judging the outcome on unseen tracks, whole episodes, in gymnasium's own environment")
         controller = str(folder / CONTROLLER)
-        self._call("evaluate", "--controller", controller, "--episodes", str(self._config.tracks))
+        call("evaluate", "--controller", controller, "--episodes", self._config.tracks)
         for stage in self._stages:
             self._plot(stage)
         self._say("recording a drive, and beside it what the model dreams")
-        self._call("record", "--controller", controller, "--out", str(folder / VIDEO), "--steps", "1000")
+        call("record", "--controller", controller, "--out", folder / VIDEO, "--steps", 1000)
         self._farewell(folder)
 
     def _checked(self, stage: Stage) -> float:
@@ -101,30 +101,28 @@ class Demo:
     def _evolve(self, stage: Stage) -> None:
         workers = self._config.workers or len(os.sched_getaffinity(0))
         self._say(f"{stage.what}: a coordinator and {workers} workers on this machine")
-        self._logs = self._runs_dir / stage.run
+        logs = self._runs_dir / stage.run
+        flags = {
+            "run": stage.run, "runs-dir": self._runs_dir, "listen": self._endpoint, "bundle": self._config.bundle,
+            **stage.flags,
+        }  # fmt: skip
+        arguments = [text for name, value in flags.items() for text in (f"--{name}", value)]
         with ExitStack() as stack:
-            flags = {
-                "run": stage.run, "runs-dir": self._runs_dir, "listen": self._endpoint, "bundle": self._config.bundle,
-                **stage.flags,
-            }  # fmt: skip
-            arguments = [text for name, value in flags.items() for text in (f"--{name}", str(value))]
-            coordinator = self._spawn(stack, "coordinator", *arguments)
-            client = self._connect(coordinator)
-            with client:
-                for number in range(workers):
-                    self._spawn(
-                        stack, "worker", "--connect", self._endpoint, "--run", stage.run,
-                        "--name", f"core-{number}", "--slots", "1",
-                    )  # fmt: skip
-                self._watch(client, coordinator, stage.run)
-            if coordinator.wait() != 0:
-                raise DreamfleetError(f"the coordinator failed; its words are in {self._log('coordinator')}")
+            log = logs / "coordinator.log"
+            coordinator = stack.enter_context(Child("coordinator", *arguments, log=log))
+            client = stack.enter_context(self._connect(coordinator))
+            for name in (f"core-{number}" for number in range(workers)):
+                where = ("--connect", self._endpoint, "--run", stage.run)
+                stack.enter_context(Child("worker", *where, "--name", name, "--slots", 1, log=logs / f"{name}.log"))
+            self._watch(client, coordinator.popen, stage.run)
+            if coordinator.finish()[0] != 0:
+                raise DreamfleetError(f"the coordinator failed; its words are in {log}")
 
-    def _connect(self, coordinator: subprocess.Popen[bytes]) -> Client:
+    def _connect(self, coordinator: Child) -> Client:
         deadline = time.monotonic() + START_SECONDS
         while True:
-            if coordinator.poll() is not None:
-                raise DreamfleetError(self._last_words("coordinator"))
+            if coordinator.popen.poll() is not None:
+                raise DreamfleetError(coordinator.last_words())
             try:
                 return Client((self._endpoint,))
             except ConnectionFailedError:
@@ -141,52 +139,28 @@ class Demo:
                 except subprocess.TimeoutExpired:
                     continue
 
-    def _spawn(self, stack: ExitStack, verb: str, *arguments: str) -> subprocess.Popen[bytes]:
-        """Start a verb whose words go to a log in the run's folder; it ends when the stack does."""
-        name = arguments[arguments.index("--name") + 1] if "--name" in arguments else verb
-        self._logs.mkdir(parents=True, exist_ok=True)
-        log = stack.enter_context(self._log(name).open("wb"))
-        process = subprocess.Popen(  # noqa: S603 - our own interpreter and our own arguments
-            _command(verb, *arguments), stdout=log, stderr=log, start_new_session=True
-        )
-        stack.callback(_end, process)
-        return process
-
-    def _call(self, verb: str, *arguments: str) -> None:
-        result = subprocess.run(_command(verb, *arguments), check=False)  # noqa: S603 - as above
-        if result.returncode != 0:
-            raise DreamfleetError(f"dreamfleet {verb} failed")
-
     def _plot(self, stage: Stage) -> None:
         from dreamfleet.coordinator.plot import plot_fitness
 
         path = self._runs_dir / stage.run / PLOT
         with open_run(self._runs_dir, stage.run) as run:
             plot_fitness(run, path)
-        self._console.print(f"{path}: fitness over generations")
+        self._console.print(f"{path}: fitness over generations", markup=False)
 
     def _farewell(self, folder: Path) -> None:
         controller = folder / CONTROLLER
-        self._console.print(
-            f"\n[bold]In {folder}[/]: the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
-        )
+        told = f": the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
+        self._console.print(Text.assemble("\n", (f"In {folder}", "bold"), told))
         for command in (
-            f"dreamfleet replay {folder.name} --candidate 0/0",
-            f"dreamfleet evaluate --controller {controller} --episodes 100",
-            f"dreamfleet coordinator --run mine --preset frugal --listen {self._endpoint}   "
-            "# and, on any host: dreamfleet worker --connect tcp/HOST:PORT",
+            spoken("replay", folder.name, "--candidate", "0/0", "--runs-dir", self._runs_dir),
+            spoken("evaluate", "--controller", controller, "--episodes", 100),
+            spoken("coordinator", "--run", "mine", "--preset", "frugal", "--listen", self._endpoint)
+            + "   # and, on any host: dreamfleet worker --connect tcp/HOST:PORT",
         ):
-            self._console.print(f"  {command}", style="green", highlight=False, soft_wrap=True)
+            self._console.print(f"  {command}", style="green", highlight=False, soft_wrap=True, markup=False)
 
     def _say(self, text: str) -> None:
-        self._console.print(f"[bold]{text}[/]")
-
-    def _log(self, name: str) -> Path:
-        return self._logs / f"{name}.log"
-
-    def _last_words(self, name: str) -> str:
-        lines = self._log(name).read_text(errors="replace").strip().splitlines()
-        return lines[-1].removeprefix("dreamfleet: ") if lines else f"the {name} ended without a word"
+        self._console.print(text, style="bold", markup=False)
 
 
 def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
@@ -211,19 +185,3 @@ def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
     if config.minutes:
         found.append(Stage(name, f"evolving in reality for {config.minutes:g} minutes", reality))
     return tuple(found)
-
-
-def _command(verb: str, *arguments: str) -> Sequence[str]:
-    return [sys.executable, "-m", "dreamfleet", verb, *arguments]
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Ask a child to leave, twice if it must be."""
-    for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGKILL):
-        if process.poll() is not None:
-            return
-        process.send_signal(number)
-        try:
-            process.wait(3)
-        except subprocess.TimeoutExpired:
-            continue

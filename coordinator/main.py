@@ -13,9 +13,10 @@ from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import Intervals
 from dreamfleet.common.runs import BUNDLE, RunSettings, open_run, run_lock
 from dreamfleet.common.session import Network
-from dreamfleet.coordinator.config import LimitsConfig, RunConfig
+from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.fleet import Fleet
 from dreamfleet.coordinator.journal import Journal
+from dreamfleet.coordinator.kept import facts_of
 from dreamfleet.coordinator.run import Run
 from dreamfleet.coordinator.service import Service
 from dreamfleet.coordinator.start import Start
@@ -29,9 +30,7 @@ class RunRequest:
     runs_dir: Path
     config: RunConfig | None
     limits: LimitsConfig
-    network: Network
-    beat: float = 1.0
-    mixed: bool = False
+    network: NetworkConfig
     start: Start | None = None  # of a new run; it begins with zero parameters otherwise
 
 
@@ -50,16 +49,27 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
             journal = Journal(folder / "journal.sqlite")
         else:
             journal = Journal.create(folder, settings, bundle.path)
-        service = Service(
-            request.name, folder, request.network, Intervals(request.beat, request.beat), mixed=request.mixed
-        )
+        service = _service(request, folder)
         on_stoppable(service.stop)
         try:
-            return service.serve(
-                lambda: Run(journal, settings, request.limits, Fleet(request.beat), monotonic(), request.start)
-            )
+            _keep(journal, request)
+            fleet = Fleet(request.network.beat)
+            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), request.start))
         finally:
             journal.close()
+
+
+def _service(request: RunRequest, folder: Path) -> Service:
+    network = request.network
+    intervals = Intervals(network.beat, network.beat)
+    return Service(request.name, folder, Network(network.listen, network.connect), intervals, mixed=network.mixed)
+
+
+def _keep(journal: Journal, request: RunRequest) -> None:
+    """Write how the run is served, at once: a coordinator that finds its port taken is not asked everything again."""
+    for name, text in facts_of(request.limits, request.network).items():
+        journal.set_fact(name, text)
+    journal.commit()
 
 
 def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 
-from dreamfleet.common.session import DEFAULT_ENDPOINT
+from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.site import offer
 
 
 @dataclass(frozen=True)
@@ -20,16 +21,17 @@ class ControlVerb:
     def configure(self, parser: argparse.ArgumentParser) -> None:
         """Add the verb's arguments."""
         parser.add_argument("run_name", nargs="?", metavar="RUN", help="name of the run (default: the only live one)")
-        parser.add_argument("--connect", nargs="+", default=[DEFAULT_ENDPOINT], help=f"default {DEFAULT_ENDPOINT}")
+        offer(parser, "connect")
+        add_json(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         """Ask, and say what follows."""
         from dreamfleet.common.client import Client
 
-        with Client(tuple(args.connect)) as client:
+        with Client(args.connect) as client:
             name = args.run_name or client.status().run
             client.control(name, self.name)
-        print(f"run {name} {self.outcome}")
+        answer(args, f"run {name} {self.outcome.format(run=name)}", run=name, asked=self.name, accepted=True)
         return 0
 
 
@@ -39,5 +41,7 @@ DRAIN = ControlVerb(
     "drain", "give out no more jobs, wait for those that run, then leave; the run can be continued", "is draining"
 )
 STOP = ControlVerb(
-    "stop", "leave now; the run can be continued", "is left by its coordinator; continue it with --resume"
+    "stop",
+    "leave now; the run can be continued",
+    "is left by its coordinator; continue it on that host with: dreamfleet coordinator --resume {run}",
 )

@@ -1,4 +1,4 @@
-"""`dreamfleet doctor`: what is installed, what is missing, and the remedy."""
+"""`dreamfleet doctor`: what is installed, what is missing, which role it can play, and the remedy."""
 
 from __future__ import annotations
 
@@ -7,45 +7,59 @@ import json
 import os
 import platform
 import sys
+from typing import TYPE_CHECKING
 
-SUMMARY = "check this installation: versions, fingerprint, what is missing and the remedy"
+from dreamfleet.common.listing import add_json, print_rows
+from dreamfleet.common.site import offer
+
+if TYPE_CHECKING:
+    from dreamfleet.common.health import Finding
+
+SUMMARY = "check this installation: versions, fingerprint, what each role lacks and the remedy"
 EXTRAS = ()
+ALL_ROLES = ("coordinator", "worker", "views", "train")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--json", action="store_true", help="print the report as JSON")
+    parser.add_argument(
+        "--role", choices=ALL_ROLES, default="coordinator",
+        help="exit 1 if this role cannot be played here (default coordinator, on which every other stands)",
+    )  # fmt: skip
+    offer(parser, "runs_dir")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the report; exit 1 if something that any role needs is broken."""
-    from rich.console import Console
-    from rich.table import Table
-
+    """Print the report; exit 1 if the role that was asked about cannot be played."""
     from dreamfleet.common.fingerprint import fingerprint
-    from dreamfleet.common.health import examine
+    from dreamfleet.common.health import examine, lacking
 
-    findings = examine()
-    broken = [each for each in findings if each.needed and not each.ok]
+    findings = examine(args.runs_dir)
+    roles = {role: lacking(role, findings) for role in ALL_ROLES}
+    host = {"python": platform.python_version(), "platform": platform.platform(), "cores": os.cpu_count(),
+            "fingerprint": fingerprint()}  # fmt: skip
     if args.json:
-        report = {
-            "python": platform.python_version(),
-            "platform": platform.platform(),
-            "cores": os.cpu_count(),
-            "fingerprint": fingerprint(),
-            "checks": [vars(each) for each in findings],
-            "ok": not broken,
-        }
-        print(json.dumps(report, indent=2))
-        return 1 if broken else 0
-    console = Console()
-    console.print(f"Python {platform.python_version()} at {sys.prefix}, {os.cpu_count()} cores, {platform.platform()}")
-    console.print(f"fingerprint: {fingerprint()}", style="dim")
-    table = Table(box=None, padding=(0, 2), header_style="dim")
-    for column in ("", "check", "found", "for", "remedy"):
-        table.add_column(column)
-    for each in findings:
-        mark = "[green]ok[/]" if each.ok else "[red]missing[/]" if each.needed else "[yellow]absent[/]"
-        table.add_row(mark, each.name, each.found, each.role, "" if each.ok else each.remedy)
-    console.print(table)
-    return 1 if broken else 0
+        told = {role: not lacks for role, lacks in roles.items()}
+        checks = [vars(each) for each in findings]
+        print(json.dumps({**host, "checks": checks, "roles": told, "ok": told[args.role]}, indent=2))
+    else:
+        print(f"Python {host['python']} at {sys.prefix}, {host['cores']} cores, {host['platform']}")
+        print(f"fingerprint: {host['fingerprint']}\n")
+        print_rows([_row(each) for each in findings])
+        print()
+        print_rows([{"role": role, "here": _verdict(lacks)} for role, lacks in roles.items()])
+    return 1 if roles[args.role] else 0
+
+
+def _row(each: Finding) -> dict[str, object]:
+    state = "ok" if each.ok else "missing" if each.needed else "absent"
+    return {"state": state, "check": each.name, "found": each.found, "for": each.role,
+            "remedy": "" if each.ok else each.remedy}  # fmt: skip
+
+
+def _verdict(lacks: list[Finding]) -> str:
+    if not lacks:
+        return "can be played"
+    remedies = "; ".join(dict.fromkeys(each.remedy for each in lacks))
+    return f"cannot be played: {', '.join(each.name for each in lacks)} missing; {remedies}"

@@ -6,7 +6,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.session import DEFAULT_ENDPOINT
+from dreamfleet.common.site import offer
 
 if TYPE_CHECKING:
     from dreamfleet.common.client import Client
@@ -18,7 +18,7 @@ REFRESH = 0.5  # seconds
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--connect", nargs="+", default=[DEFAULT_ENDPOINT], help=f"router (default {DEFAULT_ENDPOINT})")
+    offer(parser, "connect")
     parser.add_argument("--run", help="name of the run (default: the only live one)")
     parser.add_argument(
         "--json", action="store_true", help="print the document as the wire has it; with --watch one line each time"
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the status."""
     from dreamfleet.common.client import Client
 
-    with Client(tuple(args.connect)) as client:
+    with Client(args.connect) as client:
         document = client.document(args.run)
         if args.watch:
             name = str(document.get("run"))

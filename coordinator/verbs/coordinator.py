@@ -4,36 +4,36 @@ from __future__ import annotations
 
 import argparse
 import logging
-import os
 import signal
 import sys
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.config import Table, add_flags, choose_preset, load, read_toml
+from dreamfleet.common.config import Table, add_flags, given, load
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs import default_runs_dir
-from dreamfleet.common.session import DEFAULT_ENDPOINT, Network
-from dreamfleet.coordinator.config import PRESETS, LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.site import offer
+from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig, RunConfig, find_preset
 
 if TYPE_CHECKING:
+    from dreamfleet.common.runs import RunFolder
     from dreamfleet.coordinator.main import RunRequest
     from dreamfleet.coordinator.run import Run
     from dreamfleet.coordinator.start import Start
 
 SUMMARY = "start a run: CMA-ES decides, workers score"
 EXTRAS = ()
-SECTIONS = ("run", "limits", "network")
+LEFT_OPEN = 130
+log = logging.getLogger("dreamfleet.coordinator")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     name = parser.add_mutually_exclusive_group()
     name.add_argument("--run", dest="run_name", default="run", help="name of the new run (default run)")
-    name.add_argument("--resume", metavar="RUN", help="continue this run from its journal")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
-    parser.add_argument("--preset", help=f"settings to begin with: {', '.join(sorted(PRESETS))}")
+    name.add_argument("--resume", metavar="RUN", help="continue this run from its journal, with the limits and the "
+                      "network that it last had where no other are given")  # fmt: skip
     parser.add_argument(
         "--init",
         metavar="CONTROLLER",
@@ -42,10 +42,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_settings(parser)
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
-    """The arguments of whatever serves a run."""
-    parser.add_argument("--config", type=Path, help="TOML file with [run], [limits] and [network]")
-    add_flags(parser, RunConfig, LimitsConfig, NetworkConfig)
+def add_settings(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+    """The arguments of whatever serves a run; `default` is shown instead of the settings' defaults."""
+    add_json(parser)
+    offer(parser, "runs_dir")
+    add_flags(parser, RunConfig, default=default)
+    add_flags(parser, LimitsConfig, NetworkConfig)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -53,52 +55,78 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.start import find_start
 
     if args.resume and args.init:
-        raise UsageError(f"--init: run {args.resume} has begun; `dreamfleet fork {args.resume}` begins another from it")
-    start = find_start(args.init, args.runs_dir) if args.init else None
-    return serve(args, choose_preset(PRESETS, args.preset), start, args.resume)
+        raise UsageError("--init is of a new run: a continued one has its parameters; `fork` begins another from it")
+    if args.resume:
+        return _resume(args)
+    return serve(args, {}, find_start(args.init, args.runs_dir) if args.init else None)
 
 
-def serve(args: argparse.Namespace, preset: Table, start: Start | None, resume: str | None = None) -> int:
-    """Serve a run whose settings begin with `preset`, or continue one."""
-    from dreamfleet.coordinator.main import RunRequest, serve_run
+def serve(args: argparse.Namespace, base: Table, start: Start | None) -> int:
+    """Serve a new run, whose settings are those of `base` where nothing else is said."""
+    config = load(RunConfig, "run", base=base, preset=find_preset, **args.sources)
+    limits = load(LimitsConfig, "limits", **args.sources)
+    _check_target(limits, config.evaluate_every)
+    return _serve(args, _request(args, args.run_name, config, limits, {}, start))
 
-    logging.getLogger("dreamfleet.coordinator").setLevel(logging.INFO)
-    file = read_toml(args.config, SECTIONS)
-    sources: Any = {"flags": args, "environment": os.environ, "file": file}
-    config = load(RunConfig, "run", preset=preset, **sources)
-    limits = load(LimitsConfig, "limits", **sources)
-    network = load(NetworkConfig, "network", **sources)
-    _check_target(config, limits)
-    listen = network.listen or (() if network.connect else (DEFAULT_ENDPOINT,))
-    request = RunRequest(
-        name=resume or args.run_name,
-        runs_dir=args.runs_dir,
-        config=None if resume else config,
-        limits=limits,
-        network=Network(listen, network.connect),
-        beat=network.beat,
-        mixed=network.mixed,
-        start=start,
-    )
-    if resume:
-        _refuse_frozen(args, file)
+
+def _resume(args: argparse.Namespace) -> int:
+    from dreamfleet.common.runs import open_run
+    from dreamfleet.coordinator.kept import kept_limits, kept_network
+
+    with open_run(args.runs_dir, args.resume) as stored:
+        _refuse_frozen(args)
+        _tell_frozen(args, stored)
+        limits = load(LimitsConfig, "limits", base=kept_limits(stored), **args.sources)
+        _check_target(limits, stored.settings.evaluate_every)
+        request = _request(args, args.resume, None, limits, kept_network(stored), None)
+        before = len(stored.history())
+    return _serve(args, request, before)
+
+
+def _request(
+    args: argparse.Namespace, name: str, config: RunConfig | None, limits: LimitsConfig, kept: Table,
+    start: Start | None,
+) -> RunRequest:  # fmt: skip
+    from dreamfleet.coordinator.kept import choose_addresses
+    from dreamfleet.coordinator.main import RunRequest
+
+    base = {key: value for key, value in kept.items() if key not in ("listen", "connect")}
+    own = load(NetworkConfig, "network", base=base, **args.sources)
+    return RunRequest(name, args.runs_dir, config, limits, choose_addresses(own, args.site, kept), start)
+
+
+def _serve(args: argparse.Namespace, request: RunRequest, before: int | None = None) -> int:
+    from dreamfleet.coordinator.main import serve_run
+
     run = serve_run(request, _stop_on_signals)
-    _report(run, request)
-    return 0 if run.ended is not None else 130
+    _report(args, run, request, nothing_new=len(run.history) == before)
+    return 0 if run.ended is not None else LEFT_OPEN
 
 
-def _check_target(config: RunConfig, limits: LimitsConfig) -> None:
-    if limits.target is not None and not config.evaluate_every:
+def _check_target(limits: LimitsConfig, evaluate_every: int) -> None:
+    if limits.target is not None and not evaluate_every:
         raise UsageError("--target is reached by an evaluated mean: give --evaluate-every too")
 
 
-def _refuse_frozen(args: argparse.Namespace, file: dict[str, object]) -> None:
-    given = [name for name in RunConfig.__dataclass_fields__ if name in vars(args)]
-    if given or args.preset or "run" in file:
-        what = ", ".join(given) or args.preset or "[run]"
+def _refuse_frozen(args: argparse.Namespace) -> None:
+    if flags := [each.name for each in fields(RunConfig) if each.name in args.given]:
         raise UsageError(
-            f"{what}: frozen with run {args.resume}; `dreamfleet fork {args.resume}` begins another run from it"
+            f"{', '.join(flags)}: frozen with run {args.resume}; `dreamfleet fork {args.resume}` begins another run "
+            "from it"
         )
+
+
+def _tell_frozen(args: argparse.Namespace, stored: RunFolder) -> None:
+    """A file serves many runs: what it says of another one is no error, but is not silently passed over either."""
+    from dreamfleet.coordinator.config import settings_of
+
+    said = given(RunConfig, "run", args.sources["file"], args.sources["environment"])
+    preset = find_preset(said.pop("preset")) if "preset" in said else {}
+    frozen: dict[str, Any] = settings_of(stored.settings, stored.bundle_path)
+    for name, value in {**preset, **said}.items():
+        if name != "bundle" and frozen.get(name, value) != value:
+            log.warning("%s is %s in run %s, which keeps it; the settings say %s", name, frozen[name], stored.name,
+                        value)  # fmt: skip
 
 
 def _stop_on_signals(stop: Callable[[], None]) -> None:
@@ -106,11 +134,24 @@ def _stop_on_signals(stop: Callable[[], None]) -> None:
         signal.signal(number, lambda *_: stop())
 
 
-def _report(run: Run, request: RunRequest) -> None:
-    name, folder = request.name, request.runs_dir / request.name
+def _report(args: argparse.Namespace, run: Run, request: RunRequest, *, nothing_new: bool) -> None:
+    from dreamfleet.common.processes import spoken
+    from dreamfleet.common.runs import CONTROLLER
+
+    again = spoken("coordinator", "--resume", request.name, "--runs-dir", request.runs_dir)
+    path = request.runs_dir / request.name / CONTROLLER
+    controller = path if path.is_file() else None
+    facts: dict[str, Any] = {"run": request.name, "ended": run.ended, "controller": controller, "continue": again}
+    facts["best"] = None if run.best is None else vars(run.best)
     if run.ended is None:
-        print(f"left run {name} open; continue it with: dreamfleet coordinator --resume {name}", file=sys.stderr)
-        return
-    best = run.best
-    score = f"; its mean scored {best.mean:.1f} on {best.episodes} validation tracks" if best else ""
-    print(f"run {name} ended after {run.ended}{score}; controller: {folder / 'controller.npz'}")
+        text = f"left run {request.name} open; continue it with: {again}"
+    else:
+        best = run.best
+        score = f"; its mean scored {best.mean:.1f} on {best.episodes} validation tracks" if best else ""
+        where = f"; controller: {controller}" if controller else "; it has no controller yet"
+        more = f"; it goes on with wider limits, such as: {again} --generations 0 --minutes 30" if nothing_new else ""
+        text = f"run {request.name} ended after {run.ended}{score}{where}{more}"
+    if run.ended is None and not args.json:
+        print(text, file=sys.stderr)
+    else:
+        answer(args, text, **facts)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 from datetime import datetime
 from importlib.util import find_spec
-from pathlib import Path
 
 from dreamfleet.common.config import add_flags, load
-from dreamfleet.common.runs import default_runs_dir
+from dreamfleet.common.site import offer
 from dreamfleet.coordinator.demo import Demo, DemoConfig
 
 SUMMARY = "evolve a controller on this machine in minutes, judge it, plot it and record its drive"
@@ -19,7 +17,7 @@ EXTRAS = ("worker", "views")
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--run", dest="run_name", help="name of the run (default: demo and the time)")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+    offer(parser, "runs_dir")
     add_flags(parser, DemoConfig)
 
 
@@ -28,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     for package in ("av", "gymnasium", "matplotlib", "onnxruntime"):
         if find_spec(package) is None:  # said now rather than after minutes of evolution
             raise ModuleNotFoundError(name=package)
-    config = load(DemoConfig, "demo", flags=args, environment=os.environ)
+    config = load(DemoConfig, "demo", **args.sources)
     name = args.run_name or f"demo-{datetime.now():%m%d-%H%M%S}"
     Demo(config, name, args.runs_dir).play()
     return 0

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
-
-from dreamfleet.common.runs import default_runs_dir
 
 SUMMARY = "start a new run from another one's mean, step size and temperature; any setting may change"
 EXTRAS = ()
@@ -17,8 +14,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("source", metavar="RUN", help="the run to begin from; it is only read")
     parser.add_argument("--run", dest="run_name", help="name of the new run (default RUN-fork)")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
-    add_settings(parser)
+    add_settings(parser, default="RUN's own")
 
 
 def run(args: argparse.Namespace) -> int:

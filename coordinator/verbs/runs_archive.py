@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from dreamfleet.common.errors import JournalError
-from dreamfleet.common.runs import ARCHIVE, default_runs_dir, open_run, run_lock
+from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.runs import ARCHIVE, open_run, run_lock
+from dreamfleet.common.site import offer
 
 SUMMARY = "move a run that nobody serves into the archive"
 EXTRAS = ()
@@ -15,7 +16,8 @@ EXTRAS = ()
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("run_name", metavar="RUN", help="name of the run")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+    offer(parser, "runs_dir")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -27,5 +29,5 @@ def run(args: argparse.Namespace) -> int:
     with run_lock(source):
         target.parent.mkdir(exist_ok=True)
         source.rename(target)
-    print(f"archived as {target}; move it back to use it again")
+    answer(args, f"archived as {target}; move it back to use it again", run=args.run_name, archived=target)
     return 0

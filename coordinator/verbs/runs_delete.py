@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs import default_runs_dir, open_run, run_lock
+from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.runs import open_run, run_lock
+from dreamfleet.common.site import offer
 
 SUMMARY = "delete a run that nobody serves, with its journal, controller and videos"
 EXTRAS = ()
@@ -17,7 +18,8 @@ EXTRAS = ()
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("run_name", metavar="RUN", help="name of the run")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+    offer(parser, "runs_dir")
+    add_json(parser)
     parser.add_argument("--yes", action="store_true", help="do not ask")
 
 
@@ -28,12 +30,12 @@ def run(args: argparse.Namespace) -> int:
     if not args.yes:
         if not sys.stdin.isatty():
             raise UsageError("nobody is there to confirm: give --yes")
-        answer = input(f"delete run {args.run_name} with its {generations} generations? [y/N] ")
-        if answer.strip().lower() not in ("y", "yes"):
-            print("kept")
+        said = input(f"delete run {args.run_name} with its {generations} generations? [y/N] ")
+        if said.strip().lower() not in ("y", "yes"):
+            answer(args, "kept", run=args.run_name, deleted=None)
             return 1
     folder = args.runs_dir / args.run_name
     with run_lock(folder):
         shutil.rmtree(folder)
-    print(f"deleted {folder}")
+    answer(args, f"deleted {folder}", run=args.run_name, deleted=folder)
     return 0

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 from dreamfleet.common.errors import JournalError
-from dreamfleet.common.runs import ARCHIVE, RunFolder, default_runs_dir, run_paths
+from dreamfleet.common.listing import add_json, print_rows
+from dreamfleet.common.runs import ARCHIVE, RunFolder, run_paths
+from dreamfleet.common.site import offer
 
 SUMMARY = "list the runs on this disk"
 EXTRAS = ()
@@ -15,30 +18,22 @@ EXTRAS = ()
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+    offer(parser, "runs_dir")
     parser.add_argument("--archived", action="store_true", help="list the archived ones instead")
-    parser.add_argument("--json", action="store_true", help="print them as JSON")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print a line a run; a damaged journal is a line too."""
-    from rich.console import Console
-    from rich.table import Table
-
     runs_dir = args.runs_dir / ARCHIVE if args.archived else args.runs_dir
     rows = [_row(path) for path in run_paths(runs_dir)]
     if args.json:
         print(json.dumps(rows, indent=2))
         return 0
     if not rows:
-        print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME")
+        print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME", file=sys.stderr)
         return 0
-    table = Table(box=None, padding=(0, 2), header_style="dim")
-    for column in ("run", "created", "task", "generations", "last mean", "evaluated", "state"):
-        table.add_column(column, justify="right" if column in ("generations", "last mean", "evaluated") else "left")
-    for row in rows:
-        table.add_row(*(str(value) for value in row.values()))
-    Console().print(table)
+    print_rows(rows, right=("generations", "mean", "evaluated"))
     return 0
 
 

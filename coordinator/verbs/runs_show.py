@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import asdict
-from pathlib import Path
 
-from dreamfleet.common.runs import default_runs_dir, open_run
+from dreamfleet.common.listing import add_json, print_rows
+from dreamfleet.common.runs import RunSettings, StoredGeneration, open_run
+from dreamfleet.common.site import offer
 
 SUMMARY = "show one run from its journal: settings, history, evaluations"
 EXTRAS = ()
@@ -17,15 +19,12 @@ SHOWN = 20
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("run_name", metavar="RUN", help="name of the run")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    offer(parser, "runs_dir")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the run."""
-    from rich.console import Console
-    from rich.table import Table
-
     with open_run(args.runs_dir, args.run_name) as stored:
         settings, history, evaluations = stored.settings, stored.history(), stored.evaluations()
         facts = {"run": stored.name, "run_uid": stored.uid, "created": stored.created, "ended": stored.ended,
@@ -34,21 +33,32 @@ def run(args: argparse.Namespace) -> int:
         rows = {"history": [asdict(each) for each in history], "evaluations": [asdict(each) for each in evaluations]}
         print(json.dumps({**facts, "settings": asdict(settings), **rows}, indent=2))
         return 0
-    console = Console()
-    for name, value in {**facts, **asdict(settings.task), **asdict(settings)}.items():
-        if not isinstance(value, dict):
-            console.print(f"[dim]{name:>20}[/]  {value}", highlight=False)
-    table = Table(box=None, padding=(0, 2), header_style="dim")
-    for column in ("generation", "mean", "std", "best", "worst", "sigma", "steps", "seconds", "evaluated"):
-        table.add_column(column, justify="right")
+    print_rows([{"": name, "value": value} for name, value in {**facts, **_flat(settings)}.items()])
+    print()
+    shown = history[-SHOWN:] if sys.stdout.isatty() else history
     judged = {each.generation: each.mean for each in evaluations}
-    for each in history[-SHOWN:]:
-        evaluated = f"{judged[each.number]:.1f}" if each.number in judged else ""
-        table.add_row(
-            str(each.number), f"{each.mean:.1f}", f"{each.std:.1f}", f"{each.best:.1f}", f"{each.worst:.1f}",
-            f"{each.sigma:.4f}", str(each.steps), f"{each.seconds:.1f}", evaluated,
-        )  # fmt: skip
-    if len(history) > SHOWN:
-        console.print(f"the last {SHOWN} of {len(history)} generations; --json has all", style="dim")
-    console.print(table)
+    lines = [_row(each, judged.get(each.number)) for each in shown]
+    if len(shown) < len(history):
+        print(f"the last {SHOWN} of {len(history)} generations; --json has all")
+    print_rows(lines, right=tuple(lines[0]) if lines else ())
     return 0
+
+
+def _flat(settings: RunSettings) -> dict[str, object]:
+    """The settings with the task's and the controller's among them."""
+    flat: dict[str, object] = {}
+    for name, value in asdict(settings).items():
+        flat |= {name: value} if not isinstance(value, dict) else _within(name, value)
+    return flat
+
+
+def _within(name: str, parts: dict[str, object]) -> dict[str, object]:
+    return {part if part == name else f"{name}.{part}": value for part, value in parts.items() if value is not None}
+
+
+def _row(each: StoredGeneration, evaluated: float | None) -> dict[str, object]:
+    return {
+        "generation": each.number, "mean": f"{each.mean:.1f}", "std": f"{each.std:.1f}", "best": f"{each.best:.1f}",
+        "worst": f"{each.worst:.1f}", "sigma": f"{each.sigma:.4f}", "steps": each.steps,
+        "seconds": f"{each.seconds:.1f}", "evaluated": "" if evaluated is None else f"{evaluated:.1f}",
+    }  # fmt: skip

@@ -4,7 +4,7 @@ from typing import Literal
 
 import pytest
 
-from dreamfleet.common.config import add_flags, choose_preset, load, option, read_toml
+from dreamfleet.common.config import add_flags, load, option, read_toml
 from dreamfleet.common.errors import UsageError
 
 
@@ -16,6 +16,7 @@ class ThingConfig:
     names: tuple[str, ...] = option((), "whose")
     loud: bool = option(False, "or not")
     limit: float | None = option(None, "at most")
+    preset: str | None = option(None, "what to begin with")
 
 
 def flags(*arguments):
@@ -30,7 +31,7 @@ def test_defaults_stand_alone():
 
 def test_the_nearer_source_wins():
     sources = {
-        "preset": {"count": 4, "rate": 4.0, "colour": "blue", "names": ("p",)},
+        "base": {"count": 4, "rate": 4.0, "colour": "blue", "names": ("p",)},
         "file": {"thing": {"count": 5, "rate": 5, "names": ["f"]}},
         "environment": {"DREAMFLEET_THING_COUNT": "6", "DREAMFLEET_THING_RATE": "6", "HOME": "/"},
         "flags": flags("--count", "7"),
@@ -82,7 +83,25 @@ def test_a_missing_file_is_refused(tmp_path):
         read_toml(tmp_path / "absent.toml", ["thing"])
 
 
-def test_an_unknown_preset_names_the_known_ones():
-    with pytest.raises(UsageError, match="unknown preset 'huge': choose one of large, small"):
-        choose_preset({"small": {}, "large": {}}, "huge")
-    assert choose_preset({"small": {}}, None) == {}
+def test_a_preset_can_be_named_in_the_file_and_is_weaker_than_everything_but_its_base(tmp_path):
+    sizes = {"large": {"count": 90, "rate": 9.0}}
+    sources = {"file": {"thing": {"preset": "large", "rate": 5}}, "base": {"count": 2, "colour": "blue"}}
+    loaded = load(ThingConfig, "thing", preset=sizes.__getitem__, **sources)
+    assert loaded == ThingConfig(90, 5.0, "blue", preset="large")
+    with pytest.raises(KeyError):
+        load(ThingConfig, "thing", preset=sizes.__getitem__, environment={"DREAMFLEET_THING_PRESET": "tiny"})
+
+
+def test_the_section_without_a_name_is_the_top_of_the_file(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text("count = 5\n[other]\nkey = 1\n")
+    file = read_toml(path, ["other"], top=["count"])
+    environment = {"DREAMFLEET_RATE": "2", "DREAMFLEET_OTHER_KEY": "3"}
+    assert load(ThingConfig, "", file=file, environment=environment) == ThingConfig(5, 2.0)
+
+
+def test_flags_can_be_some_of_a_section():
+    parser = ArgumentParser()
+    add_flags(parser, ThingConfig, only=["count"], texts={"count": "so many"})
+    assert "so many" in parser.format_help()
+    assert "--rate" not in parser.format_help()

@@ -24,7 +24,7 @@ def complains(processes, *arguments, says):
     ("arguments", "says"),
     [
         (("--run", "No Good"), "cannot name a run"),
-        (("--preset", "huge"), "unknown preset 'huge': choose one of article, dream, frugal, paper"),
+        (("--preset", "huge"), "unknown run preset 'huge': choose one of article, dream, frugal, paper"),
         (("--bundle", "absent"), "no bundle 'absent'"),
         (("--population", "1"), "--population must be at least 2"),
         (("--sigma0", "nan"), "--sigma0 must be a positive number"),
@@ -133,7 +133,7 @@ def test_a_run_is_listed_shown_archived_and_deleted(processes, random_bundle):
     assert "sigma0" in processes.call("runs", "show", "test", *where)[1]
     complains(processes, "runs", "delete", "test", *where, says="give --yes")
     assert processes.call("runs", "archive", "test", *where)[0] == 0
-    assert "no runs" in processes.call("runs", "list", *where)[1]
+    assert "no runs" in processes.call("runs", "list", *where)[2]
     assert "test" in processes.call("runs", "list", "--archived", *where)[1]
     assert processes.call("runs", "delete", "test", "--yes", "--runs-dir", processes.runs / "archive")[0] == 0
 

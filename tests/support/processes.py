@@ -2,15 +2,13 @@
 
 import json
 import os
-import queue
 import socket
 import subprocess
-import sys
-import threading
 from contextlib import contextmanager
 from pathlib import Path
 
 from dreamfleet.common.client import Client
+from dreamfleet.common.processes import Child, command
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 60
@@ -33,51 +31,18 @@ def environment(cache):
     }
 
 
-class Process:
+class Process(Child):
     """A verb running; its stderr lines can be waited for."""
 
     def __init__(self, arguments, cache, inside=()):
-        command = [*inside, sys.executable, "-m", "dreamfleet", *map(str, arguments)]
-        self.popen = subprocess.Popen(
-            command,
-            env=environment(cache),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        self.lines = []
-        self._queue = queue.SimpleQueue()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self):
-        for line in self.popen.stderr:
-            self.lines.append(line)
-            self._queue.put(line)
-        self._queue.put(None)
-
-    def wait_for(self, text, times=1, timeout=DEADLINE):
-        """Block until `text` was said on stderr so many times, counted from the last wait."""
-        while times:
-            line = self._queue.get(timeout=timeout)
-            if line is None:
-                raise AssertionError(f"ended before saying {text!r}:\n{''.join(self.lines)}")
-            times -= text in line
+        super().__init__(*arguments, environment=environment(cache), inside=inside)
 
     def finish(self, timeout=DEADLINE):
-        """Exit code and stdout."""
-        out, _ = self.popen.stdout.read(), self.popen.wait(timeout)
-        self._reader.join(timeout)
-        return self.popen.returncode, out
+        return super().finish(timeout)
 
-    def end(self):
-        if self.popen.poll() is None:
-            self.popen.kill()
-        self.popen.wait()
-        self._reader.join(5)
-        self.popen.stdout.close()
-        self.popen.stderr.close()
+    def end(self, patience=0):
+        """At once: no test waits for a verb that it has done with."""
+        super().end(patience)
 
 
 class Processes:
@@ -118,9 +83,13 @@ class Processes:
 
     def call(self, *arguments, timeout=DEADLINE):
         """Run a verb to its end: exit code, stdout, stderr."""
-        command = [sys.executable, "-m", "dreamfleet", *map(str, arguments)]
         done = subprocess.run(
-            command, env=environment(self.cache), capture_output=True, check=False, text=True, timeout=timeout
+            command(*arguments),
+            env=environment(self.cache),
+            capture_output=True,
+            check=False,
+            text=True,
+            timeout=timeout,
         )
         return done.returncode, done.stdout, done.stderr
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import socket
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.processes import Child
 from dreamfleet.common.runs import open_run
 from dreamfleet.worker.bench.crowd import serve_crowd
 from dreamfleet.worker.bench.naps import NAP_SECONDS, NAPS, NULLS
@@ -95,8 +94,8 @@ class BenchRun:
         with ExitStack() as stack:
             self._runs = stack.enter_context(tempfile.TemporaryDirectory())
             self._coordinator = stack.enter_context(
-                _process("coordinator", "--run", "bench", "--runs-dir", self._runs, *self._arguments)
-            )
+                Child("coordinator", "--run", "bench", "--runs-dir", self._runs, *self._arguments)
+            ).popen
             self._stack = stack.pop_all()
         return self
 
@@ -105,7 +104,7 @@ class BenchRun:
 
     def workers(self, *arguments: object) -> AbstractContextManager[object]:
         """A real worker."""
-        return _process("worker", "--connect", self.endpoint, *arguments)
+        return Child("worker", "--connect", self.endpoint, *arguments)
 
     @contextmanager
     def crowd(self, count: int, slots: int) -> Iterator[None]:
@@ -133,21 +132,6 @@ class BenchRun:
         """The median makespan of a generation, without the first, in which workers join."""
         with open_run(Path(self._runs), "bench") as run:
             return statistics.median(each.seconds for each in run.history()[1:])
-
-
-@contextmanager
-def _process(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "dreamfleet", *map(str, arguments)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603 - our own
-    try:
-        yield process
-    finally:
-        process.terminate()
-        try:
-            process.wait(5)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
 
 
 def _resident_mb(pid: int) -> float:

@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from dreamfleet.common.presets import preset_help
 from dreamfleet.worker.training.train_config import TrainConfig
 
 T = TypeVar("T")
@@ -17,7 +18,7 @@ FIXED = ("actions",)  # what the task says
 def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> None:
     """The flags of a `train` verb whose model is configured by `layers`."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--preset", default="tiny", help="how much of everything, and which layers (default tiny)")
+    parser.add_argument("--preset", default="tiny", help=f"{preset_help('training')} (default tiny)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--continue-from", type=Path, metavar="FILE", help="begin from this checkpoint's weights")
     parser.add_argument("--summary", action="store_true", help="print layers and parameters, and train nothing")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.presets import check_preset
 from dreamfleet.worker.training.collect import CollectConfig
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.worldmodel import mdnrnn_config, vae_config
@@ -69,6 +69,4 @@ PRESETS = {preset.name: preset for preset in (TINY, NOTEBOOK, ARTICLE, ATTENTIVE
 
 def find_preset(name: str) -> Preset:
     """The preset of that name; `UsageError` lists those that exist."""
-    if name not in PRESETS:
-        raise UsageError(f"unknown preset {name!r}: choose one of {', '.join(sorted(PRESETS))}")
-    return PRESETS[name]
+    return PRESETS[check_preset("training", name)]

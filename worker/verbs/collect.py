@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs import default_runs_dir
+from dreamfleet.common.presets import preset_help
+from dreamfleet.common.site import offer
 
 SUMMARY = "drive at random, or take in what a run collected, as training data for a world model"
 EXTRAS = ("worker",)
@@ -17,13 +18,13 @@ EXTRAS = ("worker",)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--preset", default="tiny", help="how much of everything (default tiny)")
+    parser.add_argument("--preset", default="tiny", help=f"{preset_help('training')} (default tiny)")
     parser.add_argument("--episodes", type=int, help="episodes in all, instead of the preset's")
     parser.add_argument("--seed", type=int, help="makes the data set, instead of the preset's")
     parser.add_argument("--picture", type=int, help="64, or 96 for the whole observation, instead of the preset's")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
     parser.add_argument("--from-run", metavar="RUN", help="drive nothing: take in what this run collected, each once")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+    offer(parser, "runs_dir")
 
 
 def run(args: argparse.Namespace) -> int:

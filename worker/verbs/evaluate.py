@@ -6,11 +6,10 @@ import argparse
 import json
 import os
 import sys
-from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs import default_runs_dir
 from dreamfleet.common.seeds import TEST
+from dreamfleet.common.site import offer
 
 SUMMARY = "judge a controller on unseen tracks, in gymnasium's own unmodified environment"
 EXTRAS = ("worker",)
@@ -23,7 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first-seed", type=int, default=TEST.start, help=f"first track's seed (default {TEST.start})")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+    offer(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print mean, std, scores and seeds as JSON")
 
 

@@ -7,8 +7,8 @@ import os
 from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs import default_runs_dir
 from dreamfleet.common.seeds import VALIDATION
+from dreamfleet.common.site import offer
 
 SUMMARY = "look into a world model: what it sees, keeps and dreams, as pictures and one page"
 EXTRAS = ("worker", "views")
@@ -23,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     first = VALIDATION.start
     parser.add_argument("--seed", type=int, default=first, help=f"the track that is driven (default {first})")
     parser.add_argument("--steps", type=int, default=300, help="steps of the drive (default 300)")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+    offer(parser, "runs_dir")
 
 
 def run(args: argparse.Namespace) -> int:

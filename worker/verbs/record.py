@@ -7,8 +7,8 @@ import os
 from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs import default_runs_dir
 from dreamfleet.common.seeds import TEST
+from dreamfleet.common.site import offer
 
 SUMMARY = "record a drive as an mp4: the track, what the model sees, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")
@@ -22,7 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help="the video to write (default drive.mp4)")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--temperature", type=float, default=1.0, help="of the dream beside the drive (default 1.0)")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+    offer(parser, "runs_dir")
 
 
 def run(args: argparse.Namespace) -> int:

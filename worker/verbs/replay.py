@@ -6,10 +6,9 @@ import argparse
 import json
 import re
 import sys
-from pathlib import Path
 
 from dreamfleet.common.errors import JournalError, UsageError
-from dreamfleet.common.runs import default_runs_dir
+from dreamfleet.common.site import offer
 
 SUMMARY = "score a candidate of a run again and compare with the journal, to the bit"
 EXTRAS = ("worker",)
@@ -19,7 +18,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("run_name", metavar="RUN", help="name of the run")
     parser.add_argument("--candidate", required=True, metavar="G/I", help="generation and index, such as 3/0")
-    parser.add_argument("--runs-dir", type=Path, default=default_runs_dir(), help="where runs live (default runs)")
+    offer(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print the episodes as JSON")
 
 

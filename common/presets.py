@@ -1,0 +1,31 @@
+"""The names of both kinds of presets: settings of a run, and amounts and layers of training.
+
+Each side holds its own settings; the names stand here, so that either can say that a name is the other's.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from dreamfleet.common.errors import UsageError
+
+Kind = Literal["run", "training"]
+NAMES: dict[Kind, tuple[str, ...]] = {
+    "run": ("article", "dream", "frugal", "paper"),
+    "training": ("article", "attentive", "notebook", "paper", "tiny"),
+}
+VERBS: dict[Kind, str] = {"run": "coordinator and fork", "training": "collect and train"}
+
+
+def check_preset(kind: Kind, name: str) -> str:
+    """Return `name` if such a preset exists, else raise `UsageError`; it says if the name is one of the other kind."""
+    if name in NAMES[kind]:
+        return name
+    others = [other for other in NAMES if name in NAMES[other]]
+    hint = f"; {name!r} is a preset of {others[0]}, for {VERBS[others[0]]}" if others else ""
+    raise UsageError(f"unknown {kind} preset {name!r}: choose one of {', '.join(NAMES[kind])}{hint}")
+
+
+def preset_help(kind: Kind) -> str:
+    """What `--help` says of the presets of one kind."""
+    return f"{kind} preset to begin with: {', '.join(NAMES[kind])}"

@@ -1,0 +1,62 @@
+"""How a run was last served, kept with it: a run that is continued has the same limits and the same network.
+
+Both are facts of the journal, as JSON of what differs from the defaults. What a flag, the file or the environment says
+when a run is continued is stronger, and is kept from then on.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from typing import Any
+
+from dreamfleet.common.config import Table, read_table
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.runs import RunFolder
+from dreamfleet.common.session import DEFAULT_ENDPOINT
+from dreamfleet.common.site import SiteConfig
+from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig
+
+LIMITS, NETWORK = "limits", "network"  # the facts' names
+
+
+def facts_of(limits: LimitsConfig, network: NetworkConfig) -> dict[str, str]:
+    """The facts to keep, by name."""
+    return {name: json.dumps(_changed(each), allow_nan=False) for name, each in ((LIMITS, limits), (NETWORK, network))}
+
+
+def kept_limits(stored: RunFolder) -> Table:
+    """The limits that a run was last served with; empty if it kept none."""
+    return _read(stored, LIMITS, LimitsConfig)
+
+
+def kept_network(stored: RunFolder) -> Table:
+    """Where a run was last reached, and how it treated its workers; empty if it kept nothing."""
+    return _read(stored, NETWORK, NetworkConfig)
+
+
+def choose_addresses(own: NetworkConfig, site: SiteConfig, kept: Table) -> NetworkConfig:
+    """Where a coordinator is reached: as told, else as kept, else on this host alone.
+
+    `connect` of the site says where everybody finds the router. A coordinator that listens is that router, and
+    connects to another one only if its own flag or table says so.
+    """
+    listen = own.listen or site.listen
+    connect = own.connect or (() if listen else site.connect)
+    if not listen and not connect:
+        listen, connect = kept.get("listen", ()), kept.get("connect", ())
+    return replace(own, listen=listen or (() if connect else (DEFAULT_ENDPOINT,)), connect=connect)
+
+
+def _read(stored: RunFolder, name: str, section: type[Any]) -> dict[str, Any]:
+    try:
+        return read_table(section, f"the {name} kept with run {stored.name}", json.loads(stored.fact(name) or "{}"))
+    except (ValueError, AttributeError) as error:
+        raise JournalError(f"the {name} kept with run {stored.name} are damaged: {error}") from error
+    except UsageError as error:
+        raise JournalError(f"{error}: install a newer dreamfleet") from error
+
+
+def _changed(config: Any) -> dict[str, Any]:
+    values = {each.name: (getattr(config, each.name), each.default) for each in fields(config)}
+    return {name: value for name, (value, default) in values.items() if value != default}
