@@ -62,10 +62,11 @@ def dump(strategy: Any) -> dict[str, NDArray[Any]]:
 def restore(strategy: Any, arrays: dict[str, NDArray[Any]]) -> None:
     """Put the leaves back into a strategy built with the same options; `KeyError` if it is of another shape."""
     about = json.loads(str(arrays["about"]))
+    written: dict[int, bytes] = {}
     for path in [*(name for name in arrays if name != "about"), *about]:
         if path in about or path.rpartition(".")[0] not in about:
             owner, name = _owner(strategy, path)
-            _assign(owner, name, _value(path, about, arrays))
+            _assign(owner, name, _value(path, about, arrays), written)
 
 
 def mean_and_sigma(arrays: dict[str, NDArray[Any]]) -> tuple[NDArray[np.float64], float]:
@@ -146,10 +147,19 @@ def _owner(strategy: Any, path: str) -> tuple[Any, str]:
     return owner, name
 
 
-def _assign(owner: Any, name: str, value: Any) -> None:
+def _assign(owner: Any, name: str, value: Any, written: dict[int, bytes]) -> None:
+    """Set a leaf; `written` holds what this restoring wrote into which array.
+
+    pycma shares some arrays between its objects, such as `C` with `sm.C`, so a value goes into the array that is there.
+    Other arrays are only the same for the moment: the object that watches for stagnation keeps the mean itself until it
+    stands still. Two values for one array mean that it is no longer shared: the second owner gets its own.
+    """
     old = vars(owner).get(name, _MISSING)
-    if isinstance(old, np.ndarray) and isinstance(value, np.ndarray) and old.shape == value.shape:
-        if old.flags.writeable:  # else it is a view, such as dC of C, and follows what it looks at
-            old[...] = value  # in place, because pycma shares some arrays between objects
+    if not (isinstance(old, np.ndarray) and isinstance(value, np.ndarray) and old.shape == value.shape):
+        vars(owner)[name] = value
+    elif not old.flags.writeable:
+        return  # a view, such as dC of C, which follows what it looks at
+    elif written.setdefault(id(old), value.tobytes()) == value.tobytes():
+        old[...] = value
     else:
         vars(owner)[name] = value

@@ -16,9 +16,13 @@ def noisy_sphere(candidates, generation):
     return -((candidates - 1.0) ** 2).sum(axis=1) + 0.1 * noise
 
 
-def run(evolution, generations):
+def sphere(candidates, _generation):
+    return -((candidates - 1.0) ** 2).sum(axis=1)
+
+
+def run(evolution, generations, fitness=noisy_sphere):
     for generation in generations:
-        evolution.tell(noisy_sphere(evolution.ask(), generation))
+        evolution.tell(fitness(evolution.ask(), generation))
 
 
 @pytest.mark.parametrize("covariance", ["diagonal", "full"])
@@ -59,6 +63,23 @@ def test_a_checkpoint_continues_at_the_real_size(checkpoint):
     second.restore(first.state().packed())
     run(second, range(checkpoint, 10))
     assert np.array_equal(second.mean, uninterrupted.mean)
+
+
+@pytest.mark.parametrize("covariance", ["diagonal", "full"])
+@pytest.mark.parametrize(("dimension", "population"), [(2, 4), (2, 16), (5, 8), (12, 16), (23, 5), (50, 24)])
+def test_a_strategy_continues_from_every_generation_up_to_convergence_and_beyond(dimension, population, covariance):
+    """pycma's parts share some arrays; which ones changes as a strategy stands still."""
+    setting = config(dimension=dimension, population=population, covariance=covariance, sigma0=1e-8)
+    uninterrupted, steps = Evolution(setting, start=np.full(dimension, 1.0)), []
+    for generation in range(150):
+        state = uninterrupted.state().packed()
+        run(uninterrupted, [generation], sphere)
+        continued = Evolution(setting)
+        continued.restore(state)
+        run(continued, [generation], sphere)
+        assert continued.state().packed() == uninterrupted.state().packed(), generation
+        steps.append(uninterrupted.sigma)
+    assert min(steps) < 1e-9, "below what pycma takes for movement"
 
 
 def test_the_state_is_arrays_and_reading_it_needs_no_pickle():
