@@ -12,7 +12,8 @@ PROTOCOL_VERSION = 1
 ROOT = "dreamfleet"
 _PREFIX = f"{ROOT}/v{PROTOCOL_VERSION}"
 _RUN = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
-_WORKER = re.compile(r"[a-z0-9][a-z0-9.-]{0,62}/[0-9a-f]{8}")
+_WORKER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
+_LIFE = re.compile(r"[0-9a-f]{8}")
 
 
 def check_run_name(name: str) -> str:
@@ -24,15 +25,31 @@ def check_run_name(name: str) -> str:
     return name
 
 
+def check_worker_name(name: str) -> str:
+    """Return `name` if it may name a worker, else raise `UsageError`."""
+    if not _WORKER_NAME.fullmatch(name):
+        raise UsageError(
+            f"{name!r} cannot name a worker: use 1 to 63 of A-Z, a-z, 0-9, '.', '_' and '-', and begin with a letter "
+            "or a digit"
+        )
+    return name
+
+
 def is_worker(identity: str) -> bool:
     """Whether `identity` has the form `<name>/<life>`."""
-    return bool(_WORKER.fullmatch(identity))
+    name, _, life = identity.partition("/")
+    return bool(_WORKER_NAME.fullmatch(name) and _LIFE.fullmatch(life))
 
 
 def new_worker(name: str | None = None) -> str:
-    """Identity of a worker process: a name (the host's by default) and 8 random hex digits of this life."""
-    raw = (name or socket.gethostname()).lower()
-    clean = re.sub(r"[^a-z0-9.-]+", "-", raw).strip("-.")[:63] or "worker"
+    """Identity of a worker process: a name and 8 random hex digits of this life.
+
+    Without a name it is the host's, in lower case and without what no key may hold; `UsageError` for a name that cannot
+    be kept as it is.
+    """
+    if name is not None:
+        return f"{check_worker_name(name)}/{secrets.token_hex(4)}"
+    clean = re.sub(r"[^a-z0-9.-]+", "-", socket.gethostname().lower()).strip("-.")[:63] or "worker"
     return f"{clean}/{secrets.token_hex(4)}"
 
 

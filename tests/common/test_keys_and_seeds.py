@@ -1,6 +1,8 @@
 import re
+import socket
 
 import pytest
+import zenoh
 
 from dreamfleet.common import keys, seeds
 from dreamfleet.common.errors import UsageError
@@ -17,11 +19,26 @@ def test_bad_run_names_are_refused(name):
         keys.check_run_name(name)
 
 
-@pytest.mark.parametrize("name", [None, "Big Host!", "***", "", "ok", "x" * 200, "häuschen"])
-def test_a_worker_has_a_name_and_a_life(name):
+@pytest.mark.parametrize("name", ["ok", "hostB", "Rack_3.slot-1", "0", "x" * 63])
+def test_a_worker_keeps_the_name_that_it_was_given(name):
     identity = keys.new_worker(name)
     assert keys.is_worker(identity)
-    assert re.fullmatch(r"[a-z0-9][a-z0-9.-]{0,62}/[0-9a-f]{8}", identity)
+    assert identity.split("/")[0] == name
+    assert zenoh.KeyExpr(keys.job("run", identity)).intersects(zenoh.KeyExpr(keys.any_worker("job", "run")))
+
+
+@pytest.mark.parametrize("name", ["", "Big Host!", "***", "-a", ".a", "a/b", "@a", "x" * 64, "häuschen", "a\n"])
+def test_a_worker_name_that_cannot_be_kept_is_refused(name):
+    assert not keys.is_worker(f"{name}/0a0b0c0d")
+    with pytest.raises(UsageError, match="cannot name a worker"):
+        keys.new_worker(name)
+
+
+@pytest.mark.parametrize("host", ["Big Host!", "***", "", "ok", "x" * 200, "häuschen"])
+def test_any_host_gives_its_worker_a_name(monkeypatch, host):
+    monkeypatch.setattr(socket, "gethostname", lambda: host)
+    assert re.fullmatch(r"[a-z0-9][a-z0-9.-]{0,62}/[0-9a-f]{8}", keys.new_worker())
+    assert keys.is_worker(keys.new_worker())
 
 
 def test_two_lives_differ():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -54,13 +55,13 @@ def _say(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: 
     return replies[0]
 
 
-def neediest(session: zenoh.Session) -> str | None:
-    """The live run that works with the fewest slots; of equals the first by name."""
+def neediest(session: zenoh.Session, without: Collection[str] = ()) -> str | None:
+    """The live run that works with the fewest slots; of equals the first by name. Those in `without` are left out."""
     found = []
     for payload in ask_all(session, [keys.status("*")], HELLO_TIMEOUT):
         with suppress(ValueError, KeyError, TypeError):  # what answers need not be of this version
             document = json.loads(payload)
-            if document["state"] not in ("ended", "paused"):
+            if document["state"] not in ("ended", "paused") and document["run"] not in without:
                 found.append((int(document["slots"]), str(document["run"])))
     return min(found)[1] if found else None
 

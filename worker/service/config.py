@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from dreamfleet.common.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.keys import check_run_name
+from dreamfleet.common.keys import check_run_name, check_worker_name
 from dreamfleet.common.messages import MAX_LEASES
 
 
@@ -28,6 +28,8 @@ class WorkerConfig:
     def __post_init__(self) -> None:
         if self.run is not None:
             check_run_name(self.run)
+        if self.name is not None:
+            check_worker_name(self.name)
         if self.any and self.run is not None:
             raise UsageError("--any and --run exclude each other")
         if not 0 <= self.slots <= MAX_LEASES:

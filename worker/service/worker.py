@@ -15,15 +15,16 @@ import zenoh
 from dreamfleet.common import keys
 from dreamfleet.common.bundle import Bundle, BundleStore, default_cache
 from dreamfleet.common.codec import Inbox
-from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.errors import ConnectionFailedError, RefusedError
 from dreamfleet.common.session import Network, open_session
 from dreamfleet.worker.service.admission import Admission, ask, make_request, neediest
 from dreamfleet.worker.service.bundle_fetch import obtain
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.joined import JoinedRun, Line
 from dreamfleet.worker.service.membership import Membership, Terms
+from dreamfleet.worker.service.refusals import Refusals
 from dreamfleet.worker.service.slots import Slots
-from dreamfleet.worker.tasks.registry import known_tasks
+from dreamfleet.worker.tasks.registry import find_task, known_tasks
 
 log = logging.getLogger(__name__)
 RETRY = 1.0  # seconds between attempts to connect or join
@@ -33,6 +34,10 @@ class Worker:
     """One worker process."""
 
     def __init__(self, config: WorkerConfig, network: Network, tasks: tuple[str, ...] = ()) -> None:
+        for name in tasks:
+            find_task(
+                name
+            )  # one that cannot be loaded is an error now, and not once a run has taken this worker's word
         self.identity = keys.new_worker(config.name)
         self.inbox = Inbox()
         self._config = config
@@ -41,6 +46,7 @@ class Worker:
         self._hello = make_request(self.identity, (*known_tasks(), *tasks), self._slot_count)
         terms = Terms(config.lifetime, config.drain_timeout, leaves_alone=config.exit_when_done or config.any)
         self._membership = Membership(terms, monotonic())
+        self._refusals = Refusals()
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
 
     def stop(self) -> None:
@@ -90,14 +96,16 @@ class Worker:
             memory, path = self._config.slot_memory << 20, bundle.path if bundle else None
             slots = Slots(self._slot_count, admission.spec, path, self._events, memory)
             stack.callback(slots.stop)
-            JoinedRun(line, admission, self._membership, slots, self._events).serve()
+            try:
+                JoinedRun(line, admission, self._membership, slots, self._events).serve()
+            except RefusedError as error:
+                self._take_refusal(admission.run, error)
 
     def _join(self, session: zenoh.Session) -> Admission | None:
         """A run that has welcomed this worker; `None` if it shall leave meanwhile."""
         said = False
         while not self._leaving():
-            run = neediest(session) if self._config.any else self._config.run
-            admission = self._ask(session, run) if run or not self._config.any else None
+            admission = self._ask_neediest(session) if self._config.any else self._ask(session, self._config.run)
             if admission is not None:
                 return admission
             if not said:
@@ -105,6 +113,20 @@ class Worker:
             said = True
             self._pause()
         return None
+
+    def _ask_neediest(self, session: zenoh.Session) -> Admission | None:
+        run = neediest(session, self._refusals.standing(monotonic()))
+        try:
+            return None if run is None else self._ask(session, run)
+        except RefusedError as error:
+            self._take_refusal(str(run), error)
+            return None
+
+    def _take_refusal(self, run: str, error: RefusedError) -> None:
+        """A refusal ends a worker of one run; a worker of any run turns to the others, and asks again later."""
+        if not self._config.any:
+            raise error
+        log.warning("%s; asking it again in %.0f s", error, self._refusals.add(run, monotonic()))
 
     def _ask(self, session: zenoh.Session, run: str | None) -> Admission | None:
         return ask(session, run, self._hello, self.inbox)

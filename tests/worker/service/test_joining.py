@@ -4,6 +4,9 @@ import pytest
 
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.messages import Intervals
+from dreamfleet.common.session import Network
+from dreamfleet.worker.service.config import WorkerConfig
+from dreamfleet.worker.service.worker import Worker
 from tests.support import tasks
 from tests.support.hand import DEADLINE, Hand
 from tests.support.processes import free_port
@@ -56,3 +59,29 @@ def test_a_refusal_ends_it_with_the_reason_and_the_remedy(stage):
     error = served.exception(DEADLINE)
     assert isinstance(error, RefusedError)
     assert "your moon is full; wait a week" in str(error)
+
+
+def test_of_any_run_one_that_refuses_is_left_to_others(stage, said, cached):
+    picky = stage.hand(run="picky")
+    picky.refusal = ("your moon is full", "wait a week")
+    other = stage.also(picky, run="second")
+    other.slots = 1
+    stage.worker(run=None, any=True)
+    assert "your moon is full; wait a week; asking it again in 15 s" in wait_for(said, "refused")
+    other.ready()
+
+
+def test_a_name_is_what_the_run_knows_it_by(stage, cached):
+    hand = stage.hand()
+    stage.worker(name="hostB")
+    assert hand.hello().worker.startswith("hostB/")
+
+
+def test_a_name_that_cannot_be_kept_is_refused():
+    with pytest.raises(UsageError, match="'big host' cannot name a worker"):
+        WorkerConfig(name="big host")
+
+
+def test_a_task_that_it_is_told_of_and_cannot_load_is_an_error_at_once():
+    with pytest.raises(UsageError, match=r"'tests\.support\.tasks:Moon' cannot be loaded"):
+        Worker(WorkerConfig(), Network(), ("tests.support.tasks:Moon",))
