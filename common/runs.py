@@ -20,8 +20,9 @@ from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.fields import OPTIONAL, written
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.keys import check_run_name
-from dreamfleet.common.messages import Between, Count, TaskSpec
+from dreamfleet.common.messages import Between, Count, Packages, TaskSpec
 
 JOURNAL = "journal.sqlite"
 BUNDLE = "bundle.zip"
@@ -50,6 +51,7 @@ class RunSettings:
     collect_episodes: Annotated[int, Between(1, 10**4)] = field(default=1, metadata=OPTIONAL)
     # What a dream's temperature is multiplied by when evaluations fall; 1: never.
     heat: float = field(default=1.0, metadata=OPTIONAL)
+    packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions its fingerprint names
 
     def to_json(self) -> str:
         """The text kept in the journal."""

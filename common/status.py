@@ -7,11 +7,11 @@ under the message limit; the parts `workers`, `history` and `candidates` give th
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from dreamfleet.common.codec import MalformedError, from_plain
-from dreamfleet.common.fields import known
+from dreamfleet.common.fields import OPTIONAL, known
 from dreamfleet.common.messages import MAX_MESSAGE, Count, Length, Seconds, Text, Word
 from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
 
@@ -163,6 +163,7 @@ class Status:
     failing: Count  # wanted jobs that failed somewhere
     failures: tuple[FailureStatus, ...]  # the first of them
     dropped: dict[str, int]  # messages, by reason
+    refused: dict[str, str] = field(default_factory=dict, metadata=OPTIONAL)  # workers that could not join, and why
 
     @property
     def over(self) -> bool:

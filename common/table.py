@@ -121,7 +121,9 @@ def _sparkline(history: Sequence[StoredGeneration]) -> Text:
 
 def _worker_table(status: Status) -> RenderableType:
     if not status.worker_list:
-        return Text("no workers yet: start one with  dreamfleet worker --connect tcp/HOST:PORT", style="yellow")
+        lines = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
+        lines = lines or ["no workers yet: start one with  dreamfleet worker --connect tcp/HOST:PORT"]
+        return Text("\n".join(lines), style="yellow")
     return WorkerTable(status.worker_list[:MOST_WORKERS], status.workers.known)
 
 

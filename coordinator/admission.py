@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import HelloRequest
 
 
-def refusal(request: HelloRequest, task: str, fingerprint: str | None) -> tuple[str, str] | None:
+def refusal(
+    request: HelloRequest, task: str, fingerprint: str | None, packages: tuple[str, ...] = NUMERIC_PACKAGES
+) -> tuple[str, str] | None:
     """Why a worker cannot join a run of `task` and what to do about it; `None` if it may.
 
-    `fingerprint` is the one that the run admits; `None` admits any.
+    `fingerprint` is the one that the run admits, `None` admits any; it names the versions of `packages`.
     """
-    if task not in request.tasks:
+    if not {task, task.partition(":")[0]} & set(request.tasks):  # itself, or the family that it is of
         known = ", ".join(request.tasks) or "none"
         return f"this run scores in {task!r}, which the worker does not know (it knows: {known})", (
             "install the package that registers this task on the worker's host"
+        )
+    if request.packages != packages:
+        return f"its fingerprint names {', '.join(request.packages)}, this run's {', '.join(packages)}", (
+            "say hello again about those"
         )
     if fingerprint in (None, request.fingerprint):
         return None

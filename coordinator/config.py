@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -9,10 +10,15 @@ from typing import Any, Literal
 
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.config import option
+from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import COLDEST, HOTTEST, TaskSpec
 from dreamfleet.common.presets import check_preset, preset_help
 from dreamfleet.common.runs import RunSettings
+from dreamfleet.common.tasks import GYM, describe_task
+
+DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
 
 
 @dataclass(frozen=True)
@@ -21,7 +27,12 @@ class RunConfig:
 
     preset: str | None = option(None, preset_help("run"))
     task: str = option("car-racing", "what candidates are scored in; a worker must know it")
-    bundle: str = option("tiny", "the frozen world model: a shipped name or a file")
+    bundle: str | None = option(
+        None, "the frozen world model: a shipped name, a file, or none (default tiny; none for gym:ENVIRONMENT)"
+    )
+    environment: tuple[str, ...] = option((), "KEY=VALUE of what a gym:ENVIRONMENT is made with; values as in JSON")
+    normalise: bool = option(False, "shift and scale what a gym:ENVIRONMENT shows, as it is when the run begins")
+    task_options: str | None = option(None, "the task's own options as `runs show` prints them, instead of these two")
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
     hidden_units: int = option(8, "units of a hidden controller's layer")
     features: Literal["zh", "z"] = option("zh", "what the controller sees: latent and hidden state, or latent alone")
@@ -61,12 +72,17 @@ class RunConfig:
         if self.heat > 1 and (self.temperature is None or not self.evaluate_every):
             raise UsageError("--heat raises --temperature when evaluations fall: give it and --evaluate-every too")
 
-    def settings(self, bundle: Bundle) -> RunSettings:
-        """What the journal keeps: the bundle by its hash."""
-        shape = bundle.shape_of(self.features, self.hidden_units if self.controller == "hidden" else 0)
-        named = None if shape == bundle.default_shape else bundle.under(shape).controller_shape
+    @property
+    def needs_no_bundle(self) -> bool:
+        """Whether candidates are scored without a world model."""
+        return self.bundle == NO_BUNDLE or (self.bundle is None and self.task.startswith(f"{GYM}:"))
+
+    def settings(self, bundle: Bundle | None) -> RunSettings:
+        """What the journal keeps: the bundle by its hash, or what a task that needs none says of itself."""
+        spec, shape, packages = self._described() if bundle is None else self._on(bundle)
         return RunSettings(
-            task=TaskSpec(self.task, bundle.sha256, self.horizon, self.patience, named, self.temperature),
+            task=spec,
+            packages=packages,
             controller=shape,
             population=self.population,
             episodes=self.episodes,
@@ -82,6 +98,48 @@ class RunConfig:
             heat=self.heat,
         )
 
+    @property
+    def _hidden(self) -> int:
+        return self.hidden_units if self.controller == "hidden" else 0
+
+    def _on(self, bundle: Bundle) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
+        if self.environment or self.normalise or self.task_options:
+            raise UsageError("--environment, --normalise and --task-options are of tasks without a world model")
+        shape = bundle.shape_of(self.features, self._hidden)
+        named = None if shape == bundle.default_shape else bundle.under(shape).controller_shape
+        spec = TaskSpec(self.task, bundle.sha256, self.horizon, self.patience, named, self.temperature)
+        return spec, shape, NUMERIC_PACKAGES
+
+    def _described(self) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
+        if self.temperature is not None or self.collect_every:
+            raise UsageError("--temperature and --collect-every are of tasks with a world model")
+        told = describe_task(self.task, self._options())
+        options = told.options if self.task_options is None else self.task_options
+        shape = ControllerShape(told.observations, told.outputs, self._hidden)
+        spec = TaskSpec(self.task, "", self.horizon, self.patience, shape, options=options, version=told.version)
+        return spec, shape, told.packages
+
+    def _options(self) -> dict[str, Any]:
+        """What the task is asked to describe itself under."""
+        if self.task_options is not None:
+            try:
+                frozen = json.loads(self.task_options or "{}")
+                return {"environment": dict(frozen.get("environment", {}))}
+            except (ValueError, AttributeError, TypeError) as error:
+                raise UsageError(f"--task-options must be a JSON object, not {self.task_options!r}") from error
+        options: dict[str, Any] = {"environment": dict(map(_argument, self.environment))} if self.environment else {}
+        return options | ({"normalise": True, "seed": self.seed} if self.normalise else {})
+
+
+def _argument(text: str) -> tuple[str, Any]:
+    name, equals, value = text.partition("=")
+    if not (equals and name.isidentifier()):
+        raise UsageError(f"--environment {text!r}: write KEY=VALUE, such as continuous=true")
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        return name, value
+
 
 def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:
     """The settings of a run as they would be configured; `bundle` is where its copy of the world model lies."""
@@ -89,6 +147,8 @@ def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:
     spec, hidden = run.task, run.controller.hidden
     frozen |= {"controller": "hidden", "hidden_units": hidden} if hidden else {"controller": "linear"}
     frozen |= {name: getattr(spec, name) for name in ("task", "horizon", "patience", "temperature")}
+    if not spec.bundle:
+        return {**frozen, "bundle": NO_BUNDLE, "task_options": spec.options}
     return {**frozen, "bundle": str(bundle)}
 
 

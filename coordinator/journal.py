@@ -55,15 +55,16 @@ class Journal:
                 raise
 
     @classmethod
-    def create(cls, folder: Path, settings: RunSettings, bundle: Path) -> Journal:
-        """A new run in `folder`, which holds its own copy of the bundle; whole or not at all."""
+    def create(cls, folder: Path, settings: RunSettings, bundle: Path | None) -> Journal:
+        """A new run in `folder`, which holds its own copy of the bundle, if any; whole or not at all."""
         path = folder / JOURNAL
         if path.exists():
             raise JournalError(f"run {folder.name} exists: choose another --run, or continue it with --resume")
         aside = path.with_suffix(".new")
         aside.unlink(missing_ok=True)
         try:
-            shutil.copyfile(bundle, folder / BUNDLE)
+            if bundle is not None:
+                shutil.copyfile(bundle, folder / BUNDLE)
             with _translated(path):
                 connection = sqlite3.connect(aside)
                 schema.migrate(connection, 0)

@@ -13,7 +13,7 @@ from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import Intervals
 from dreamfleet.common.runs import BUNDLE, RunSettings, open_run, run_lock
 from dreamfleet.common.session import Network
-from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.fleet import Fleet
 from dreamfleet.coordinator.journal import Journal
 from dreamfleet.coordinator.kept import facts_of
@@ -48,7 +48,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         if request.config is None:
             journal = Journal(folder / "journal.sqlite")
         else:
-            journal = Journal.create(folder, settings, bundle.path)
+            journal = Journal.create(folder, settings, bundle.path if bundle else None)
         service = _service(request, folder)
         on_stoppable(service.stop)
         try:
@@ -72,17 +72,25 @@ def _keep(journal: Journal, request: RunRequest) -> None:
     journal.commit()
 
 
-def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle]:
-    """What the run is, and its verified bundle."""
+def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle | None]:
+    """What the run is, and its verified bundle if it has one."""
     if request.config is not None:
-        bundle = find_bundle(request.config.bundle)
-        settings = request.config.settings(bundle)
-        if request.start is not None:
-            request.start.check(bundle, settings.controller)
-        return settings, bundle
+        return _settle_new(request.config, request.start)
     with open_run(request.runs_dir, request.name) as stored:
         settings = stored.settings
+    if not settings.task.bundle:
+        return settings, None
     bundle = Bundle.open(folder / BUNDLE)
     if bundle.sha256 != settings.task.bundle:
         raise JournalError(f"{bundle.path} is not the bundle that this run was started with; restore the folder")
+    return settings, bundle
+
+
+def _settle_new(config: RunConfig, start: Start | None) -> tuple[RunSettings, Bundle | None]:
+    if start is not None and config.needs_no_bundle:
+        config = start.under(config)
+    bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
+    settings = config.settings(bundle)
+    if start is not None:
+        start.check(settings)
     return settings, bundle

@@ -35,8 +35,9 @@ class Reported:
             "steps": self.steps,
         }
         parameters = np.frombuffer(self.vector, dtype="<f4").astype(np.float32)
+        spec = self.settings.task
         return Controller(
-            self.settings.controller, parameters, self.settings.task.task, self.settings.task.bundle, provenance
+            self.settings.controller, parameters, spec.task, spec.bundle, provenance, spec.options, spec.version
         )
 
 

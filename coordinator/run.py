@@ -29,6 +29,8 @@ from dreamfleet.coordinator.slack import Slack
 from dreamfleet.coordinator.start import Start
 from dreamfleet.coordinator.uploads import Uploads
 
+MOST_REFUSED = 8
+
 
 class Run:
     """One incarnation of a run, new or continued."""
@@ -47,6 +49,7 @@ class Run:
         self.fleet = fleet
         self.ended: str | None = None
         self.paused: str | None = None
+        self.refused: dict[str, str] = {}  # workers that could not join, the latest last, and why
         self.uid = journal.fact("uid") or ""
         self.fingerprint = journal.fact("fingerprint")
         self.incarnation = journal.begin_incarnation()
@@ -131,10 +134,23 @@ class Run:
 
     def refusal(self, request: HelloRequest, mixed: bool) -> tuple[str, str] | None:
         """Why a worker cannot join and what to do about it; `None` if it may."""
-        return refusal(request, self.settings.task.task, None if mixed else self.fingerprint)
+        found = refusal(request, self.settings.task.task, None if mixed else self.fingerprint, self.settings.packages)
+        if found is not None and request.packages == self.settings.packages:
+            self._remember_refusal(request.worker, found[0])
+        return found
+
+    def _remember_refusal(self, worker: str, why: str) -> None:
+        name = worker.partition("/")[0]  # a worker that is started again and again has one name and many lives
+        if self.refused.get(name) != why:
+            self.fleet.notes.append(f"refused worker {worker}: {why}")
+        self.refused.pop(name, None)
+        self.refused[name] = why
+        while len(self.refused) > MOST_REFUSED:
+            del self.refused[next(iter(self.refused))]
 
     def admit(self, request: HelloRequest, now: float) -> None:
         """Welcome a worker; the first one's fingerprint becomes the run's."""
+        self.refused.pop(request.worker.partition("/")[0], None)
         if self.fingerprint is None:
             self.fingerprint = request.fingerprint
             self._journal.set_fact("fingerprint", request.fingerprint)

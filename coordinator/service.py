@@ -134,7 +134,7 @@ class Service:
             answer(keys.hello(name), enqueue_into(events, "hello")),
             answer(keys.control(name, "*"), enqueue_into(events, "control")),
             *(answer(keys.status(name, part), _callback(self._answer_status(part))) for part in PARTS),
-            answer(keys.bundle(name, self._run.settings.task.bundle), _callback(self._answer_bundle)),
+            *(answer(keys.bundle(name, sha256), _callback(self._answer_bundle)) for sha256 in self._bundles),
         ]
 
     def _enqueue(self, kind: str) -> Any:
@@ -246,6 +246,7 @@ class Service:
             remedy=remedy,
             spec={} if why else written(self._run.settings.task),
             intervals={} if why else asdict(self._intervals),
+            packages=self._run.settings.packages,
         )
 
     def _control(self, query: zenoh.Query) -> None:
@@ -320,6 +321,12 @@ class Service:
                 query.reply(keys.status(self._name, part), payload, encoding="application/json")
 
         return answer
+
+    @property
+    def _bundles(self) -> tuple[str, ...]:
+        """The world models that are served: one, or none where the task needs none."""
+        sha256 = self._run.settings.task.bundle
+        return (sha256,) if sha256 else ()
 
     def _answer_bundle(self, query: zenoh.Query) -> None:
         """In the queryable's own thread: reads a file that nobody writes."""

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError, DreamfleetError
-from dreamfleet.common.runs import RunFolder, open_run
+from dreamfleet.common.runs import RunFolder, RunSettings, open_run
 from dreamfleet.common.shelf import find_controller
 from dreamfleet.coordinator import cma_state
+from dreamfleet.coordinator.config import RunConfig
 
 
 @dataclass(frozen=True)
@@ -21,21 +20,36 @@ class Start:
     """The first mean `(size,)`, and the world model it was evolved on; in the dream or in reality is all one."""
 
     mean: NDArray[np.float64]
-    bundle: str  # SHA-256
+    bundle: str  # SHA-256; empty: none
     source: str
+    options: str = ""  # of the task, as its specification has them
 
-    def check(self, bundle: Bundle, shape: ControllerShape) -> None:
-        """Refuse parameters that mean nothing to this world model and controller."""
-        if self.bundle != bundle.sha256:
+    def under(self, config: RunConfig) -> RunConfig:
+        """The configuration with the options that this start was evolved under, where it names none."""
+        given = config.task_options is not None or config.environment or config.normalise
+        return config if given else replace(config, task_options=self.options)
+
+    def check(self, settings: RunSettings) -> None:
+        """Refuse parameters that mean nothing to this world model, these options and this controller."""
+        spec, shape = settings.task, settings.controller
+        if self.bundle != spec.bundle:
             raise ControllerError(
-                f"{self.source} belongs to the world model {self.bundle[:12]}, not to {bundle.path.name} "
-                f"({bundle.sha256[:12]}): give its own with --bundle"
+                f"{self.source} belongs to {_told(self.bundle)}, not to {_told(spec.bundle)}: give its own --bundle"
+            )
+        if self.options != spec.options:
+            raise ControllerError(
+                f"{self.source} was evolved under other options of {spec.task}: leave --environment and --normalise "
+                "out, and it brings its own"
             )
         if len(self.mean) != shape.size:
             raise ControllerError(
                 f"{self.source} has {len(self.mean)} parameters, this run's controllers {shape.size}: give its own "
                 "--controller, --hidden-units and --features"
             )
+
+
+def _told(bundle: str) -> str:
+    return f"the world model {bundle[:12]}" if bundle else "no world model"
 
 
 def find_start(name: str, runs_dir: Path) -> Start:
@@ -45,13 +59,14 @@ def find_start(name: str, runs_dir: Path) -> Start:
             if not stored.controller_path.is_file():
                 return start_of(stored)
     controller, _ = find_controller(name, runs_dir)
-    return Start(controller.parameters.astype(np.float64), controller.bundle, f"controller {name}")
+    mean = controller.parameters.astype(np.float64)
+    return Start(mean, controller.bundle, f"controller {name}", controller.options)
 
 
 def start_of(stored: RunFolder) -> Start:
     """The mean of a run's latest generation."""
     mean, _ = latest(stored)
-    return Start(mean, stored.spec.bundle, f"run {stored.name}")
+    return Start(mean, stored.spec.bundle, f"run {stored.name}", stored.spec.options)
 
 
 def latest(stored: RunFolder) -> tuple[NDArray[np.float64], float]:

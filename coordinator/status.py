@@ -84,6 +84,7 @@ def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float
         failing=len(failures),
         failures=tuple(_failure(each) for each in failures[:MOST_FAILURES]),
         dropped=dict(dropped),
+        refused={name: shorten(why, LONGEST) for name, why in list(run.refused.items())[-MOST_NAMED:]},
     )
     return Snapshot(status, workers, run.history.view(), standing, run.last, run.slack.report.current)
 

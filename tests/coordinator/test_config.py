@@ -53,9 +53,9 @@ def test_jobs_of_other_controllers_have_other_digests(random_bundle):
 
 def test_a_start_of_another_length_is_refused(random_bundle):
     start = Start(np.zeros(867), random_bundle.sha256, "run night")
-    start.check(random_bundle, random_bundle.shape_of("zh"))
+    start.check(RunConfig().settings(random_bundle))
     with pytest.raises(ControllerError, match="867 parameters, this run's controllers 99"):
-        start.check(random_bundle, random_bundle.shape_of("z"))
+        start.check(RunConfig(features="z").settings(random_bundle))
 
 
 @pytest.mark.parametrize("temperature", [0.0, -1.0, 5000.0, float("nan"), float("inf")])

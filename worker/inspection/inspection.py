@@ -24,9 +24,9 @@ DRIVEN = ("episodes", "frames", "held_out_episodes")  # of a bundle's provenance
 
 @dataclass(frozen=True)
 class Subject:
-    """What is looked at: a bundle; of a run, its controller once it has ended."""
+    """What is looked at: a bundle; of a run, its controller too. A run without a world model shows how it went."""
 
-    bundle: Bundle
+    bundle: Bundle | None
     controller: Controller | None = None
     run: RunFolder | None = None
 
@@ -43,6 +43,9 @@ def find_subject(name: str, runs_dir: Path) -> Iterator[Subject]:
         shipped = ", ".join(shipped_bundles()) or "none"
         raise BundleError(f"no bundle {name!r} (a file, or one that ships: {shipped}), and {error}") from error
     with run:
+        if not run.spec.bundle:
+            yield Subject(None, run=run)
+            return
         bundle = Bundle.open(run.bundle_path)
         if not run.controller_path.exists():
             yield Subject(bundle, run=run)
@@ -64,18 +67,35 @@ def inspect(
             on_section(len(sections), section.name)
             if section.picture is not None:
                 (out / f"{section.name}.png").write_bytes(section.picture)
-        title = f"{subject.bundle.manifest.name}, a world model"
-        about = f"{subject.bundle.path.name}, SHA-256 {subject.bundle.sha256}"
-        (out / PAGE).write_text(Page(title, about, facts(subject.bundle), sections).html())
+        (out / PAGE).write_text(_page(subject, sections).html())
     except OSError as error:
         raise DatasetError(f"cannot write in {out}: {error.strerror}; choose another --out") from error
     return out / PAGE
+
+
+def _page(subject: Subject, sections: list[Section]) -> Page:
+    if subject.bundle is not None:
+        title = f"{subject.bundle.manifest.name}, a world model"
+        about = f"{subject.bundle.path.name}, SHA-256 {subject.bundle.sha256}"
+        return Page(title, about, facts(subject.bundle), sections)
+    assert subject.run is not None
+    settings = subject.run.settings
+    rows = [
+        ("task", settings.task.task),
+        ("controller", f"{settings.controller.size} parameters, layers {settings.controller.layers}"),
+        ("population", f"{settings.population} x {settings.episodes} episodes"),
+        ("generations", str(len(subject.run.history()))),
+    ]
+    return Page(f"{subject.run.name}, a run without a world model", f"run {subject.run.uid}", rows, sections)
 
 
 def sections_of(subject: Subject, config: DriveConfig, data: Path | None) -> Iterator[Section]:
     """The sections of the page, each as it is drawn."""
     if data is not None:
         training = curves.losses(data)
+    if subject.bundle is None:
+        yield from _fitness(subject)
+        return
     bundle, decoder = subject.bundle, Decoder(subject.bundle)
     driven = drive(bundle, subject.controller, config)
     yield vision.reconstructions(driven, decoder)
@@ -83,10 +103,14 @@ def sections_of(subject: Subject, config: DriveConfig, data: Path | None) -> Ite
     yield vision.moments(driven)
     yield vision.samples(bundle.manifest.latent, decoder)
     yield from _dreams(bundle, driven, decoder)
-    if subject.run is not None and (evolved := curves.fitness(subject.run)):
-        yield evolved
+    yield from _fitness(subject)
     if data is not None:
         yield from training
+
+
+def _fitness(subject: Subject) -> Iterator[Section]:
+    if subject.run is not None and (evolved := curves.fitness(subject.run)):
+        yield evolved
 
 
 def _dreams(bundle: Bundle, driven: EncodedRollout, decoder: Decoder) -> Iterator[Section]:
