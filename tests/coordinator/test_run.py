@@ -39,7 +39,7 @@ class Bench:
         self.run.advance(self.now)
         self.run.commit()
         for name in (A, B):
-            self.run.admit(HelloRequest(1, 1, "0", name, (SPEC.task,), "f", 1), self.now)
+            self.run.exchange.admit(HelloRequest(1, 1, "0", name, (SPEC.task,), "f", 1), self.now)
             self.beat(name)
 
     def restart(self):
@@ -60,12 +60,12 @@ class Bench:
 
     def deliver(self, name, result):
         batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,))
-        self.run.results(name, batch, self.now)
+        self.run.exchange.results(name, batch, self.now)
         self.run.advance(self.now)
         self.run.commit()
 
     def upload(self, name, part):
-        self.run.upload(name, part, self.now)
+        self.run.exchange.upload(name, part, self.now)
 
     def parts(self, job):
         data = drive_of(job)
@@ -122,7 +122,7 @@ def test_a_death_between_the_jobs_and_the_commit_loses_no_bit(bench):
         for work in send.content.work:
             results.append(Result(work.job.digest, float(work.job.candidate), 10, 0.1, None, None))
             batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(results[-1],))
-            bench.run.results(send.identity, batch, bench.now)
+            bench.run.exchange.results(send.identity, batch, bench.now)
     assert bench.run.advance(bench.now)
     early = bench.run.fleet.dispatch(bench.now, durable=False)
     assert not any(send.content.verdicts for send in early)
@@ -169,7 +169,7 @@ def test_parts_of_a_job_that_nobody_gave_are_dropped_and_counted(bench):
     part = bench.parts(job)[0]
     for stranger, each in (("x/0badc0de", part), (name, replace(part, digest=b"x" * 32))):
         bench.upload(stranger, each)
-    assert bench.run.dropped == {"unwanted upload": 2}
+    assert bench.run.exchange.dropped == {"unwanted upload": 2}
     assert len(bench.run.slack.collections.uploads) == 0
 
 
@@ -225,7 +225,7 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
             bench.beat(what[0], unacked=[jobs[what[1]].digest])
         elif kind == "wait":
             bench.now += what[0]
-            bench.run.tick(bench.now)
+            bench.run.exchange.tick(bench.now)
             bench.run.advance(bench.now)
             bench.run.commit()
         elif kind == "restart" and bench.run.ended is None:
