@@ -197,6 +197,38 @@ def test_a_restart_in_mid_upload_asks_again_and_what_was_kept_stays(bench):
     assert bench.kept() == [drive_of(job), drive_of(other)]
 
 
+def fail(bench, name, digest, error):
+    bench.deliver(name, Result(digest, None, 0, 0.1, error, None))
+
+
+def test_a_pause_names_candidate_seed_every_worker_how_often_and_why(bench):
+    given = {send.identity: send.content.work for send in bench.run.exchange.dispatch(bench.now)}
+    work = given[A][0]
+    seed, name = work.job.seeds[0], f"candidate 0/{work.job.candidate}"
+    fail(bench, A, work.job.digest, "boom")
+    assert bench.run.paused is None
+    bench.run.exchange.dispatch(bench.now)
+    fail(bench, B, work.job.digest, "bang")
+    assert bench.run.paused.startswith(
+        f"{name}, seed {seed}, failed on two workers: {A} (once): boom; {B} (once): bang"
+    )
+    assert "dreamfleet resume" in bench.run.paused
+    assert f"paused: {bench.run.paused}" in bench.run.exchange.take_notes()
+
+
+def test_a_pause_on_the_only_worker_speaks_of_one_worker_and_three_times(bench):
+    bench.run.exchange.depart(B, bench.now)
+    bench.now += 1
+    bench.run.exchange.tick(bench.now)
+    digest = None
+    while bench.run.paused is None:
+        for send in bench.run.exchange.dispatch(bench.now):
+            digest = digest or (send.content.work[0].job.digest if send.content.work else None)
+        fail(bench, A, digest, "boom")
+    assert f"failed on one worker: {A} (3 times): boom" in bench.run.paused
+    assert "two workers" not in bench.run.paused
+
+
 STEPS = st.one_of(
     st.tuples(st.just("part"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1), st.integers(0, 2)),
     st.tuples(st.just("spoilt"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1), st.integers(0, 2)),
