@@ -170,7 +170,7 @@ class RunFolder:
 
     @property
     def controller_path(self) -> Path:
-        """The reported controller; there once the run ended."""
+        """The reported controller; there from the first closed generation on."""
         return self.path / CONTROLLER
 
     def candidate(self, generation: int, number: int) -> NDArray[np.float32]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from dreamfleet.common.bundle import pretrained
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError
-from dreamfleet.common.runs import BUNDLE, CONTROLLER
+from dreamfleet.common.runs import BUNDLE, CONTROLLER, JOURNAL
 
 
 def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]:
@@ -19,5 +19,10 @@ def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]
         return Controller.load(run / CONTROLLER), run / BUNDLE
     if shipped.is_file():
         return Controller.load(shipped), None
+    if (run / JOURNAL).is_file():
+        raise ControllerError(
+            f"run {name} has no controller yet: it is written as the first generation is closed; an older run's is "
+            f"written once it is continued: dreamfleet coordinator --resume {name}"
+        )
     names = ", ".join(sorted(each.stem for each in pretrained().glob("*.npz"))) or "none"
-    raise ControllerError(f"no controller {name!r}: give a file, a run that has ended, or one that ships: {names}")
+    raise ControllerError(f"no controller {name!r}: give a file, a run, or one that ships: {names}")

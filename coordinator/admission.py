@@ -5,6 +5,8 @@ from __future__ import annotations
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import HelloRequest
 
+MOST_REFUSED = 8  # names that are remembered
+
 
 def refusal(
     request: HelloRequest, task: str, fingerprint: str | None, packages: tuple[str, ...] = NUMERIC_PACKAGES
@@ -27,3 +29,23 @@ def refusal(
     return f"fingerprints differ: the run has [{fingerprint}], the worker [{request.fingerprint}]", (
         "install the same package versions on a host of the same CPU features, or start the coordinator with --mixed"
     )
+
+
+class Refusals:
+    """Workers that could not join, the latest last: for whoever wonders why a run waits."""
+
+    def __init__(self) -> None:
+        self.latest: dict[str, str] = {}  # name of a worker -> why
+
+    def add(self, worker: str, why: str) -> bool:
+        """Remember one; whether that is news. A worker that is started again and again has one name, many lives."""
+        name = worker.partition("/")[0]
+        news = self.latest.pop(name, None) != why
+        self.latest[name] = why
+        while len(self.latest) > MOST_REFUSED:
+            del self.latest[next(iter(self.latest))]
+        return news
+
+    def admitted(self, worker: str) -> None:
+        """It could join after all."""
+        self.latest.pop(worker.partition("/")[0], None)

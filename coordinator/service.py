@@ -81,6 +81,7 @@ class Service:
             token = self._claim(session, stack)
             stack.callback(token.undeclare)
             self._run = run_maker()
+            self._exchange = self._run.exchange
             self._started = monotonic()
             self._snapshot = self._take_snapshot()
             declared = self._declare(session)
@@ -154,15 +155,15 @@ class Service:
         while not self._stopping and self._run.ended is None:
             self._drain_events()
             now = monotonic()
-            self._run.tick(now)
+            self._exchange.tick(now)
             if self._run.advance(now):
-                self._put(session, self._run.dispatch(now, durable=False))  # workers need not wait for the disk
+                self._put(session, self._exchange.dispatch(now, durable=False))  # workers need not wait for the disk
             self._run.commit()
-            self._put(session, self._run.dispatch(now))
+            self._put(session, self._exchange.dispatch(now))
             self._run.prepare()
             self._publish_closed(session)
             self._write_notes()
-            if self._draining and not self._run.leased:
+            if self._draining and not self._exchange.leased:
                 self.stop()
             if now - taken >= SNAPSHOT_INTERVAL:
                 self._snapshot, taken = self._take_snapshot(), now
@@ -172,7 +173,7 @@ class Service:
             session.put(keys.job(self._name, send.identity), self._batch(send), encoding=encoding(JobBatch))
 
     def _write_notes(self) -> None:
-        for note in self._run.take_notes():
+        for note in self._exchange.take_notes():
             log.info("%s", note)
 
     def _drain_events(self) -> None:
@@ -181,7 +182,7 @@ class Service:
             self._handle(*self._events.get(timeout=TICK))
             until = monotonic() + LINGER
             for _ in range(DRAIN):
-                left = until - monotonic() if self._run.jobs else 0.0  # else a generation's end waits for us
+                left = until - monotonic() if self._exchange.jobs else 0.0  # else a generation's end waits for us
                 self._handle(*self._events.get(timeout=max(left, 0.0)))
         except queue.Empty:
             pass
@@ -194,19 +195,19 @@ class Service:
             self._control(event)
         elif kind == "token":
             if event.kind == zenoh.SampleKind.DELETE:
-                self._run.depart(keys.worker_of(str(event.key_expr)), now)
+                self._exchange.depart(keys.worker_of(str(event.key_expr)), now)
         elif kind == "result":
             results = self._inbox.decode(ResultBatch, event.payload.to_bytes())
             if results is not None and self._ours(results.run_uid):
-                self._run.results(keys.worker_of(str(event.key_expr)), results, now)
+                self._exchange.results(keys.worker_of(str(event.key_expr)), results, now)
         elif kind == "beat":
             beat = self._inbox.decode(Beat, event.payload.to_bytes())
             if beat is not None and self._ours(beat.run_uid) and beat.nonce == self._nonce:
-                self._run.beat(keys.worker_of(str(event.key_expr)), beat, now)
+                self._exchange.beat(keys.worker_of(str(event.key_expr)), beat, now)
         elif kind == "upload":
             part = self._inbox.decode(UploadPart, event.payload.to_bytes())
             if part is not None and self._ours(part.run_uid):
-                self._run.upload(keys.worker_of(str(event.key_expr)), part, now)
+                self._exchange.upload(keys.worker_of(str(event.key_expr)), part, now)
 
     def _ours(self, run_uid: str) -> bool:
         if run_uid != self._run.uid:
@@ -225,10 +226,10 @@ class Service:
                     f"{keys.PROTOCOL_VERSION}",
                     f"install dreamfleet {package_version('dreamfleet')} on the worker's host",
                 )
-            elif refusal := self._run.refusal(request, self._mixed):
+            elif refusal := self._exchange.refusal(request, self._run.settings, self._mixed):
                 reply = self._hello_reply(*refusal)
             else:
-                self._run.admit(request, now)
+                self._exchange.admit(request, now)
                 reply = self._hello_reply()
             query.reply(keys.hello(self._name), encode_json(reply), encoding="application/json")
 
@@ -309,7 +310,7 @@ class Service:
     def _take_snapshot(self) -> Snapshot:
         now = monotonic()
         with self._lock:
-            dropped = self._inbox.dropped + self._run.dropped + self._overflow
+            dropped = self._inbox.dropped + self._exchange.dropped + self._overflow
         return take_snapshot(self._run, self._name, dropped, now - self._started, now)
 
     def _answer_status(self, part: str) -> Callable[[zenoh.Query], None]:

@@ -56,7 +56,7 @@ def find_start(name: str, runs_dir: Path) -> Start:
     """A controller's file, a run (its reported controller, or its mean while it is open), or what ships."""
     if not Path(name).is_file() and (runs_dir / name).is_dir():
         with open_run(runs_dir, name) as stored:
-            if not stored.controller_path.is_file():
+            if stored.ended is None:  # what it reports so far is an older mean than the one that it stands at
                 return start_of(stored)
     controller, _ = find_controller(name, runs_dir)
     mean = controller.parameters.astype(np.float64)

@@ -47,9 +47,10 @@ class Snapshot:
 
 def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float) -> Snapshot:
     """The run as it is at `now`, seconds of the monotonic clock; `uptime` in seconds."""
-    workers = tuple(_worker(member, now) for member in run.members)
-    present = [member for member in run.members if member.present]
-    standing, evaluations, failures = run.generation.standing(), run.slack.evaluations, run.failures
+    exchange = run.exchange
+    workers = tuple(_worker(member, now) for member in exchange.members)
+    present = [member for member in exchange.members if member.present]
+    standing, evaluations, failures = run.generation.standing(), run.slack.evaluations, exchange.failures
     status = Status(
         schema=SCHEMA,
         run=name,
@@ -75,16 +76,16 @@ def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float
         workers=WorkerCount(len(present), len(workers)),
         worker_list=(),
         slots=sum(member.slots for member in present),
-        fingerprint=run.fingerprint,
+        fingerprint=exchange.fingerprint,
         throughput=Throughput(
             steps_per_second=round(sum(member.steps_per_second for member in present), 1),
             environment_steps=run.history.steps + run.generation.steps,
         ),
-        waste=_waste(run.counts),
+        waste=_waste(exchange.counts),
         failing=len(failures),
         failures=tuple(_failure(each) for each in failures[:MOST_FAILURES]),
         dropped=dict(dropped),
-        refused={name: shorten(why, LONGEST) for name, why in list(run.refused.items())[-MOST_NAMED:]},
+        refused={name: shorten(why, LONGEST) for name, why in list(exchange.refusals.latest.items())[-MOST_NAMED:]},
     )
     return Snapshot(status, workers, run.history.view(), standing, run.last, run.slack.report.current)
 

@@ -97,7 +97,7 @@ def test_killed_anywhere_it_raises_at_the_same_generations_and_gives_the_same_bi
         """Before the commit, after it, or not."""
         fate = chance.random()
         batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(result,))
-        bench.run.results(name, batch, bench.now)
+        bench.run.exchange.results(name, batch, bench.now)
         bench.run.advance(bench.now)
         if fate > 0.2 or bench.run.ended is not None:
             bench.run.commit()

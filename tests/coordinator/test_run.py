@@ -39,7 +39,7 @@ class Bench:
         self.run.advance(self.now)
         self.run.commit()
         for name in (A, B):
-            self.run.admit(HelloRequest(1, 1, "0", name, (SPEC.task,), "f", 1), self.now)
+            self.run.exchange.admit(HelloRequest(1, 1, "0", name, (SPEC.task,), "f", 1), self.now)
             self.beat(name)
 
     def restart(self):
@@ -60,12 +60,12 @@ class Bench:
 
     def deliver(self, name, result):
         batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,))
-        self.run.results(name, batch, self.now)
+        self.run.exchange.results(name, batch, self.now)
         self.run.advance(self.now)
         self.run.commit()
 
     def upload(self, name, part):
-        self.run.upload(name, part, self.now)
+        self.run.exchange.upload(name, part, self.now)
 
     def parts(self, job):
         data = drive_of(job)
@@ -122,7 +122,7 @@ def test_a_death_between_the_jobs_and_the_commit_loses_no_bit(bench):
         for work in send.content.work:
             results.append(Result(work.job.digest, float(work.job.candidate), 10, 0.1, None, None))
             batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(results[-1],))
-            bench.run.results(send.identity, batch, bench.now)
+            bench.run.exchange.results(send.identity, batch, bench.now)
     assert bench.run.advance(bench.now)
     early = bench.run.fleet.dispatch(bench.now, durable=False)
     assert not any(send.content.verdicts for send in early)
@@ -169,7 +169,7 @@ def test_parts_of_a_job_that_nobody_gave_are_dropped_and_counted(bench):
     part = bench.parts(job)[0]
     for stranger, each in (("x/0badc0de", part), (name, replace(part, digest=b"x" * 32))):
         bench.upload(stranger, each)
-    assert bench.run.dropped == {"unwanted upload": 2}
+    assert bench.run.exchange.dropped == {"unwanted upload": 2}
     assert len(bench.run.slack.collections.uploads) == 0
 
 
@@ -195,6 +195,38 @@ def test_a_restart_in_mid_upload_asks_again_and_what_was_kept_stays(bench):
     bench.deliver(B, result_of(other))
     assert bench.run.ended is not None
     assert bench.kept() == [drive_of(job), drive_of(other)]
+
+
+def fail(bench, name, digest, error):
+    bench.deliver(name, Result(digest, None, 0, 0.1, error, None))
+
+
+def test_a_pause_names_candidate_seed_every_worker_how_often_and_why(bench):
+    given = {send.identity: send.content.work for send in bench.run.exchange.dispatch(bench.now)}
+    work = given[A][0]
+    seed, name = work.job.seeds[0], f"candidate 0/{work.job.candidate}"
+    fail(bench, A, work.job.digest, "boom")
+    assert bench.run.paused is None
+    bench.run.exchange.dispatch(bench.now)
+    fail(bench, B, work.job.digest, "bang")
+    assert bench.run.paused.startswith(
+        f"{name}, seed {seed}, failed on two workers: {A} (once): boom; {B} (once): bang"
+    )
+    assert "dreamfleet resume" in bench.run.paused
+    assert f"paused: {bench.run.paused}" in bench.run.exchange.take_notes()
+
+
+def test_a_pause_on_the_only_worker_speaks_of_one_worker_and_three_times(bench):
+    bench.run.exchange.depart(B, bench.now)
+    bench.now += 1
+    bench.run.exchange.tick(bench.now)
+    digest = None
+    while bench.run.paused is None:
+        for send in bench.run.exchange.dispatch(bench.now):
+            digest = digest or (send.content.work[0].job.digest if send.content.work else None)
+        fail(bench, A, digest, "boom")
+    assert f"failed on one worker: {A} (3 times): boom" in bench.run.paused
+    assert "two workers" not in bench.run.paused
 
 
 STEPS = st.one_of(
@@ -225,7 +257,7 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
             bench.beat(what[0], unacked=[jobs[what[1]].digest])
         elif kind == "wait":
             bench.now += what[0]
-            bench.run.tick(bench.now)
+            bench.run.exchange.tick(bench.now)
             bench.run.advance(bench.now)
             bench.run.commit()
         elif kind == "restart" and bench.run.ended is None:

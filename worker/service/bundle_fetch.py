@@ -11,8 +11,9 @@ import zenoh
 
 from dreamfleet.common import keys
 from dreamfleet.common.asking import ask_all
-from dreamfleet.common.bundle import Bundle, BundleStore
+from dreamfleet.common.bundle import Bundle, BundleStore, default_cache
 from dreamfleet.common.codec import Inbox
+from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.messages import MAX_PART, BundlePart
 
@@ -47,6 +48,15 @@ def obtain(
             log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6)
             return bundle
     raise BundleError(f"the bundle {sha256[:12]}... arrived damaged {ATTEMPTS} times: check the coordinator's copy")
+
+
+def fetch_for(controller: Controller, session: zenoh.Session, run: str) -> Bundle | None:
+    """The world model of a controller that `run` reports: cached, shipped, or fetched; `None` if it needs none."""
+    if not controller.bundle:
+        return None
+    bundle = obtain(session, run, controller.bundle, BundleStore(default_cache()), Inbox())
+    assert bundle is not None  # nobody stops it
+    return bundle.under(controller.shape)
 
 
 def _download(

@@ -6,10 +6,15 @@ import argparse
 import json
 import os
 import sys
+from typing import TYPE_CHECKING
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.seeds import TEST
 from dreamfleet.common.site import offer
+
+if TYPE_CHECKING:
+    from dreamfleet.common.bundle import Bundle
+    from dreamfleet.common.controller import Controller
 
 SUMMARY = "judge a controller on unseen tracks, in gymnasium's own unmodified environment"
 EXTRAS = ("worker",)
@@ -17,7 +22,9 @@ EXTRAS = ("worker",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--controller", required=True, help="a file, a run that has ended, or one that ships")
+    parser.add_argument("--controller", help="a file, a run, or one that ships")
+    parser.add_argument("--connect", nargs="+", metavar="ENDPOINT", help="ask a live run for its controller instead")
+    parser.add_argument("--run", dest="run_name", metavar="RUN", help="with --connect: its name, if several are live")
     parser.add_argument("--episodes", type=int, default=100, help="tracks (default 100)")
     parser.add_argument("--first-seed", type=int, default=TEST.start, help=f"first track's seed (default {TEST.start})")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
@@ -29,13 +36,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Drive and print the scores."""
     from dreamfleet.common.progress import progress_bar
-    from dreamfleet.common.shelf import find_controller
-    from dreamfleet.worker.tools.evaluation import Evaluated, bundle_for, evaluate
+    from dreamfleet.worker.tools.evaluation import Evaluated, evaluate
 
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
-    controller, beside = find_controller(args.controller, args.runs_dir)
-    bundle = bundle_for(controller, args.bundle, beside)
+    controller, bundle = _choose(args)
     seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
     if seeds[0] not in TEST or seeds[-1] not in TEST:
         print(f"note: test tracks are {TEST.start} to {TEST.stop - 1}; some of these are not", file=sys.stderr)
@@ -52,3 +57,23 @@ def run(args: argparse.Namespace) -> int:
         low, high = min(done.scores), max(done.scores)
         print(f"{done.mean:.1f} ± {done.std:.1f} on {len(seeds)} tracks ({low:.0f} to {high:.0f}), judged by gymnasium")
     return 0
+
+
+def _choose(args: argparse.Namespace) -> tuple[Controller, Bundle | None]:
+    """What to judge, and its world model: from here, or from a live run."""
+    from dreamfleet.common.client import Client
+    from dreamfleet.common.shelf import find_controller
+    from dreamfleet.worker.service.bundle_fetch import fetch_for
+    from dreamfleet.worker.tools.evaluation import bundle_for
+
+    if args.connect and not args.controller:
+        with Client(tuple(args.connect)) as client:
+            run = args.run_name or client.status().run
+            controller = client.controller(run)
+            if args.bundle is None:
+                return controller, fetch_for(controller, client.session, run)
+        return controller, bundle_for(controller, args.bundle)
+    if args.connect or args.run_name or not args.controller:
+        raise UsageError("give --controller, or --connect (and --run) to judge what a live run reports")
+    controller, beside = find_controller(args.controller, args.runs_dir)
+    return controller, bundle_for(controller, args.bundle, beside)

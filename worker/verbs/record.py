@@ -16,7 +16,7 @@ EXTRAS = ("worker", "views")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--controller", required=True, help="a file, a run that has ended, or one that ships")
+    parser.add_argument("--controller", required=True, help="a file, a run, or one that ships")
     parser.add_argument("--seed", type=int, default=TEST.start, help=f"the track (default {TEST.start})")
     parser.add_argument("--steps", type=int, default=1000, help="steps at most (default 1000)")
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help="the video to write (default drive.mp4)")

@@ -1,0 +1,128 @@
+"""What passes between a run and its workers: who may join, what they say, what they are given. No transport."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection
+
+from dreamfleet.common.messages import Beat, HelloRequest, Result, ResultBatch, UploadPart
+from dreamfleet.common.runs import RunSettings
+from dreamfleet.coordinator.admission import Refusals, refusal
+from dreamfleet.coordinator.failure import Failure
+from dreamfleet.coordinator.fleet import Fleet, Send
+from dreamfleet.coordinator.jobs import Work
+from dreamfleet.coordinator.journal import Journal
+from dreamfleet.coordinator.member import Member
+from dreamfleet.coordinator.slack import Slack
+
+
+class Exchange:
+    """One incarnation's fleet as the service and the status see it; `score` takes accepted results of candidates."""
+
+    def __init__(
+        self, journal: Journal, incarnation: int, fleet: Fleet, slack: Slack, score: Callable[[Result], None]
+    ) -> None:
+        self.refusals = Refusals()
+        self.fingerprint = journal.fact("fingerprint")  # of the hosts that are admitted; `None` before the first
+        self._journal = journal
+        self._incarnation = incarnation
+        self._fleet = fleet
+        self._slack = slack
+        self._uploads = slack.collections.uploads
+        self._score = score
+
+    def refusal(self, request: HelloRequest, settings: RunSettings, mixed: bool) -> tuple[str, str] | None:
+        """Why a worker cannot join and what to do about it; `None` if it may."""
+        found = refusal(request, settings.task.task, None if mixed else self.fingerprint, settings.packages)
+        known = request.packages == settings.packages  # else it says hello again
+        if found is not None and known and self.refusals.add(request.worker, found[0]):
+            self._fleet.notes.append(f"refused worker {request.worker}: {found[0]}")
+        return found
+
+    def admit(self, request: HelloRequest, now: float) -> None:
+        """Welcome a worker; the first one's fingerprint becomes the run's."""
+        self.refusals.admitted(request.worker)
+        if self.fingerprint is None:
+            self.fingerprint = request.fingerprint
+            self._journal.set_fact("fingerprint", request.fingerprint)
+        self._fleet.welcome(request.worker, request.slots, request.fingerprint, now)
+
+    def beat(self, worker: str, beat: Beat, now: float) -> None:
+        """A worker says what it holds."""
+        self._fleet.beat(worker, beat, now)
+
+    def depart(self, worker: str, now: float) -> None:
+        """A worker's token vanished."""
+        self._fleet.depart(worker, now)
+
+    def results(self, worker: str, batch: ResultBatch, now: float) -> None:
+        """Judge a worker's results; the first wanted ones are written and counted."""
+        for each in batch.results:
+            result = self._slack.collections.receive(worker, each, self._fleet.wants(each.digest))
+            if result is None:
+                self._fleet.put_off(worker, each.digest, now)
+                continue
+            _, work = self._fleet.result(worker, result, now)
+            if work is not None:
+                self._journal.add_result(work.job, result, worker, batch.fingerprint, self._incarnation)
+                self._count(work, result)
+            self._uploads.forget(result.digest)
+
+    def upload(self, worker: str, part: UploadPart, now: float) -> None:
+        """Take in part of a drive, from a worker that was given the job and while it is wanted."""
+        work = self._fleet.wants(part.digest)
+        if work is None or work.job.kind != "collect" or not self._fleet.holds(worker, part.digest):
+            self._uploads.dropped["unwanted upload"] += 1
+            return
+        self._uploads.add(worker, part, now)
+
+    def tick(self, now: float) -> None:
+        """Let time pass: departures, silences, uploads that stopped."""
+        self._fleet.tick(now)
+        self._uploads.tick(now)
+
+    @property
+    def jobs(self) -> int:
+        """Jobs that are wanted."""
+        return self._fleet.open
+
+    @property
+    def leased(self) -> int:
+        """Jobs in workers' hands, copies counted."""
+        return self._fleet.leased
+
+    def dispatch(self, now: float, *, durable: bool = True) -> list[Send]:
+        """Batches to send now; verdicts stay until everything so far is `durable`."""
+        return self._fleet.dispatch(now, durable=durable)
+
+    def take_notes(self) -> list[str]:
+        """What happened since the last call, for a log."""
+        notes, self._fleet.notes = self._fleet.notes, []
+        return notes
+
+    @property
+    def members(self) -> Collection[Member]:
+        """The workers that are known."""
+        return self._fleet.members.values()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What became of jobs, results and batches."""
+        return self._fleet.counts
+
+    @property
+    def failures(self) -> list[Failure]:
+        """Wanted jobs that failed somewhere."""
+        return self._fleet.failures
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Parts of uploads that were dropped, by reason."""
+        return self._uploads.dropped
+
+    def _count(self, work: Work, result: Result) -> None:
+        """What an accepted result, which is in the journal, means to whatever asked for it."""
+        if work.job.kind == "score":
+            self._score(result)
+        else:
+            self._slack.count(work, result)

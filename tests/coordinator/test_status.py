@@ -1,0 +1,190 @@
+"""Snapshots of a run and the answers that are cut from them, without a transport."""
+
+import dataclasses
+import json
+from collections import Counter
+
+import pytest
+
+from dreamfleet.common.codec import from_plain
+from dreamfleet.common.messages import MAX_MESSAGE, Result
+from dreamfleet.common.runs import StoredGeneration
+from dreamfleet.common.status import PARTS, Population, read_document, read_status
+from dreamfleet.coordinator import answers
+from dreamfleet.coordinator.generation import Standing
+from dreamfleet.coordinator.history import History
+from dreamfleet.coordinator.status import Snapshot, left, take_snapshot
+from tests.coordinator.test_run import SETTINGS, A, Bench
+from tests.support.samples import CLOSED, STATUS
+
+SCORED = dataclasses.replace(SETTINGS, population=4, episodes=2, collect_every=0)
+
+
+@pytest.fixture
+def bench(tmp_path, random_bundle):
+    made = Bench(tmp_path / "night", random_bundle.path, SCORED, generations=3)
+    yield made
+    made.journal.close()
+
+
+def score(bench, count, fitness=lambda job: job.candidate + job.episode / 2):
+    """So many jobs, one after the other."""
+    while count:
+        for send in bench.run.exchange.dispatch(bench.now):
+            bench.given = getattr(bench, "given", []) + [work.job for work in send.content.work]
+        job = bench.given.pop(0)
+        bench.deliver(A, Result(job.digest, fitness(job), 10, 0.1, None, None))
+        count -= 1
+
+
+def snapshot_of(bench):
+    return take_snapshot(bench.run, "night", Counter(), 0.0, bench.now)
+
+
+def answered(snapshot, part="", **parameters):
+    return read_document(answers.answer(snapshot, part, {name: str(value) for name, value in parameters.items()}))
+
+
+def test_every_candidate_of_the_open_and_of_the_last_generation_is_told(bench):
+    before = read_status(answered(snapshot_of(bench)))
+    assert before.population == Population(0, 0, 4, (0,) * 4, (2,) * 4, (None,) * 4)
+    assert before.last_population is None
+    score(bench, 3)
+    jobs = Counter(job.candidate for job in bench.given)
+    now = read_status(answered(snapshot_of(bench))).population.candidates
+    assert [each.done for each in now] == [2 - jobs[index] for index in range(4)]
+    assert [each.fitness is None for each in now] == [each.done == 0 for each in now]
+    score(bench, 5)
+    after = read_status(answered(snapshot_of(bench)))
+    assert after.last_population == Population(0, 0, 4, (2,) * 4, (2,) * 4, (0.25, 1.25, 2.25, 3.25))
+    assert (after.population.generation, after.generation.number, after.generations) == (1, 1, 1)
+    assert after.last == after.recent[-1]
+
+
+def test_a_restart_knows_the_last_generations_candidates_again(bench):
+    score(bench, 8)
+    before = snapshot_of(bench)
+    bench.restart()
+    after = snapshot_of(bench)
+    assert (after.last, after.status.last, after.standing) == (before.last, before.status.last, before.standing)
+
+
+def rows(count):
+    return [dataclasses.replace(CLOSED, number=number, mean=-123.4567890123456 - number) for number in range(count)]
+
+
+def large(population, workers, generations, text="x"):
+    """A snapshot of an unusual run."""
+    standing = Standing(
+        generations, [10_000] * population, [10_000] * population, [-123.45678901234567 + i for i in range(population)]
+    )
+    fleet = tuple(
+        dataclasses.replace(STATUS.worker_list[0], worker=f"a-rather-long-host-{i}/0a1b2c3d", fingerprint=text * 200)
+        for i in range(workers)
+    )
+    status = dataclasses.replace(
+        STATUS, why=text * 2000, failures=STATUS.failures * 3, worker_list=(), recent=(),
+        workers=dataclasses.replace(STATUS.workers, known=workers),
+    )  # fmt: skip
+    last = dataclasses.replace(standing, generation=generations - 1)
+    return Snapshot(status, fleet, History(rows(generations)).view(), standing, last, None)
+
+
+@pytest.mark.parametrize(("population", "workers", "generations"), [(4, 1, 1), (100_000, 2000, 5000)])
+@pytest.mark.parametrize("text", ["x", "\N{SNOWMAN}", "\N{ROLLING ON THE FLOOR LAUGHING}"])
+def test_no_answer_is_longer_than_a_message_whatever_the_run(population, workers, generations, text):
+    snapshot = large(population, workers, generations, text)
+    for part in PARTS:
+        payload = answers.answer(snapshot, part, {})
+        assert len(payload) <= MAX_MESSAGE, part
+    status = read_status(answered(snapshot))
+    assert status.population.total == population
+    assert status.worker_list
+    assert status.recent[-1].number == generations - 1
+
+
+def collected(snapshot, part, column, **parameters):
+    found, offset, total = [], 0, 1
+    while offset < total:
+        document = answered(snapshot, part, offset=offset, **parameters)
+        total = document["total"]
+        found += document[column]
+        offset += len(document[column])
+    return found
+
+
+def test_pages_together_are_everything_and_come_from_the_same_moment():
+    snapshot = large(3000, 150, 250)
+    assert [each["worker"] for each in collected(snapshot, "workers", "workers")] == [
+        each.worker for each in snapshot.workers
+    ]
+    assert [from_plain(StoredGeneration, each) for each in collected(snapshot, "history", "history")] == rows(250)
+    for standing in (snapshot.standing, snapshot.last):
+        asked = {"generation": standing.generation}
+        assert collected(snapshot, "candidates", "fitness", **asked) == standing.fitness
+        assert answered(snapshot, "candidates", **asked)["generation"] == standing.generation
+
+
+@pytest.mark.parametrize("damage", ["-1", "x", "1e9", "9" * 40, ""])
+def test_parameters_that_are_no_numbers_mean_the_beginning(damage):
+    snapshot = large(4, 1, 3)
+    for part in PARTS:
+        assert answered(snapshot, part, offset=damage, limit=damage) == answered(snapshot, part)
+
+
+class Rows(list):
+    """Counts every row that is looked at."""
+
+    touched = 0
+
+    def __getitem__(self, index):
+        found = super().__getitem__(index)
+        Rows.touched += len(found) if isinstance(index, slice) else 1
+        return found
+
+    def __iter__(self):
+        for row in super().__iter__():
+            Rows.touched += 1
+            yield row
+
+
+def touched(bench, generations):
+    """Rows of the history and of evaluations that a snapshot, an answer and the stop reason look at."""
+    bench.run.history.__init__(rows(generations))
+    evaluations = bench.run.slack.evaluations
+    evaluations.__init__(
+        dataclasses.replace(STATUS.best, generation=number, mean=float(number % 7)) for number in range(generations)
+    )
+    bench.run.history._rows = Rows(bench.run.history._rows)
+    evaluations._rows, evaluations._bests = Rows(evaluations._rows), Rows(evaluations._bests)
+    bench.run.limits = dataclasses.replace(
+        bench.run.limits, generations=10**6, steps=10**12, minutes=1e6, target=1e6, parted=3
+    )
+    Rows.touched = 0
+    snapshot = snapshot_of(bench)
+    answers.status(snapshot)
+    assert bench.run._stop_reason() is None
+    return Rows.touched
+
+
+def test_a_snapshot_costs_the_same_however_long_the_run_is(bench):
+    few, many = touched(bench, 100), touched(bench, 5000)
+    assert few == many
+    assert few < 100
+
+
+def test_the_best_answer_carries_the_controller_in_parts(bench):
+    assert answered(snapshot_of(bench), "best")["controller"] is None
+    score(bench, 8)
+    about = answered(snapshot_of(bench), "best")["controller"]
+    reported = bench.run.slack.report.current.controller()
+    assert (about["sha256"], about["total"]) == (reported.sha256, len(reported.parameters))
+    assert about["provenance"]["generation"] == 0
+
+
+def test_a_run_that_is_left_open_says_so_and_one_that_ended_has_ended(bench):
+    assert left(snapshot_of(bench)).status.state == "left"
+    while bench.run.ended is None:
+        score(bench, 1)
+    assert left(snapshot_of(bench)).status.state == "ended"
+    assert json.loads(answers.status(left(snapshot_of(bench))))["why"] == "3 generations"

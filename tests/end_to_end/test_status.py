@@ -1,0 +1,127 @@
+"""Watching a run from anywhere, to its end, and judging what it reports."""
+
+import json
+import signal
+
+import pytest
+
+from dreamfleet.common.client import Client
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import ConnectionFailedError, ControllerError
+from dreamfleet.common.runs import open_run
+from tests.support import tasks
+
+pytestmark = pytest.mark.timeout(120)
+
+
+@pytest.fixture
+def settings(random_bundle):
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0)
+
+
+def lines(out):
+    return [json.loads(line) for line in out.splitlines()]
+
+
+def test_a_watcher_prints_a_line_each_time_and_at_last_how_the_run_ended(processes, settings):
+    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 2)
+    watcher = processes.start("status", "--connect", processes.endpoint, "--watch", "--json")
+    processes.worker("--task", tasks.SLOW_TOY)
+    assert coordinator.finish()[0] == 0
+    code, out = watcher.finish()
+    seen = lines(out)
+    assert code == 0
+    assert (seen[-1]["state"], seen[-1]["why"], seen[-1]["generations"]) == ("ended", "2 generations", 2)
+    assert len(seen) > 1
+    with open_run(processes.runs, "test") as run:
+        assert seen[-1]["last"]["mean"] == run.history()[-1].mean
+
+
+def test_the_last_panel_shows_the_final_state(processes, settings):
+    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 2)
+    watcher = processes.start("status", "--connect", processes.endpoint, "--watch")
+    processes.worker("--task", tasks.SLOW_TOY)
+    assert coordinator.finish()[0] == 0
+    code, out = watcher.finish()
+    assert code == 0
+    assert "ended" in out
+    assert "2 generations" in out
+
+
+def test_a_watcher_of_a_run_that_is_stopped_is_told_that_it_was_left_open(processes, settings):
+    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
+    with Client((processes.endpoint,)) as client:
+        watched = client.watch("test", 0.05)
+        assert next(watched).state == "waiting for workers"
+        coordinator.popen.send_signal(signal.SIGTERM)
+        *_, last = watched
+    assert last.state == "left"
+    assert coordinator.finish()[0] == 130
+
+
+def test_a_watcher_of_a_coordinator_that_is_killed_says_that_nobody_answers(processes, settings):
+    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
+    with Client((processes.endpoint,)) as client:
+        watched = client.watch("test", 0.05)
+        next(watched)
+        coordinator.popen.kill()
+        with pytest.raises(ConnectionFailedError, match="no coordinator of run 'test'"):
+            for _ in watched:
+                pass
+
+
+def test_parts_that_nobody_answers_any_more_are_an_error_for_people(processes, settings):
+    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
+    with Client((processes.endpoint,)) as client:
+        assert client.status().run == "test"
+        coordinator.end()
+        for ask in (client.workers, client.history, client.controller):
+            with pytest.raises(ConnectionFailedError, match="no coordinator of run 'test'"):
+                ask("test")
+
+
+def test_a_live_runs_controller_is_fetched_and_judged_on_another_host(processes, random_bundle, tmp_path):
+    """One of many units, which travels in parts; the other host has neither runs nor bundles."""
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
+        "--controller", "hidden", "--hidden-units", 40, "--task", tasks.TOY, "--generations", 100000,
+    )  # fmt: skip
+    with Client((processes.endpoint,)) as client:
+        with pytest.raises(ControllerError, match="reports no controller yet"):
+            client.controller("test")
+        worker = processes.worker("--task", tasks.TOY)
+        coordinator.wait_for("generation 3: mean")
+        worker.popen.send_signal(signal.SIGTERM)
+        assert worker.finish()[0] == 0
+        with open_run(processes.runs, "test") as run:
+            here = Controller.load(run.controller_path)
+        there = client.controller("test")
+        assert len(there.parameters) > 6000
+        assert (there.shape, there.task, there.bundle) == (here.shape, here.task, here.bundle)
+        assert there.provenance["generation"] >= here.provenance["generation"]
+        parts = client.candidates("test", client.status().generation.number)
+        assert sum(len(part.done) for part in parts) == 4
+    code, out, err = processes.call(
+        "evaluate", "--connect", processes.endpoint, "--run", "test", "--episodes", 2, "--jobs", 1, "--json",
+        "--runs-dir", tmp_path / "nothing",
+    )  # fmt: skip
+    assert code == 0, err
+    assert len(json.loads(out)["scores"]) == 2
+    code, out, err = processes.call("evaluate", "--controller", "test", "--runs-dir", processes.runs, "--episodes", 2,
+                                    "--jobs", 1, "--json")  # fmt: skip
+    assert code == 0, err
+
+
+def test_resuming_past_a_limit_names_a_controller_that_is_there(processes, settings):
+    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
+    processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done")
+    coordinator.wait_for("generation 1: mean")
+    coordinator.popen.kill()
+    with open_run(processes.runs, "test") as run:
+        run.controller_path.unlink()
+        code, out, err = processes.call(
+            "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+            "--generations", 1,
+        )  # fmt: skip
+        assert (code, "controller" in out) == (0, True), err
+        assert Controller.load(run.controller_path).provenance["generation"] >= 1
