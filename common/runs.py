@@ -50,6 +50,8 @@ class RunSettings:
     collect_episodes: Annotated[int, Between(1, 10**4)] = field(default=1, metadata=OPTIONAL)
     # What a dream's temperature is multiplied by when evaluations fall; 1: never.
     heat: float = field(default=1.0, metadata=OPTIONAL)
+    optimiser: str = field(default="cma", metadata=OPTIONAL)  # registered, or module:attribute
+    optimiser_options: tuple[str, ...] = field(default=(), metadata=OPTIONAL)  # each as name=value
 
     def to_json(self) -> str:
         """The text kept in the journal."""

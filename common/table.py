@@ -57,7 +57,7 @@ def _facts(status: dict[str, Any]) -> Table:
     )  # fmt: skip
     grid.add_row(
         "last generation", _spread(last) if last else "-",
-        "step size", f"{status['generation']['sigma']:.4f} ({settings['covariance']})",
+        "step size", f"{status['generation']['sigma']:.4f} ({_optimiser(settings)})",
     )  # fmt: skip
     grid.add_row("evaluated mean", _evaluated(evaluation), "best", _evaluated(best))
     steps, rate = status["throughput"]["environment_steps"], status["throughput"]["steps_per_second"]
@@ -69,6 +69,11 @@ def _facts(status: dict[str, Any]) -> Table:
     if dropped:
         grid.add_row("dropped messages", ", ".join(f"{count} {why}" for why, count in status["dropped"].items()))
     return grid
+
+
+def _optimiser(settings: dict[str, Any]) -> str:
+    name = settings.get("optimiser", "cma")  # which an older coordinator does not tell
+    return str(settings["covariance"] if name == "cma" else name)
 
 
 def _spread(last: dict[str, Any]) -> str:

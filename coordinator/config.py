@@ -25,7 +25,9 @@ class RunConfig:
     population: int = option(32, "candidates a generation")
     episodes: int = option(2, "episodes a candidate, on the same fresh tracks for all")
     sigma0: float = option(0.1, "first step size")
-    covariance: Literal["diagonal", "full"] = option("diagonal", "the model of CMA-ES")
+    optimiser: str = option("cma", "what asks for candidates: cma, cmaes-lra, cmaes-sep, or yours as module:attribute")
+    optimiser_options: tuple[str, ...] = option((), "the optimiser's own options, each as name=value")
+    covariance: Literal["diagonal", "full"] = option("diagonal", "the model of CMA-ES; an option of cma")
     racing: bool = option(False, "let only the better half of the candidates drive the second half of the episodes")
     horizon: int = option(1000, "steps of a scored episode at most")
     patience: int = option(0, "cut a scored episode after so many steps without reward; 0: never")
@@ -59,10 +61,10 @@ class RunConfig:
             raise UsageError("--heat raises --temperature when evaluations fall: give it and --evaluate-every too")
 
     def settings(self, bundle: Bundle) -> RunSettings:
-        """What the journal keeps: the bundle by its hash."""
+        """What the journal keeps: the bundle by its hash; `UsageError` if its optimiser cannot do it."""
         shape = bundle.shape_of(self.features, self.hidden_units if self.controller == "hidden" else 0)
         named = None if shape == bundle.default_shape else bundle.under(shape).controller_shape
-        return RunSettings(
+        settings = RunSettings(
             task=TaskSpec(self.task, bundle.sha256, self.horizon, self.patience, named, self.temperature),
             controller=shape,
             population=self.population,
@@ -77,7 +79,18 @@ class RunConfig:
             collect_every=self.collect_every,
             collect_episodes=self.collect_episodes,
             heat=self.heat,
+            optimiser=self.optimiser,
+            optimiser_options=tuple(filter(None, self.optimiser_options)),
         )
+        _try_optimiser(settings)
+        return settings
+
+
+def _try_optimiser(settings: RunSettings) -> None:
+    """Build the run's optimiser once, so that what it cannot do is said before there is a run."""
+    from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig  # heavy: `--help` reads this module too
+
+    Evolution(EvolutionConfig.of(settings))
 
 
 def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:

@@ -69,12 +69,7 @@ class Run:
         self.uid = journal.fact("uid") or ""
         self.fingerprint = journal.fact("fingerprint")
         self.incarnation = journal.begin_incarnation()
-        self._evolution = Evolution(
-            EvolutionConfig(
-                settings.controller.size, settings.population, settings.sigma0, settings.covariance, settings.seed
-            ),
-            start.mean if start else None,
-        )
+        self._evolution = Evolution(EvolutionConfig.of(settings), start.mean if start else None)
         if start:
             journal.set_fact("start", start.source)
         self.opened = now
