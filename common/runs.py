@@ -52,6 +52,8 @@ class RunSettings:
     # What a dream's temperature is multiplied by when evaluations fall; 1: never.
     heat: float = field(default=1.0, metadata=OPTIONAL)
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions its fingerprint names
+    optimiser: str = field(default="cma", metadata=OPTIONAL)  # registered, or module:attribute
+    optimiser_options: tuple[str, ...] = field(default=(), metadata=OPTIONAL)  # each as name=value
 
     def to_json(self) -> str:
         """The text kept in the journal."""

@@ -11,7 +11,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from dreamfleet.common.runs import StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.status import FailureStatus, OpenGeneration, Progress, Status, WorkerStatus
 
 STATE_STYLES = {
@@ -69,7 +69,7 @@ def _facts(status: Status) -> Table:
     )
     grid.add_row(
         "last generation", _spread(status.last) if status.last else "-",
-        "step size", f"{status.generation.sigma:.4f} ({settings.covariance})",
+        "step size", f"{status.generation.sigma:.4f} ({_optimiser(settings)})",
     )  # fmt: skip
     grid.add_row("evaluated mean", _evaluated(status.evaluation), "best", _evaluated(status.best))
     steps, rate = status.throughput.environment_steps, status.throughput.steps_per_second
@@ -84,6 +84,10 @@ def _facts(status: Status) -> Table:
 
 def _spread(last: StoredGeneration) -> str:
     return f"{last.mean:.1f} ± {last.std:.1f}  ({last.worst:.0f} to {last.best:.0f})"
+
+
+def _optimiser(settings: RunSettings) -> str:
+    return settings.covariance if settings.optimiser == "cma" else settings.optimiser
 
 
 def _evaluated(each: StoredEvaluation | None) -> str:

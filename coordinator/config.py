@@ -39,7 +39,9 @@ class RunConfig:
     population: int = option(32, "candidates a generation")
     episodes: int = option(2, "episodes a candidate, on the same fresh tracks for all")
     sigma0: float = option(0.1, "first step size")
-    covariance: Literal["diagonal", "full"] = option("diagonal", "the model of CMA-ES")
+    optimiser: str = option("cma", "what asks for candidates: cma, cmaes-lra, cmaes-sep, or yours as module:attribute")
+    optimiser_options: tuple[str, ...] = option((), "the optimiser's own options, each as name=value")
+    covariance: Literal["diagonal", "full"] = option("diagonal", "the model of CMA-ES; an option of cma")
     racing: bool = option(False, "let only the better half of the candidates drive the second half of the episodes")
     horizon: int = option(1000, "steps of a scored episode at most")
     patience: int = option(0, "cut a scored episode after so many steps without reward; 0: never")
@@ -80,7 +82,7 @@ class RunConfig:
     def settings(self, bundle: Bundle | None) -> RunSettings:
         """What the journal keeps: the bundle by its hash, or what a task that needs none says of itself."""
         spec, shape, packages = self._described() if bundle is None else self._on(bundle)
-        return RunSettings(
+        settings = RunSettings(
             task=spec,
             packages=packages,
             controller=shape,
@@ -96,7 +98,11 @@ class RunConfig:
             collect_every=self.collect_every,
             collect_episodes=self.collect_episodes,
             heat=self.heat,
+            optimiser=self.optimiser,
+            optimiser_options=tuple(filter(None, self.optimiser_options)),
         )
+        _try_optimiser(settings)
+        return settings
 
     @property
     def _hidden(self) -> int:
@@ -139,6 +145,13 @@ def _argument(text: str) -> tuple[str, Any]:
         return name, json.loads(value)
     except ValueError:
         return name, value
+
+
+def _try_optimiser(settings: RunSettings) -> None:
+    """Build the run's optimiser once, so that what it cannot do is said before there is a run."""
+    from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig  # heavy: `--help` reads this module too
+
+    Evolution(EvolutionConfig.of(settings))
 
 
 def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:

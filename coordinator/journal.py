@@ -21,7 +21,7 @@ from dreamfleet.common import schema
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.messages import Job, Result
 from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, RunSettings, StoredEvaluation, StoredGeneration
-from dreamfleet.coordinator.cma_state import Checkpoint
+from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.collection import Collection
 from dreamfleet.coordinator.evaluation import Evaluation
 

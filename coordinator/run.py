@@ -50,12 +50,7 @@ class Run:
         self.history = History(closed)
         self.slack = Slack(journal, settings, self.uid, self.history, evaluations)
         self.exchange = Exchange(journal, self.incarnation, fleet, self.slack, self._score)
-        self._evolution = Evolution(
-            EvolutionConfig(
-                settings.controller.size, settings.population, settings.sigma0, settings.covariance, settings.seed
-            ),
-            start.mean if start else None,
-        )
+        self._evolution = Evolution(EvolutionConfig.of(settings), start.mean if start else None)
         if start:
             journal.set_fact("start", start.source)
         checks = self.slack.evaluations.finished

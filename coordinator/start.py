@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import ControllerError, DreamfleetError
 from dreamfleet.common.runs import RunFolder, RunSettings, open_run
 from dreamfleet.common.shelf import find_controller
-from dreamfleet.coordinator import cma_state
+from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.config import RunConfig
 
 
@@ -70,8 +70,9 @@ def start_of(stored: RunFolder) -> Start:
 
 
 def latest(stored: RunFolder) -> tuple[NDArray[np.float64], float]:
-    """Mean and step size of a run's latest generation."""
+    """Mean and step size of a run's latest generation, whichever optimiser wrote them."""
     state = stored.strategy_state()
     if state is None:
         raise DreamfleetError(f"run {stored.name} has no generation yet")
-    return cma_state.mean_and_sigma(cma_state.unpack(state))
+    head = Checkpoint.unpack(state).head
+    return head.mean, head.sigma

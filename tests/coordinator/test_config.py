@@ -82,3 +82,33 @@ def test_heat_that_cannot_raise_a_temperature_is_refused(changes, says):
 def test_a_hidden_layer_has_units():
     with pytest.raises(UsageError, match="hidden-units"):
         RunConfig(hidden_units=0)
+
+
+def test_an_optimiser_is_journalled_and_can_be_configured_again(random_bundle):
+    config = RunConfig(
+        optimiser="tests.support.optimisers:ParentsAndChildren", optimiser_options=("parents=2", ""), features="z"
+    )
+    settings = config.settings(random_bundle)
+    assert settings.optimiser_options == ("parents=2",)
+    assert RunSettings.from_json(settings.to_json()) == settings
+    assert RunConfig(**settings_of(settings, random_bundle.path)).settings(random_bundle) == settings
+
+
+def test_a_run_that_says_nothing_of_optimisers_keeps_the_words_of_the_first_version(random_bundle):
+    text = json.loads(RunConfig().settings(random_bundle).to_json())
+    assert not {"optimiser", "optimiser_options"} & text.keys()
+    assert RunSettings.from_json(json.dumps(text)).optimiser == "cma"
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"optimiser": "cmea"}, "unknown optimiser 'cmea'"),
+        ({"optimiser": "cmaes-sep", "covariance": "full"}, "give --covariance diagonal"),
+        ({"optimiser_options": ("restarts=3",)}, "has no option 'restarts', it knows: covariance"),
+        ({"population": 2}, "at least 3 for 867 parameters"),
+    ],
+)
+def test_what_an_optimiser_cannot_do_is_refused_before_there_is_a_run(random_bundle, changes, says):
+    with pytest.raises(UsageError, match=says):
+        RunConfig(**changes).settings(random_bundle)

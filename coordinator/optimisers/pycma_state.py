@@ -8,14 +8,14 @@ continued and uninterrupted runs for each covariance model.
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dreamfleet.coordinator.optimisers.scalars import SCALARS, tag, untag
 
 # Not state: options and callbacks come from the constructor; the clock, the logger, archives and the last population
 # with its fitness, which are large, change no sample.
@@ -25,20 +25,8 @@ _SKIPPED = frozenset({
     "_parameters", "params", "more_to_write", "best", "ary", "pop_sorted", "_is_independent_sample",
     "fit.fit", "fit.bndpen",
 })  # fmt: skip
-_SCALARS = (bool, int, float, str, type(None), np.bool_, np.integer, np.floating)
 _MAX_DEPTH = 6
 _MISSING = object()
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """A strategy's state; to pack it takes a while, which can be left for later."""
-
-    arrays: dict[str, NDArray[Any]]
-
-    def packed(self) -> bytes:
-        """As one `.npz`."""
-        return pack(self.arrays)
 
 
 def dump(strategy: Any) -> dict[str, NDArray[Any]]:
@@ -54,12 +42,12 @@ def dump(strategy: Any) -> dict[str, NDArray[Any]]:
                 if isinstance(item, np.ndarray):
                     arrays[f"{path}.{index}"] = item.copy()
         else:
-            about[path] = _tag(value)
+            about[path] = tag(value)
     arrays["about"] = np.array(json.dumps(about, sort_keys=True))
     return arrays
 
 
-def restore(strategy: Any, arrays: dict[str, NDArray[Any]]) -> None:
+def restore(strategy: Any, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Put the leaves back into a strategy built with the same options; `KeyError` if it is of another shape."""
     about = json.loads(str(arrays["about"]))
     written: dict[int, bytes] = {}
@@ -69,28 +57,9 @@ def restore(strategy: Any, arrays: dict[str, NDArray[Any]]) -> None:
             _assign(owner, name, _value(path, about, arrays), written)
 
 
-def mean_and_sigma(arrays: dict[str, NDArray[Any]]) -> tuple[NDArray[np.float64], float]:
-    """The distribution's mean `(dimension,)` and its overall step size."""
-    about = json.loads(str(arrays["about"]))
-    return arrays["mean"].astype(np.float64), float(_untag(about["sigma"]))
-
-
-def untold(arrays: dict[str, NDArray[Any]]) -> bool:
+def untold(arrays: Mapping[str, NDArray[Any]]) -> bool:
     """Whether the strategy was never told anything: it lacks the parts that the first tell makes."""
-    return int(_untag(json.loads(str(arrays["about"]))["countiter"])) == 0
-
-
-def pack(arrays: dict[str, NDArray[Any]]) -> bytes:
-    """Arrays as one `.npz`."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # type: ignore[arg-type]
-    return buffer.getvalue()
-
-
-def unpack(data: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays of `pack`; never pickle."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-        return dict(archive)
+    return int(untag(json.loads(str(arrays["about"]))["countiter"])) == 0
 
 
 def _leaves(value: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any, str, Any]]:
@@ -107,36 +76,21 @@ def _leaves(value: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str,
 
 def _is_leaf(value: Any) -> bool:
     if type(value) in (list, range):  # the indices of mirrored samples are a range
-        return all(isinstance(item, (*_SCALARS, np.ndarray)) for item in value)
-    return isinstance(value, _SCALARS) or type(value) is np.ndarray
+        return all(isinstance(item, (*SCALARS, np.ndarray)) for item in value)
+    return isinstance(value, SCALARS) or type(value) is np.ndarray
 
 
 def _tag(value: Any) -> list[Any]:
-    """A scalar with its type, so that a NumPy number comes back as one; floats as hexadecimal, to the bit."""
-    if isinstance(value, np.ndarray):
-        return ["array"]
-    if isinstance(value, (float, np.floating)):
-        return [type(value).__name__, float(value).hex()]
-    if isinstance(value, (np.integer, np.bool_)):
-        return [type(value).__name__, value.item()]
-    return ["plain", value]
+    return ["array"] if isinstance(value, np.ndarray) else tag(value)
 
 
-def _untag(tag: list[Any]) -> Any:
-    kind, value = tag
-    if kind == "plain":
-        return value
-    number = float.fromhex(value) if isinstance(value, str) else value
-    return number if kind == "float" else np.dtype(kind.rstrip("_")).type(number)
-
-
-def _value(path: str, about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Any:
+def _value(path: str, about: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Any:
     if path not in about:
         return arrays[path].copy()
     if about[path][0] != "list":
-        return _untag(about[path])
+        return untag(about[path])
     tags = about[path][2]
-    return [arrays[f"{path}.{i}"].copy() if tag == ["array"] else _untag(tag) for i, tag in enumerate(tags)]
+    return [arrays[f"{path}.{i}"].copy() if tag == ["array"] else untag(tag) for i, tag in enumerate(tags)]
 
 
 def _owner(strategy: Any, path: str) -> tuple[Any, str]:

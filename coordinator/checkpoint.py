@@ -1,0 +1,60 @@
+"""An optimiser's state as a run's journal keeps it: its arrays under a head that says whose they are."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.errors import JournalError
+from dreamfleet.coordinator.optimisers.api import State
+from dreamfleet.coordinator.optimisers.scalars import untag
+
+PREFIX = "optimiser."
+
+
+@dataclass(frozen=True)
+class Head:
+    """Which optimiser wrote a state with what installed, its mean `(dimension,)` and its step size."""
+
+    name: str
+    requirement: str
+    mean: NDArray[np.float64]
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A state between tell and ask; to pack it takes a while, which can be left for later."""
+
+    head: Head
+    state: State
+
+    def packed(self) -> bytes:
+        """As one `.npz`."""
+        head = {PREFIX + name: np.array(value) for name, value in vars(self.head).items()}
+        buffer = io.BytesIO()
+        np.savez(buffer, **self.state, **head)  # type: ignore[arg-type]
+        return buffer.getvalue()
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Checkpoint:
+        """Read what `packed` wrote, also of version 0.1; never pickle."""
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            arrays = dict(archive)
+        head = {name: arrays.pop(name) for name in [*arrays] if name.startswith(PREFIX)}
+        if not head:
+            return cls(_first_head(arrays), arrays)
+        name, requirement, mean, sigma = (head[PREFIX + each] for each in ("name", "requirement", "mean", "sigma"))
+        return cls(Head(str(name), str(requirement), mean, float(sigma)), arrays)
+
+
+def _first_head(arrays: State) -> Head:
+    """The head of a state of version 0.1, which had pycma alone; takes its own words out of the arrays."""
+    if "cma" not in arrays:
+        raise JournalError("the journal's last state is damaged: it does not say which optimiser wrote it")
+    sigma = untag(json.loads(str(arrays["about"]))["sigma"])
+    return Head("cma", f"cma=={arrays.pop('cma')}", arrays["mean"].astype(np.float64), float(sigma))

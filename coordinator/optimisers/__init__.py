@@ -1,0 +1,1 @@
+"""What decides which candidates to try: each optimiser is a class behind one contract, found by its name."""

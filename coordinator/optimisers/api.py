@@ -1,0 +1,83 @@
+"""What an optimiser is: it asks for candidates, is told their fitness, and its state continues to the bit.
+
+The only module that a third party imports. Register a class under the entry-point group `dreamfleet.optimisers`, or
+name it as `module:attribute`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.errors import UsageError
+
+State = dict[str, NDArray[Any]]
+"""Named arrays of numbers or text, never of objects; names that begin with `optimiser.` belong to the coordinator."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """What an optimiser is built from.
+
+    `mean` `(dimension,)` is where it begins, `sigma0` its first step size, `population` the candidates that every `ask`
+    returns, `seed` a number of at least 0 from which all its randomness follows, and `options` what the user gave.
+    """
+
+    mean: NDArray[np.float64]
+    population: int
+    sigma0: float
+    seed: int
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def dimension(self) -> int:
+        """Parameters of a candidate."""
+        return len(self.mean)
+
+    def choice(self, option: str, *known: str) -> str:
+        """The option's value, the first of `known` where it was not given; `UsageError` for any other."""
+        value = self.options.get(option, known[0])
+        if value not in known:
+            raise UsageError(f"option {option} must be one of {', '.join(known)}, not {value!r}")
+        return value
+
+
+class Optimiser(Protocol):
+    """Maximises fitness. The coordinator calls `ask` and `tell` in turn, and `state` only after `tell`.
+
+    `requirement` is what pip installs to get these very bits, such as "cma==4.5.0". A state names it, and is continued
+    by the same one alone. `options` says which options there are, and what each takes.
+    """
+
+    requirement: ClassVar[str]
+    options: ClassVar[Mapping[str, str]]
+
+    def __init__(self, search: Search) -> None:
+        """Begin; `UsageError` for what this optimiser cannot do, before a run exists."""
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """The best guess `(dimension,)`: what is evaluated and reported, and where a fork begins."""
+
+    @property
+    def sigma(self) -> float:
+        """The overall step size: what is shown, and what a fork begins with."""
+
+    def ask(self) -> NDArray[np.float64]:
+        """The next population `(population, dimension)`; every number is finite."""
+
+    def tell(self, fitness: NDArray[np.float64]) -> None:
+        """Learn from the population asked for: `fitness` `(population,)` in its order, finite, larger is better."""
+
+    def prepare(self) -> None:
+        """Work ahead while workers are busy, if there is anything to do; called any number of times, changes no bit."""
+
+    def state(self) -> State:
+        """Everything that the next `ask` and all that follows depend on; arrays that nobody changes later."""
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from what `state` gave to an optimiser of an equal `Search`, but for its `mean`."""

@@ -1,0 +1,101 @@
+"""CMA-ES by Hansen's own library, pycma, with a full or a diagonal covariance matrix."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any, ClassVar
+
+import cma
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.coordinator.optimisers import pycma_state
+from dreamfleet.coordinator.optimisers.api import Search, State
+from dreamfleet.coordinator.optimisers.normals import Normals
+
+
+class Pycma:
+    """CMA-ES (Hansen 2016, arXiv:1604.00772, algorithm of appendix A) over the whole covariance matrix or its diagonal.
+
+    The diagonal alone (Ros and Hansen 2008, "A Simple Modification in CMA-ES Achieving Linear Time and Space
+    Complexity") has n numbers to learn instead of n squared, and costs as little. From 300 parameters on pycma adapts
+    the step size by two points along the last step (Hansen 2008, arXiv:0805.0231) instead of by the evolution path
+    (equations 43 and 44).
+
+    >>> optimiser = Pycma(Search(mean=np.zeros(3), population=4, sigma0=0.1, seed=1, options={"covariance": "full"}))
+    >>> candidates = optimiser.ask()
+    >>> optimiser.tell(-np.square(candidates - 1).sum(axis=1))
+    """
+
+    requirement: ClassVar[str] = f"cma=={version('cma')}"
+    options: ClassVar[Mapping[str, str]] = {"covariance": "diagonal or full; also as --covariance"}
+
+    def __init__(self, search: Search) -> None:
+        self._search = search
+        self._diagonal = search.choice("covariance", "diagonal", "full") == "diagonal"
+        self._refuse_too_few_candidates()
+        self._normals = Normals(search.seed)
+        self._asked: list[NDArray[np.float64]] = []
+        self._begin(search.mean)
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """The distribution's mean `(dimension,)`."""
+        return np.asarray(self._strategy.mean, dtype=np.float64).copy()
+
+    @property
+    def sigma(self) -> float:
+        """The overall step size."""
+        return float(self._strategy.sigma)
+
+    def ask(self) -> NDArray[np.float64]:
+        """Sample the next population `(population, dimension)` (equations 38 to 40)."""
+        self._asked = [np.asarray(x, dtype=np.float64) for x in self._strategy.ask()]
+        return np.stack(self._asked)
+
+    def tell(self, fitness: NDArray[np.float64]) -> None:
+        """Update mean, step size and covariance (equations 41 to 47)."""
+        self._strategy.tell(self._asked, [-float(value) for value in fitness])
+        self._asked = []
+
+    def prepare(self) -> None:
+        """Draw the normals of the next `ask`, which do not depend on `tell`."""
+        self._normals.draw_ahead(self._search.population, self._search.dimension)
+
+    def state(self) -> State:
+        """The leaves of pycma's objects, and the generator's state."""
+        return {**pycma_state.dump(self._strategy), "random": np.array(json.dumps(self._normals.state))}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a `state`."""
+        arrays = dict(state)
+        random = json.loads(str(arrays.pop("random")))
+        self._begin(arrays["mean"].astype(np.float64))
+        if not pycma_state.untold(arrays):
+            # pycma builds some of its parts at the first ask and tell; they must be there to be overwritten.
+            self.ask()
+            self.tell(np.arange(self._search.population, dtype=np.float64))
+            pycma_state.restore(self._strategy, arrays)
+        self._normals.state = random
+
+    def _begin(self, mean: NDArray[np.float64]) -> None:
+        options = {
+            "popsize": self._search.population,
+            "CMA_diagonal": self._diagonal,
+            "seed": np.nan,  # leave NumPy's global source alone: a number here would make continuation inexact
+            "randn": self._normals,
+            "verbose": -9,
+        }
+        self._strategy = cma.CMAEvolutionStrategy(mean, self._search.sigma0, options)
+
+    def _refuse_too_few_candidates(self) -> None:
+        """Two-point step sizes put two candidates on the last step, and populations below 6 hold a mirrored one too."""
+        two_point = self._search.dimension >= cma.evolution_strategy.TPA_dimension
+        if two_point and self._search.population < 3:
+            raise UsageError(
+                f"cma needs a population of at least 3 for {self._search.dimension} parameters, not "
+                f"{self._search.population}: give --population"
+            )

@@ -1,0 +1,64 @@
+"""Optimisers by name: those registered under the entry-point group, and any as `module:attribute`."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Mapping
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.coordinator.optimisers.api import Optimiser, Search
+
+GROUP = "dreamfleet.optimisers"
+_OF_CLASS = tuple(Optimiser.__annotations__)
+_OF_INSTANCE = tuple(name for name in vars(Optimiser) if not name.startswith("_"))
+
+
+def known_optimisers() -> tuple[str, ...]:
+    """Names of the registered optimisers."""
+    return tuple(sorted(point.name for point in entry_points(group=GROUP)))
+
+
+def build_optimiser(name: str, search: Search) -> Optimiser:
+    """The optimiser `name`; `UsageError` if it is unknown, incomplete, lacks an option, or cannot do this search."""
+    kind = _find(name)
+    _refuse_incomplete(name, kind, _OF_CLASS)
+    _refuse_unknown_options(name, kind.options, search.options)
+    try:
+        inspect.signature(kind).bind(search)
+    except TypeError as error:
+        raise UsageError(f"optimiser {name!r} must be built from one Search: {error}") from error
+    optimiser: Optimiser = kind(search)
+    _refuse_incomplete(name, optimiser, _OF_INSTANCE)
+    return optimiser
+
+
+def _find(name: str) -> Any:
+    for point in entry_points(group=GROUP):
+        if point.name == name:
+            return point.load()
+    module, _, attribute = name.partition(":")
+    if not attribute:
+        known = ", ".join(known_optimisers()) or "none"
+        raise UsageError(f"unknown optimiser {name!r}: known are {known}, and your own as module:attribute")
+    try:
+        return getattr(import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"optimiser {name!r} cannot be loaded: {error}") from error
+
+
+def _refuse_incomplete(name: str, what: object, wanted: Iterable[str]) -> None:
+    missing = [each for each in wanted if not hasattr(what, each)]
+    if missing:
+        raise UsageError(
+            f"optimiser {name!r} lacks {', '.join(missing)}: dreamfleet.coordinator.optimisers.api says what each is"
+        )
+
+
+def _refuse_unknown_options(name: str, known: Mapping[str, str], given: Mapping[str, str]) -> None:
+    for option in given.keys() - known.keys():
+        knows = "; ".join(f"{each} ({text})" for each, text in known.items()) or "none"
+        drop = "--covariance diagonal" if option == "covariance" else "--optimiser-options without it"
+        raise UsageError(f"optimiser {name!r} has no option {option!r}, it knows: {knows}; give {drop}")

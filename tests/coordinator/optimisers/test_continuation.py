@@ -1,0 +1,147 @@
+"""Every optimiser that ships, and one of a third party, against the same contract."""
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.errors import JournalError
+from dreamfleet.coordinator.checkpoint import Checkpoint
+from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.optimisers.registry import known_optimisers
+
+OWN = "tests.support.optimisers:ParentsAndChildren"
+OPTIMISERS = [(name, "diagonal") for name in (*known_optimisers(), OWN)] + [("cma", "full")]
+SIZES = [(2, 4), (3, 64), (12, 5), (31, 7), (50, 16)]
+EVERY_OPTIMISER = pytest.mark.parametrize(("optimiser", "covariance"), OPTIMISERS)
+
+
+def config(optimiser, covariance="diagonal", dimension=12, population=8):
+    return EvolutionConfig(dimension, population, 0.1, covariance, 3, optimiser)
+
+
+def fitness(candidates, generation):
+    noise = np.random.default_rng(generation).normal(size=len(candidates))
+    return -((candidates - 1.0) ** 2).sum(axis=1) + 0.1 * noise
+
+
+def step(evolution, generation):
+    asked = evolution.ask()
+    evolution.tell(fitness(asked, generation))
+    return asked
+
+
+def continued(setting, state):
+    evolution = Evolution(setting)
+    evolution.restore(state)
+    return evolution
+
+
+def assert_continues(setting, checkpoints, generations):
+    """From each checkpoint to the end: the populations, means, step sizes and last state are the same bits."""
+    uninterrupted, states, asked = Evolution(setting), {}, []
+    for generation in range(generations):
+        if generation in checkpoints:
+            states[generation] = uninterrupted.state().packed()
+        asked.append(step(uninterrupted, generation))
+    for checkpoint, state in states.items():
+        again = continued(setting, state)
+        for generation in range(checkpoint, generations):
+            assert np.array_equal(step(again, generation), asked[generation]), (checkpoint, generation)
+        assert np.array_equal(again.mean, uninterrupted.mean)
+        assert again.sigma == uninterrupted.sigma
+        assert again.state().packed() == uninterrupted.state().packed()
+
+
+@EVERY_OPTIMISER
+@pytest.mark.parametrize(("dimension", "population"), SIZES)
+def test_it_asks_the_same_bits_whether_it_was_interrupted_or_not(optimiser, covariance, dimension, population):
+    assert_continues(config(optimiser, covariance, dimension, population), (0, 1, 2, 7, 30), 40)
+
+
+@EVERY_OPTIMISER
+def test_it_can_be_interrupted_between_any_two_generations(optimiser, covariance):
+    setting = config(optimiser, covariance)
+    uninterrupted, interrupted = Evolution(setting), Evolution(setting)
+    for generation in range(60):
+        step(uninterrupted, generation)
+        interrupted = continued(setting, interrupted.state().packed())
+        step(interrupted, generation)
+    assert interrupted.state().packed() == uninterrupted.state().packed()
+
+
+@pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep", OWN])
+@pytest.mark.parametrize(("dimension", "population"), [(299, 4), (300, 4), (867, 16), (900, 64)])
+def test_it_continues_at_the_real_size(optimiser, dimension, population):
+    assert_continues(config(optimiser, "diagonal", dimension, population), (0, 1, 5), 8)
+
+
+@pytest.mark.parametrize("optimiser", ["cma", "cmaes-lra"])
+def test_a_full_matrix_continues_at_hundreds_of_parameters(optimiser):
+    assert_continues(config(optimiser, "full" if optimiser == "cma" else "diagonal", 300, 4), (0, 2), 4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("optimiser", ["cma", "cmaes-lra"])
+@pytest.mark.timeout(600)
+def test_a_full_matrix_continues_at_the_real_size(optimiser):
+    assert_continues(config(optimiser, "full" if optimiser == "cma" else "diagonal", 867, 16), (0, 2), 4)
+
+
+@EVERY_OPTIMISER
+def test_it_maximises_and_the_seed_makes_its_run(optimiser, covariance):
+    one, same = (Evolution(config(optimiser, covariance)) for _ in range(2))
+    first = fitness(one.mean[None], 0)
+    for generation in range(200):
+        assert np.array_equal(step(one, generation), step(same, generation))
+    assert fitness(one.mean[None], 0) > first + 5
+    other = Evolution(EvolutionConfig(12, 8, 0.1, covariance, 4, optimiser))
+    assert not np.array_equal(other.ask(), Evolution(config(optimiser, covariance)).ask())
+
+
+@EVERY_OPTIMISER
+def test_it_begins_where_it_is_told_to(optimiser, covariance):
+    start = np.linspace(-3, 3, 12)
+    evolution = Evolution(config(optimiser, covariance), start)
+    assert np.array_equal(evolution.mean, start)
+    again = continued(config(optimiser, covariance), evolution.state().packed())
+    assert np.array_equal(again.mean, start)
+    assert np.array_equal(again.ask(), evolution.ask())
+    step(evolution, 0)
+    assert np.array_equal(start, np.linspace(-3, 3, 12)), "a start belongs to whoever gave it"
+
+
+@EVERY_OPTIMISER
+def test_working_ahead_changes_no_bit(optimiser, covariance):
+    ahead, plain = (Evolution(config(optimiser, covariance)) for _ in range(2))
+    for generation in range(5):
+        ahead.prepare()
+        ahead.prepare()
+        assert ahead.state().packed() == plain.state().packed()
+        assert np.array_equal(step(ahead, generation), step(plain, generation))
+
+
+@EVERY_OPTIMISER
+def test_a_state_is_arrays_without_pickle_and_tells_mean_and_step_size(optimiser, covariance):
+    evolution = Evolution(config(optimiser, covariance))
+    step(evolution, 0)
+    kept = evolution.state()
+    step(evolution, 1)
+    read = Checkpoint.unpack(kept.packed())
+    assert all(not array.dtype.hasobject for array in read.state.values())
+    assert (read.head.name, read.head.sigma) == (optimiser, kept.head.sigma)
+    assert np.array_equal(read.head.mean, kept.head.mean)
+    assert not np.array_equal(read.head.mean, evolution.mean), "what was kept stays as it was"
+
+
+@EVERY_OPTIMISER
+def test_a_state_of_another_version_is_refused_with_the_remedy(optimiser, covariance):
+    evolution = Evolution(config(optimiser, covariance))
+    kept = evolution.state()
+    older = f"{kept.head.requirement.split('==')[0]}==0.0.1"
+    changed = Checkpoint(type(kept.head)(optimiser, older, kept.head.mean, kept.head.sigma), kept.state)
+    with pytest.raises(JournalError, match=f"pip install {older}"):
+        evolution.restore(changed.packed())
+
+
+def test_a_state_of_another_optimiser_is_refused():
+    with pytest.raises(JournalError, match="written by optimiser 'cmaes-sep', not by 'cma'"):
+        Evolution(config("cma")).restore(Evolution(config("cmaes-sep")).state().packed())
