@@ -1,0 +1,57 @@
+"""`doctor` in an installation that has no more than a coordinator needs, put together from links."""
+
+import json
+import os
+import subprocess
+import sys
+from importlib.metadata import distribution
+
+import pytest
+
+from tests.support.processes import ROOT, environment
+
+COORDINATOR = ("cma", "eclipse-zenoh", "msgpack", "numpy", "rich", "pygments", "markdown-it-py", "mdurl", "dreamfleet")
+
+
+def top_of(name):
+    found = distribution(name)
+    files = found.files or []
+    tops = {file.parts[0] for file in files if ".." not in file.parts and not file.parts[0].startswith("__")}
+    return [found.locate_file(top) for top in tops]
+
+
+@pytest.fixture
+def bare(tmp_path):
+    """A folder of links to the coordinator's packages alone."""
+    site = tmp_path / "site"
+    site.mkdir()
+    for name in COORDINATOR:
+        for path in top_of(name):
+            (site / path.name).symlink_to(path)
+    return site
+
+
+def doctor(bare, tmp_path, *words):
+    seen = {**environment(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join([str(bare), str(ROOT)])}
+    command = [sys.executable, "-S", "-P", "-m", "dreamfleet", "doctor", *words]
+    done = subprocess.run(command, env=seen, capture_output=True, text=True, check=False, timeout=60)
+    assert not done.stderr, done.stderr
+    return done.returncode, done.stdout
+
+
+def test_it_says_of_each_role_whether_it_can_be_played_and_the_whole_remedy(bare, tmp_path):
+    code, out = doctor(bare, tmp_path)
+    assert code == 0
+    assert "coordinator\tcan be played" in out
+    assert "worker\tcannot be played: gymnasium, pygame-ce, box2d, onnxruntime missing" in out
+    assert "pip install 'dreamfleet[worker]'" in out
+
+
+@pytest.mark.parametrize(("role", "code"), [("coordinator", 0), ("worker", 1), ("views", 1), ("train", 1)])
+def test_its_exit_code_is_of_the_role_that_is_asked_about(bare, tmp_path, role, code):
+    left, out = doctor(bare, tmp_path, "--role", role, "--json")
+    report = json.loads(out)
+    assert left == code
+    assert report["ok"] is (code == 0)
+    assert report["roles"]["coordinator"]
+    assert not report["roles"]["worker"]

@@ -1,0 +1,20 @@
+"""Two kinds of presets share some names: every message says which kind it speaks of."""
+
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.presets import NAMES, check_preset
+from dreamfleet.coordinator import config
+from dreamfleet.worker.training import presets
+
+
+def test_the_names_are_those_that_each_side_has_settings_for():
+    assert set(NAMES["run"]) == set(config.PRESETS)
+    assert set(NAMES["training"]) == set(presets.PRESETS)
+
+
+def test_a_name_of_the_other_kind_is_told_apart():
+    with pytest.raises(UsageError, match=r"unknown run preset 'notebook'.*'notebook' is a preset of training"):
+        check_preset("run", "notebook")
+    with pytest.raises(UsageError, match=r"unknown training preset 'dream'.*'dream' is a preset of run"):
+        presets.find_preset("dream")

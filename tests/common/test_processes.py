@@ -1,0 +1,47 @@
+"""Our own verbs as processes."""
+
+import pytest
+
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.processes import Child, call
+from tests.support import tasks
+
+CHATTER = ("sh", "-c", 'yes out | head -c 300000; yes err | head -c 300000 >&2; exec "$@"', "sh")
+
+
+def test_a_child_that_says_much_waits_for_no_reader():
+    with Child("--version", inside=CHATTER) as child:
+        code, out = child.finish(60)
+    assert code == 0
+    assert "dreamfleet 0." in out
+    assert "err\n" in child.lines
+
+
+def test_a_module_in_the_current_folder_is_never_taken_for_ours(tmp_path, monkeypatch):
+    for name in ("dreamfleet.py", "argparse.py", "zenoh.py"):
+        (tmp_path / name).write_text("raise SystemExit('hostile')\n")
+    monkeypatch.chdir(tmp_path)
+    with Child("--version") as child:
+        assert child.finish(60)[0] == 0, child.lines
+
+
+def test_a_child_is_asked_to_leave_before_it_is_ended(processes, random_bundle):
+    words = ("coordinator", "--run", "asked", "--runs-dir", processes.runs, "--listen", processes.endpoint)
+    with Child(*words, "--bundle", random_bundle.path, "--task", tasks.TOY) as child:
+        child.wait_for("incarnation")
+    assert child.popen.returncode == 130
+    assert "left run asked open" in child.lines[-1]
+
+
+def test_words_go_to_a_log_where_one_is_named(tmp_path):
+    log = tmp_path / "new" / "child.log"
+    with Child("runs", "show", "absent", "--runs-dir", tmp_path, log=log) as child:
+        assert child.finish(60) == (1, "")
+    assert child.last_words().startswith("no run 'absent'")
+
+
+def test_what_is_not_said_is_an_error_and_no_endless_wait(tmp_path):
+    with Child("runs", "list", "--runs-dir", tmp_path) as child, pytest.raises(DreamfleetError, match="ended before"):
+        child.wait_for("nothing of the kind")
+    with pytest.raises(DreamfleetError, match="dreamfleet runs failed"):
+        call("runs", "show", "absent", "--runs-dir", tmp_path)

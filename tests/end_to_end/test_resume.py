@@ -1,0 +1,127 @@
+"""A run that is continued: with what it had, by the words that it left, and on another host."""
+
+import json
+import shutil
+import signal
+import subprocess
+
+import pytest
+
+from dreamfleet.common.runs import open_run
+from tests.support import tasks
+from tests.support.processes import environment, free_port
+
+pytestmark = pytest.mark.timeout(120)
+
+
+@pytest.fixture
+def settings(random_bundle):
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+            "--task", tasks.SLOW_TOY)  # fmt: skip
+
+
+def history(folder, name="test"):
+    with open_run(folder, name) as run:
+        return [(each.number, each.mean, each.best, each.sigma) for each in run.history()]
+
+
+def stopped(processes, settings, *flags):
+    """A run that was stopped in its third generation, and what it said last."""
+    coordinator = processes.coordinator(*settings, *flags)
+    worker = processes.worker("--task", tasks.SLOW_TOY)
+    coordinator.wait_for("generation 1: mean")
+    coordinator.popen.send_signal(signal.SIGTERM)
+    assert coordinator.finish()[0] == 130
+    return worker, coordinator.lines[-1]
+
+
+def test_the_hint_of_a_run_that_was_left_is_a_whole_command_with_its_limits_and_its_network(processes, settings):
+    processes.runs = processes.folder / "all my runs"
+    worker, said = stopped(processes, settings, "--generations", 6, "--mixed")
+    command = said.split("continue it with: ")[1]
+    done = subprocess.run(
+        command, shell=True, env=environment(processes.cache), capture_output=True, check=False, text=True, timeout=100,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "ended after 6 generations" in done.stdout
+    assert worker.popen.poll() is None
+    with open_run(processes.runs, "test") as run:
+        assert json.loads(run.fact("limits")) == {"generations": 6}
+        assert json.loads(run.fact("network")) == {"listen": [processes.endpoint], "beat": 0.2, "mixed": True}
+
+
+def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept(processes, settings):
+    stopped(processes, settings, "--generations", 60, "--minutes", 30)
+    elsewhere = f"tcp/127.0.0.1:{free_port()}"
+    again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", elsewhere,
+                            "--generations", 3)  # fmt: skip
+    processes.worker("--task", tasks.SLOW_TOY, endpoint=elsewhere)
+    assert again.finish()[0] == 0
+    with open_run(processes.runs, "test") as run:
+        assert json.loads(run.fact("limits")) == {"generations": 3, "minutes": 30}
+        assert json.loads(run.fact("network")) == {"listen": [elsewhere], "beat": 0.2}
+    code, out, _ = processes.call("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--json")
+    assert code == 0
+    assert json.loads(out)["ended"] == "3 generations"
+
+
+def test_a_limit_that_has_passed_ends_at_once_and_names_no_controller_that_is_not_there(processes, settings):
+    stopped(processes, settings)
+    code, out, _ = processes.call(
+        "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--generations", 1
+    )  # fmt: skip
+    assert code == 0
+    path = processes.runs / "test" / "controller.npz"
+    assert ("controller: " in out) == path.exists()
+    assert "it goes on with wider limits" in out
+
+
+def test_a_run_moves_to_another_place_and_its_worker_follows(processes, settings):
+    """The worker is given both addresses; the folder is all that moves."""
+    whole = processes.coordinator(*settings, "--generations", 5, name="whole")
+    with_it = processes.worker("--task", tasks.SLOW_TOY, "--run", "whole")
+    assert whole.finish()[0] == 0
+    with_it.end()
+
+    first, second = processes.endpoint, f"tcp/127.0.0.1:{free_port()}"
+    parts = processes.coordinator(*settings, "--generations", 5, name="parts")
+    worker = processes.start("worker", "--connect", first, second, "--slots", 1, "--task", tasks.SLOW_TOY)
+    parts.wait_for("generation 1: mean")
+    parts.popen.send_signal(signal.SIGTERM)
+    assert parts.finish()[0] == 130
+    elsewhere = processes.folder / "elsewhere"
+    shutil.copytree(processes.runs / "parts", elsewhere / "parts")
+    again = processes.start("coordinator", "--resume", "parts", "--runs-dir", elsewhere, "--listen", second)
+    worker.wait_for("joined run parts again")
+    assert again.finish()[0] == 0
+    assert history(elsewhere, "parts") == history(processes.runs, "whole")
+
+
+def test_one_file_serves_coordinator_worker_and_status(processes, random_bundle):
+    path = processes.folder / "fleet.toml"
+    path.write_text(
+        f'connect = ["{processes.endpoint}"]\nlisten = ["{processes.endpoint}"]\nruns_dir = "{processes.runs}"\n'
+        f'[run]\npreset = "frugal"\nbundle = "{random_bundle.path}"\ntask = "{tasks.TOY}"\npopulation = 4\n'
+        "evaluate_every = 0\n[limits]\ngenerations = 2\n[worker]\nslots = 1\nexit_when_done = true\n"
+    )
+    coordinator = processes.start("coordinator", "--run", "filed", "--config", path)
+    coordinator.wait_for("incarnation")
+    code, out, err = processes.call("status", "--config", path, "--json")
+    assert code == 0, err
+    status = json.loads(out)
+    assert (status["run"], status["settings"]["population"], status["settings"]["episodes"]) == ("filed", 4, 2)
+    worker = processes.start("worker", "--config", path, "--task", tasks.TOY)
+    assert coordinator.finish()[0] == 0
+    assert worker.finish()[0] == 0
+    code, out, _ = processes.call("runs", "list", "--config", path)
+    assert "filed\t" in out
+
+
+def test_a_file_that_speaks_of_another_run_does_not_keep_this_one_from_going_on(processes, settings):
+    stopped(processes, settings, "--generations", 3)
+    path = processes.folder / "fleet.toml"
+    path.write_text("[run]\npopulation = 64\nepisodes = 2\n")
+    again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--config", path)
+    again.wait_for("population is 4 in run test, which keeps it; the settings say 64")
+    assert again.finish()[0] == 0
+    assert not any("episodes is" in line for line in again.lines)
