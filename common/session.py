@@ -8,38 +8,16 @@ from __future__ import annotations
 
 import json
 import queue
-import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import zenoh
 
-from dreamfleet.common.errors import ConnectionFailedError, UsageError
+from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.network import Network, check_endpoint
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LEASE_MS = 4000  # announced by each side: after so long without a sign the other side drops its token
-_ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[0-9a-fA-F:]+\]|[^:/\s]+):(\d{1,5})")
-
-
-@dataclass(frozen=True)
-class Network:
-    """Where to listen and what to connect to; endpoints such as `tcp/HOST:7447`."""
-
-    listen: tuple[str, ...] = ()
-    connect: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for endpoint in (*self.listen, *self.connect):
-            check_endpoint(endpoint)
-
-
-def check_endpoint(endpoint: str) -> str:
-    """Return `endpoint` if it is well formed, else raise `UsageError`."""
-    found = _ENDPOINT.fullmatch(endpoint)
-    if not found or int(found[3]) > 65535:
-        raise UsageError(f"{endpoint!r} is no endpoint: write it as tcp/HOST:PORT, such as {DEFAULT_ENDPOINT}")
-    return endpoint
+__all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_session"]  # an endpoint is of both
 
 
 def open_session(network: Network, *, timeout: float = 3.0) -> zenoh.Session:

@@ -17,7 +17,7 @@ from typing import Literal
 
 from dreamfleet.common.config import add_flags, load, option, read_toml
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.session import DEFAULT_ENDPOINT, check_endpoint
+from dreamfleet.common.network import DEFAULT_ENDPOINT, check_endpoint
 
 TABLES = ("run", "limits", "network", "worker", "demo")  # of every verb: one file serves all of them
 OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG")

@@ -12,8 +12,8 @@ from typing import Any
 
 from dreamfleet.common.config import Table, read_table
 from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.network import DEFAULT_ENDPOINT
 from dreamfleet.common.runs import RunFolder
-from dreamfleet.common.session import DEFAULT_ENDPOINT
 from dreamfleet.common.site import SiteConfig
 from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig
 

@@ -70,6 +70,14 @@ def test_every_verb_offers_the_file_and_what_is_logged():
         assert "--log-level" in text, name
 
 
+SILENT = {"demo", "worker"}  # these work for a person who watches, or for nobody
+
+
+def test_every_verb_that_answers_can_do_so_in_json():
+    verbs = {name: cli.parser_of(name, point.load()).format_help() for name, point in points().items()}
+    assert {name for name, text in verbs.items() if "--json" not in text} <= SILENT
+
+
 def test_a_verb_that_cannot_be_loaded_breaks_no_other(capsys, tmp_path):
     assert cli.run_verb(points(BROKEN), ["runs", "list", "--runs-dir", str(tmp_path)]) == 0
     with pytest.raises(SystemExit):

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.network import DEFAULT_ENDPOINT
 from dreamfleet.common.runs import RunFolder
-from dreamfleet.common.session import DEFAULT_ENDPOINT
 from dreamfleet.common.site import SiteConfig
 from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.journal import Journal

@@ -1,5 +1,6 @@
 """What people get wrong: one clear line that says what to do, an exit code that is not 0, nothing lost."""
 
+import json
 import socket
 from pathlib import Path
 
@@ -132,10 +133,18 @@ def test_a_run_is_listed_shown_archived_and_deleted(processes, random_bundle):
     assert "ended" in processes.call("runs", "list", *where)[1]
     assert "sigma0" in processes.call("runs", "show", "test", *where)[1]
     complains(processes, "runs", "delete", "test", *where, says="give --yes")
-    assert processes.call("runs", "archive", "test", *where)[0] == 0
+    _, shown, _ = processes.call("runs", "show", "test", *where)
+    assert f"task\t{tasks.TOY}" in shown
+    assert "task.bundle\t" + random_bundle.sha256 in shown
+    assert shown.count("\n0\t") == shown.count("\n1\t") == 1, "a line a generation"
+    code, out, _ = processes.call("runs", "archive", "test", *where, "--json")
+    assert (code, json.loads(out)["archived"]) == (0, str(processes.runs / "archive" / "test"))
     assert "no runs" in processes.call("runs", "list", *where)[2]
     assert "test" in processes.call("runs", "list", "--archived", *where)[1]
-    assert processes.call("runs", "delete", "test", "--yes", "--runs-dir", processes.runs / "archive")[0] == 0
+    archive = ("--runs-dir", processes.runs / "archive")
+    assert "test\t" in processes.call("runs", "list", *archive)[1]
+    code, out, _ = processes.call("runs", "delete", "test", "--yes", *archive, "--json")
+    assert (code, json.loads(out)["run"]) == (0, "test")
 
 
 def test_the_doctor_finds_this_installation_well(processes):

@@ -117,7 +117,7 @@ def test_a_worker_with_another_fingerprint_is_refused_with_the_remedy(processes,
     stranger.write_text(
         "import sys, dreamfleet.common.fingerprint, dreamfleet.worker.service.admission\n"
         "dreamfleet.worker.service.admission.fingerprint = lambda: 'riscv64 other'\n"
-        "from common.cli import main\nsys.exit(main(sys.argv[1:]))\n"
+        "from dreamfleet.common.cli import main\nsys.exit(main(sys.argv[1:]))\n"
     )
     command = [sys.executable, stranger, "worker", "--connect", processes.endpoint, "--task", tasks.SLOW_TOY]
     done = subprocess.run(
@@ -165,7 +165,7 @@ def test_pause_resume_and_drain_from_the_command_line(processes, settings):
         assert code == 0, err
         return out
 
-    assert "is paused" in say("pause")
+    assert json.loads(say("pause", "--json")) == {"run": "test", "asked": "pause", "accepted": True}
     assert processes.status()["state"] == "paused"
     assert "goes on" in say("resume", "test")
     coordinator.wait_for("generation", times=2)

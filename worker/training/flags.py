@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from dreamfleet.common.listing import add_json
 from dreamfleet.common.presets import preset_help
 from dreamfleet.worker.training.train_config import TrainConfig
 
@@ -22,6 +23,7 @@ def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> No
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--continue-from", type=Path, metavar="FILE", help="begin from this checkpoint's weights")
     parser.add_argument("--summary", action="store_true", help="print layers and parameters, and train nothing")
+    add_json(parser)
     for title, config in (
         ("training, instead of the preset's", TrainConfig),
         ("layers, instead of the preset's", layers),

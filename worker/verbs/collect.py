@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.presets import preset_help
 from dreamfleet.common.site import offer
 
@@ -25,6 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
     parser.add_argument("--from-run", metavar="RUN", help="drive nothing: take in what this run collected, each once")
     offer(parser, "runs_dir")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -44,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
         for count in collect(args.data, config, max(1, args.jobs)):
             frames, done = frames + count, done + 1
             bar.move(done)
-    print(f"{args.data}: {done} episodes, {frames} frames new; {config.episodes} episodes in all")
+    text = f"{args.data}: {done} episodes, {frames} frames new; {config.episodes} episodes in all"
+    answer(args, text, data=args.data, new_episodes=done, new_frames=frames, episodes=config.episodes)
     return 0
 
 
@@ -57,5 +60,6 @@ def _take_in(args: argparse.Namespace) -> int:
         if not drives:
             raise UsageError(f"run {args.from_run} has collected nothing: start a run with --collect-every")
     new = list(take_in(args.data, drives))
-    print(f"{args.data}: {len(new)} episodes, {sum(new)} frames new, of {len(drives)} that {args.from_run} collected")
+    text = f"{args.data}: {len(new)} episodes, {sum(new)} frames new, of {len(drives)} that {args.from_run} collected"
+    answer(args, text, data=args.data, new_episodes=len(new), new_frames=sum(new), collected=len(drives))
     return 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.listing import add_json, answer
 
 SUMMARY = "drive yourself by keyboard, on the track or in a world model's dream"
 EXTRAS = ("worker",)
@@ -21,6 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scale", type=float, help="enlarge the picture (default: a dream to 640 pixels, the track not)"
     )
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,5 +41,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         scene = Reality(config.steps)
     for driven in drive(scene, config):
-        print(f"score {driven.score:.1f} in {driven.steps} steps, seed {config.seed}", flush=True)
+        text = f"score {driven.score:.1f} in {driven.steps} steps, seed {config.seed}"
+        answer(args, text, score=driven.score, steps=driven.steps, seed=config.seed)
     return 0

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dreamfleet.common.listing import add_json, answer
+
 SUMMARY = "encode a data set's pictures with its trained VAE"
 EXTRAS = ("train",)
 
@@ -12,6 +14,7 @@ EXTRAS = ("train",)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -26,5 +29,5 @@ def run(args: argparse.Namespace) -> int:
         for done, count in enumerate(encode(args.data), start=1):
             frames += count
             bar.move(done)
-    print(f"{args.data}: {frames} frames encoded, each also mirrored")
+    answer(args, f"{args.data}: {frames} frames encoded, each also mirrored", data=args.data, new_frames=frames)
     return 0

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.seeds import VALIDATION
 from dreamfleet.common.site import offer
 
@@ -24,6 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=first, help=f"the track that is driven (default {first})")
     parser.add_argument("--steps", type=int, default=300, help="steps of the drive (default 300)")
     offer(parser, "runs_dir")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -38,5 +40,5 @@ def run(args: argparse.Namespace) -> int:
     with find_subject(args.subject, args.runs_dir) as subject, progress_bar("inspect", SECTIONS, "sections") as bar:
         page = inspect(subject, args.out, DriveConfig(args.seed, args.steps), args.data, bar.move)
         bar.move(SECTIONS)
-    print(page)
+    answer(args, str(page), page=page)
     return 0

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.seeds import TEST
 from dreamfleet.common.site import offer
 
@@ -23,6 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--temperature", type=float, default=1.0, help="of the dream beside the drive (default 1.0)")
     offer(parser, "runs_dir")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -43,5 +45,5 @@ def run(args: argparse.Namespace) -> int:
     bundle = bundle_for(controller, args.bundle, beside)
     with progress_bar("record", args.steps, "steps") as bar:
         score = record(controller, bundle, args.seed, args.steps, args.out, daydream, bar.move)
-    print(f"{args.out}: score {score:.1f} on track {args.seed}")
+    answer(args, f"{args.out}: score {score:.1f} on track {args.seed}", video=args.out, score=score, seed=args.seed)
     return 0

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from dreamfleet.common.listing import answer
+
 SUMMARY = "train the MDN-RNN on a data set, or go on with it"
 EXTRAS = ("train",)
 
@@ -34,5 +36,5 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar("MDN-RNN", config.updates, "updates") as bar:
         figures = train_mdnrnn(args.data, config, bar.move, layers, device_of(args.device), args.continue_from)
     record_quality(args.data, figures)
-    print("  ".join(f"{name} {value}" for name, value in figures.items()))
+    answer(args, "  ".join(f"{name} {value}" for name, value in figures.items()), **figures)
     return 0

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from dreamfleet.common.listing import answer
+
 SUMMARY = "train the VAE on a data set, or go on with it"
 EXTRAS = ("train",)
 
@@ -38,5 +40,5 @@ def run(args: argparse.Namespace) -> int:
         device, other = device_of(args.device), args.continue_from
         figures = train_vae(args.data, config, bar.move, layers, device, other, args.decoder_only)
     record_quality(args.data, figures)
-    print("  ".join(f"{name} {value}" for name, value in figures.items()))
+    answer(args, "  ".join(f"{name} {value}" for name, value in figures.items()), **figures)
     return 0

@@ -6,7 +6,7 @@ import argparse
 import signal
 
 from dreamfleet.common.config import add_flags, load
-from dreamfleet.common.session import Network
+from dreamfleet.common.network import Network
 from dreamfleet.common.site import offer
 from dreamfleet.worker.service.config import WorkerConfig
 

@@ -1,0 +1,31 @@
+"""Endpoints: where one side listens and the others connect. Knows no transport, so that every verb may read it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from dreamfleet.common.errors import UsageError
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+_ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[0-9a-fA-F:]+\]|[^:/\s]+):(\d{1,5})")
+
+
+@dataclass(frozen=True)
+class Network:
+    """Where to listen and what to connect to; endpoints such as `tcp/HOST:7447`."""
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for endpoint in (*self.listen, *self.connect):
+            check_endpoint(endpoint)
+
+
+def check_endpoint(endpoint: str) -> str:
+    """Return `endpoint` if it is well formed, else raise `UsageError`."""
+    found = _ENDPOINT.fullmatch(endpoint)
+    if not found or int(found[3]) > 65535:
+        raise UsageError(f"{endpoint!r} is no endpoint: write it as tcp/HOST:PORT, such as {DEFAULT_ENDPOINT}")
+    return endpoint
