@@ -25,7 +25,7 @@ from dreamfleet.common.errors import BundleError, ControllerError
 from dreamfleet.common.fields import OPTIONAL, written
 from dreamfleet.common.files import write_aside
 from dreamfleet.common.messages import Between, Word
-from dreamfleet.common.tensors import read_array, weights_finite
+from dreamfleet.common.tensors import is_empty, read_array, weights_finite
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -218,6 +218,10 @@ def hash_file(path: Path) -> str:
 
 def _look(path: Path, manifest: Manifest, name: str, data: bytes) -> None:
     """Refuse what would only show as nonsense while it is scored."""
+    if name.endswith(".onnx") and is_empty(data):
+        raise BundleError(
+            f"{path}: {name} is an empty graph; fetch the bundle again, or build it again from its models"
+        )
     if name.endswith(".onnx") and not weights_finite(data):
         raise BundleError(f"{path}: {name} has weights that are NaN or infinite; train the model again")
     if name != INITIAL:

@@ -35,6 +35,17 @@ def weights_finite(model: bytes) -> bool:
         return True
 
 
+def is_empty(model: bytes) -> bool:
+    """Whether an ONNX model computes nothing: it is no bytes at all, or a message without a node.
+
+    What is no message at all is not judged here; the runtime refuses it. GraphProto.node is field 1.
+    """
+    try:
+        return not any(True for graph in _messages(memoryview(model), 7) for _ in _messages(graph, 1))
+    except (IndexError, ValueError):
+        return False
+
+
 def read_array(data: bytes) -> NDArray[np.float32]:
     """A `.npy` of floats; `ValueError` if it is none."""
     array = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
@@ -61,6 +72,8 @@ def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
     while position < len(data):
         tag, position = _varint(data, position)
         number, kind = tag >> 3, tag & 7
+        if not number:
+            raise ValueError("not a message")
         if kind == _VARINT:
             value, position = _varint(data, position)
             yield number, value

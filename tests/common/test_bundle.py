@@ -2,11 +2,16 @@ import os
 import shutil
 import zipfile
 
+import onnx
 import pytest
 
 from dreamfleet.common.bundle import (
+    DECODER,
+    DREAM,
     ENCODER,
+    LINEAR,
     MANIFEST,
+    POLICY,
     Bundle,
     BundleStore,
     find_bundle,
@@ -106,6 +111,22 @@ def test_damage_is_one_clear_line(random_bundle, tmp_path, damage, said):
     with pytest.raises(BundleError, match=said) as error:
         Bundle.open(path)
     assert "\n" not in str(error.value)
+
+
+def without_nodes(part):
+    model = onnx.load_from_string(part)
+    del model.graph.node[:]
+    return model.SerializeToString()
+
+
+@pytest.mark.parametrize("name", [ENCODER, DECODER, POLICY, DREAM, LINEAR])
+@pytest.mark.parametrize(
+    "change", [lambda part: b"", without_nodes, lambda part: onnx.ModelProto().SerializeToString()]
+)
+def test_an_empty_graph_is_refused_by_its_name(random_bundle, tmp_path, name, change):
+    parts = parts_of(random_bundle)
+    with pytest.raises(BundleError, match=rf"b\.zip: {name} is an empty graph; .*build it again"):
+        write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, name: change(parts[name])})
 
 
 def test_a_missing_bundle_names_those_that_ship(tmp_path):
