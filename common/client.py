@@ -9,9 +9,9 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-import zenoh
 
 from dreamfleet.common import keys
+from dreamfleet.common.asking import ask_all
 from dreamfleet.common.codec import MalformedError, decode_json, from_plain
 from dreamfleet.common.controller import Controller, ControllerShape
 from dreamfleet.common.errors import ConnectionFailedError, ControllerError, RefusedError, UsageError
@@ -165,15 +165,7 @@ class Client:
         )
 
     def _ask(self, selector: str) -> list[dict[str, Any]]:
-        replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        done = object()
-        handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
-        self.session.get(selector, handler, timeout=QUERY_TIMEOUT)
-        documents = []
-        while (reply := replies.get()) is not done:
-            if reply.ok is not None:
-                documents.append(read_document(reply.ok.payload.to_bytes()))
-        return documents
+        return [read_document(payload) for payload in ask_all(self.session, [selector], QUERY_TIMEOUT)]
 
 
 def _controller(about: dict[str, Any], data: bytes) -> Controller:

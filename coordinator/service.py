@@ -44,7 +44,7 @@ from dreamfleet.common.status import PARTS
 from dreamfleet.coordinator import answers
 from dreamfleet.coordinator.fleet import Send
 from dreamfleet.coordinator.run import Run
-from dreamfleet.coordinator.status import Snapshot, left, take_snapshot
+from dreamfleet.coordinator.status import Snapshot, as_left, take_snapshot
 
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a loss waits to be acted upon
@@ -90,7 +90,7 @@ class Service:
             on_ready(self._run)
             self._loop(session)
             self._run.leave()
-            self._snapshot = left(self._take_snapshot())
+            self._snapshot = as_left(self._take_snapshot())
             for each in declared:
                 each.undeclare()
             farewell = answers.status(self._snapshot)

@@ -90,7 +90,7 @@ def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float
     return Snapshot(status, workers, run.history.view(), standing, run.last, run.slack.report.current)
 
 
-def left(snapshot: Snapshot) -> Snapshot:
+def as_left(snapshot: Snapshot) -> Snapshot:
     """The last snapshot of a coordinator that leaves its run open."""
     if snapshot.status.state == "ended":
         return snapshot

@@ -13,7 +13,7 @@ from dreamfleet.common.status import PARTS, Population, read_document, read_stat
 from dreamfleet.coordinator import answers
 from dreamfleet.coordinator.generation import Standing
 from dreamfleet.coordinator.history import History
-from dreamfleet.coordinator.status import Snapshot, left, take_snapshot
+from dreamfleet.coordinator.status import Snapshot, as_left, take_snapshot
 from tests.coordinator.test_run import SETTINGS, A, Bench
 from tests.support.samples import CLOSED, STATUS
 
@@ -183,8 +183,8 @@ def test_the_best_answer_carries_the_controller_in_parts(bench):
 
 
 def test_a_run_that_is_left_open_says_so_and_one_that_ended_has_ended(bench):
-    assert left(snapshot_of(bench)).status.state == "left"
+    assert as_left(snapshot_of(bench)).status.state == "left"
     while bench.run.ended is None:
         score(bench, 1)
-    assert left(snapshot_of(bench)).status.state == "ended"
-    assert json.loads(answers.status(left(snapshot_of(bench))))["why"] == "3 generations"
+    assert as_left(snapshot_of(bench)).status.state == "ended"
+    assert json.loads(answers.status(as_left(snapshot_of(bench))))["why"] == "3 generations"

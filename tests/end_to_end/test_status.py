@@ -125,3 +125,9 @@ def test_resuming_past_a_limit_names_a_controller_that_is_there(processes, setti
         )  # fmt: skip
         assert (code, "controller" in out) == (0, True), err
         assert Controller.load(run.controller_path).provenance["generation"] >= 1
+
+
+def test_a_controller_from_here_and_one_from_a_live_run_exclude_each_other(processes):
+    for flags in ((), ("--controller", "tiny", "--run", "test"), ("--controller", "tiny", "--connect", "tcp/h:1")):
+        code, _, err = processes.call("evaluate", *flags)
+        assert (code, "give either --controller, or --run" in err) == (2, True), err
