@@ -68,6 +68,20 @@ def test_it_can_be_interrupted_between_any_two_generations(optimiser, covariance
     assert interrupted.state().packed() == uninterrupted.state().packed()
 
 
+@pytest.mark.parametrize("optimiser", ["cmaes-lra", "cmaes-sep"])
+@pytest.mark.parametrize(("dimension", "population"), [(2, 4), (2, 16), (5, 8), (12, 16)])
+def test_it_continues_up_to_convergence_and_beyond(optimiser, dimension, population):
+    """As `test_evolution` shows of pycma; where fitness no longer differs, and the step size is next to nothing."""
+    setting, start = EvolutionConfig(dimension, population, 1e-8, "diagonal", 3, optimiser), np.ones(dimension)
+    uninterrupted, again = Evolution(setting, start), Evolution(setting, start)
+    for generation in range(200):
+        again = continued(setting, again.state().packed())
+        for each in (uninterrupted, again):
+            each.tell(-((each.ask() - 1) ** 2).sum(axis=1))
+        assert again.state().packed() == uninterrupted.state().packed(), generation
+    assert np.abs(uninterrupted.mean - 1).max() < 1e-9
+
+
 @pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep", OWN])
 @pytest.mark.parametrize(("dimension", "population"), [(299, 4), (300, 4), (867, 16), (900, 64)])
 def test_it_continues_at_the_real_size(optimiser, dimension, population):
