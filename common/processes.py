@@ -19,7 +19,7 @@ from typing import IO
 
 from dreamfleet.common.errors import DreamfleetError
 
-LINES = 10_000  # of each stream that are kept
+LINES = 10_000  # of each stream that are kept at least
 PATIENCE = 3.0  # seconds after each request to leave
 
 
@@ -60,7 +60,7 @@ class Child:
         environment: Mapping[str, str] | None = None,
         inside: Sequence[str] = (),
     ) -> None:
-        self.lines: deque[str] = deque(maxlen=LINES)  # of stderr
+        self.lines: list[str] = []  # of stderr, the last of them
         self._log = log
         self._out: deque[str] = deque(maxlen=LINES)
         self._heard: queue.SimpleQueue[str | None] = queue.SimpleQueue()
@@ -124,6 +124,8 @@ class Child:
 
     def _hear(self, line: str) -> None:
         self.lines.append(line)
+        if len(self.lines) > 2 * LINES:
+            del self.lines[:LINES]
         self._heard.put(line)
 
     def _join(self) -> None:
