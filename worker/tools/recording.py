@@ -12,6 +12,7 @@ import av
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.stopping import Stop, never
 from dreamfleet.worker.car_racing.task import CarRacing
 from dreamfleet.worker.dream.daydream import Daydream, DaydreamConfig, can_dream
 from dreamfleet.worker.tools.canvas import AWAKE, DREAMING, Canvas, Dreamt, Layout, Moment
@@ -24,10 +25,11 @@ TASKS = ("car-racing", "dream")  # what was evolved in a dream drives in reality
 def record(
     controller: Controller, bundle: Bundle, seed: int, steps: int, out: Path,
     dreaming: DaydreamConfig | None = None, on_step: Callable[[int], None] = lambda _steps: None,
+    stop: Stop = never,
 ) -> float:  # fmt: skip
     """Drive one episode in gymnasium's own environment into an mp4; returns its score.
 
-    A bundle that can dream does so beside the drive.
+    A bundle that can dream does so beside the drive. If `stop` asks for it, the video ends early, with a step at least.
     """
     if controller.task not in TASKS:
         raise UsageError(f"only {' and '.join(TASKS)} can be recorded, not {controller.task}")
@@ -49,7 +51,7 @@ def record(
         raise DatasetError(f"cannot write {out}: {error.strerror}; choose another --out") from error
     with container:
         stream = _open_stream(container, layout)
-        while step < steps and not ended:
+        while step < steps and not ended and not (step and stop()):
             state = policy.state
             action = policy.act(observation)
             decoded, dreamt = decoder.decode(policy.latent)[0], None
