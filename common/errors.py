@@ -43,5 +43,11 @@ class MissingExtraError(DreamfleetError):
     """A verb needs packages of an extra that is not installed."""
 
 
+class StoppedError(DreamfleetError):
+    """Somebody asked a verb to stop; the text says what is kept and how to go on."""
+
+    exit_code = 130  # as a shell says it of Ctrl-C
+
+
 class NoDisplayError(DreamfleetError):
     """A verb opens a window, and there is no screen to open it on."""

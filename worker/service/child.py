@@ -5,7 +5,6 @@ This module imports nothing heavy, so that a child has asked to die with its par
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import os
 import signal
@@ -13,14 +12,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from dreamfleet.common.children import die_with
+
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from pathlib import Path
 
     from dreamfleet.common.messages import TaskSpec
     from dreamfleet.worker.scoring.scorer import Scorer
-
-_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ def serve_jobs(
     pipe: Connection[Any, Any], steps: Any, abandoned: Any, spec: TaskSpec, bundle: Path | None, parent: int
 ) -> None:
     """Score jobs from the pipe until it closes. `steps` and `abandoned` are shared with the parent."""
-    _die_with(parent)
+    die_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker decides; Ctrl-C reaches the whole group
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     with suppress(OSError, AttributeError, ValueError, RuntimeError):  # no stderr: no traceback of a crash
@@ -73,13 +72,3 @@ def _take_turns(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandone
                 raise AbandonedError
 
         pipe.send(do_turn(scorer, turn, work, count))
-
-
-def _die_with(parent: int) -> None:
-    """Ask Linux to end this process with its parent; the closed pipe does so elsewhere, a job later."""
-    try:
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    except (OSError, AttributeError):
-        return
-    if os.getppid() != parent:
-        raise SystemExit(1)

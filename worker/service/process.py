@@ -6,15 +6,15 @@ Spawned, never forked: a forked Zenoh session hangs.
 from __future__ import annotations
 
 import os
-import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from multiprocessing import get_context, resource_tracker
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from multiprocessing import get_context
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
+from dreamfleet.common.children import signals_held
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.threads import pin_thread_pools
 from dreamfleet.worker.service.child import Ready, serve_jobs
@@ -38,7 +38,7 @@ class ChildProcess:
         self._process = context.Process(
             target=serve_jobs, args=(theirs, self._steps, self._abandoned, spec, bundle, os.getpid()), daemon=True
         )
-        with _signals_held():
+        with signals_held():
             self._process.start()
         theirs.close()
         self._reader = threading.Thread(target=self._read, args=(hear,), daemon=True)
@@ -96,14 +96,3 @@ class ChildProcess:
             while True:
                 hear(self._pipe.recv())
         hear(None)
-
-
-@contextmanager
-def _signals_held() -> Iterator[None]:
-    """A child started here inherits the mask: Ctrl-C, which reaches the whole group, cannot end it while it imports."""
-    resource_tracker.ensure_running()  # as it starts it would lift the mask
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

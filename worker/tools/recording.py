@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.stopping import Stop, never
 from dreamfleet.worker.dream.daydream import Daydream, DaydreamConfig, can_dream
 from dreamfleet.worker.scoring.episode import Course, play
 from dreamfleet.worker.tasks.api import Assignment, World
@@ -27,10 +28,12 @@ from dreamfleet.worker.worldmodel.inference import Decoder
 def record(
     controller: Controller, bundle: Bundle | None, seed: int, steps: int, out: Path,
     dreaming: DaydreamConfig | None = None, on_step: Callable[[int], None] = lambda _steps: None,
+    stop: Stop = never,
 ) -> float:  # fmt: skip
     """Drive one episode in the task's judge into an mp4; returns its score.
 
-    A bundle shows what it sees and decodes beside the drive; one that can dream does so too.
+    A bundle shows what it sees and decodes beside the drive; one that can dream does so too. If `stop` asks for it, the
+    video ends early, with a step at least.
     """
     task, assignment = find_task(controller.task), Assignment(spec_for(controller, bundle), bundle)
     world = task.world_of(assignment)
@@ -44,6 +47,8 @@ def record(
         for moment in play(environment, actor, Course(seed, steps)):
             score += moment.reward
             on_step(moment.step)
+            if stop():
+                break
     environment.close()
     return score
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -13,7 +15,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.children import die_with, signals_held
+from dreamfleet.common.errors import DatasetError, DreamfleetError, UsageError
 from dreamfleet.common.files import write_aside
 from dreamfleet.common.threads import pin_thread_pools
 from dreamfleet.worker.scoring.episode import Course, play
@@ -53,25 +56,40 @@ def present(folder: Path) -> list[Path]:
     return sorted((folder / "episodes").glob("[0-9]*.npz"))
 
 
-def collect(folder: Path, config: CollectConfig, jobs: int) -> Iterator[int]:
+def missing(folder: Path, config: CollectConfig) -> list[int]:
+    """Numbers of the episodes that are not there yet."""
+    return [number for number in range(config.episodes) if not episode_path(folder, number).exists()]
+
+
+def collect(folder: Path, config: CollectConfig, jobs: int) -> Generator[int, None, None]:
     """Drive the episodes that are not there yet in `jobs` processes; yields the frames of each as it is written.
 
-    `DatasetError` before anything is driven if what is there has other pictures.
+    `DatasetError` before anything is driven if what is there has other pictures. Closed early, it waits until those
+    that are being driven are written.
     """
     check_pictures(present(folder), config.picture)
-    missing = [number for number in range(config.episodes) if not episode_path(folder, number).exists()]
+    numbers = missing(folder, config)
     try:
         (folder / "episodes").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
-    if not missing:
+    if not numbers:
         return
     pin_thread_pools()
-    with get_context("spawn").Pool(min(jobs, len(missing)), initializer=_start_process) as pool:
-        yield from pool.imap_unordered(_collect_one, [(folder, config, number) for number in missing])
+    pool = ProcessPoolExecutor(min(jobs, len(numbers)), get_context("spawn"), _start_process, (os.getpid(),))
+    try:
+        with signals_held():
+            drives = [pool.submit(_collect_one, (folder, config, number)) for number in numbers]
+        for each in as_completed(drives):
+            yield each.result()
+    except BrokenProcessPool as error:
+        raise DreamfleetError("a process that drove has crashed; `dreamfleet doctor` looks for the cause") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
-def _start_process() -> None:
+def _start_process(parent: int) -> None:
+    die_with(parent)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
 
 

@@ -10,7 +10,8 @@ from typing import Any
 
 import torch
 
-from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
+from dreamfleet.common.stopping import Stop
 from dreamfleet.worker.training.checkpoint import load_checkpoint, save_checkpoint
 from dreamfleet.worker.training.train_config import TrainConfig
 
@@ -44,6 +45,21 @@ class Schedule:
     def done(self) -> bool:
         """Whether to make no more updates."""
         return self.update >= self._config.updates or self.progress.get("stopped") is not None
+
+    def goes_on(self, stop: Stop) -> bool:
+        """Whether to make another update; `StoppedError` between two of them, the last one saved, if told to stop.
+
+        Between two updates, because what a stop keeps must lead to the weights that no stop would have led to.
+        """
+        if self.done:
+            return False
+        if stop():
+            self.save()
+            raise StoppedError(
+                f"stopped after update {self.update} of {self._config.updates}: {self._path} keeps them; the same "
+                "command goes on from there"
+            )
+        return True
 
     def set_rate(self, epoch: int) -> None:
         """The rate of an epoch."""

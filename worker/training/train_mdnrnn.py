@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.progress import append_curve
+from dreamfleet.common.stopping import Stop, never
 from dreamfleet.worker.training.checkpoint import load_progress
 from dreamfleet.worker.training.dataset import episodes, load, split
 from dreamfleet.worker.training.drives import Drives, inputs_of, load_drives
@@ -28,11 +29,12 @@ VALIDATION_DRIVES = 20  # for the curve while training
 
 def train_mdnrnn(
     folder: Path, config: TrainConfig, report: Report, layers: MDNRNNConfig = REWARDED,
-    device: torch.device | None = None, continue_from: Path | None = None,
+    device: torch.device | None = None, continue_from: Path | None = None, stop: Stop = never,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
 
-    A stop changes nothing: batches and chance follow from the seed and the update alone.
+    A stop changes nothing: batches and chance follow from the seed and the update alone. `StoppedError` if `stop` asks
+    for one.
     """
     train, held_out = split(episodes(folder, ENCODED))
     vae = encoder_of(folder)
@@ -45,7 +47,7 @@ def train_mdnrnn(
     if schedule.progress.setdefault("vae", vae) != vae:
         raise DatasetError(f"{folder / CHECKPOINT} was trained on latents of another VAE; delete it to begin anew")
     report(schedule.update, "")
-    while not schedule.done:
+    while schedule.goes_on(stop):
         update = schedule.update + 1
         schedule.set_rate(update * config.batch // len(train) if config.decay < 1 else 0)
         random = np.random.default_rng([config.seed, update])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.progress import append_curve
+from dreamfleet.common.stopping import Stop, never
 from dreamfleet.worker.training.dataset import (
     POOL_EPISODES,
     check_pictures,
@@ -36,11 +37,12 @@ Report = Callable[[int, str], None]
 def train_vae(
     folder: Path, config: TrainConfig, report: Report, layers: VAEConfig = PAPER,
     device: torch.device | None = None, continue_from: Path | None = None, decoder_only: bool = False,
+    stop: Stop = never,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
 
     With `decoder_only` the encoder stays as it is, and with it latents, MDN-RNNs and controllers. A stop changes
-    nothing: batches and chance follow from the seed and the update alone.
+    nothing: batches and chance follow from the seed and the update alone. `StoppedError` if `stop` asks for one.
     """
     train, held_out = split(episodes(folder))
     check_whole([*train, *held_out], "picture", "preprocessing")
@@ -55,7 +57,7 @@ def train_vae(
     validation = held_out_pictures(held_out, CURVE_PICTURES)
     batches = picture_batches(train, config.batch, config.seed, progress.get("pool", 0), progress.get("taken", 0))
     epoch_pools = max(1, len(train) // POOL_EPISODES)
-    while not schedule.done:
+    while schedule.goes_on(stop):
         pool, taken, batch = next(batches)
         schedule.set_rate(pool // epoch_pools)
         torch.manual_seed(config.seed * 1_000_003 + schedule.update)

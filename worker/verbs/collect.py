@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import os
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.presets import preset_help
 from dreamfleet.common.site import offer
@@ -34,7 +35,8 @@ def run(args: argparse.Namespace) -> int:
     if args.from_run is not None:
         return _take_in(args)
     from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.training.collect import collect
+    from dreamfleet.common.stopping import heeding_signals
+    from dreamfleet.worker.training.collect import collect, missing, present
     from dreamfleet.worker.training.presets import find_preset
 
     config = find_preset(args.preset).collect
@@ -42,12 +44,24 @@ def run(args: argparse.Namespace) -> int:
     changes = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     config = replace(config, **changes)
     frames = done = 0
-    with progress_bar("collect", config.episodes, "episodes") as bar:
-        for count in collect(args.data, config, max(1, args.jobs)):
-            frames, done = frames + count, done + 1
-            bar.move(done)
-    text = f"{args.data}: {done} episodes, {frames} frames new; {config.episodes} episodes in all"
-    answer(args, text, data=args.data, new_episodes=done, new_frames=frames, episodes=config.episodes)
+    before = len(present(args.data))
+    total = before + len(missing(args.data, config))
+    with progress_bar("collect", total, "episodes") as bar, heeding_signals() as stop:
+        bar.move(before)
+        with closing(collect(args.data, config, max(1, args.jobs))) as counts:
+            for count in counts:
+                frames, done = frames + count, done + 1
+                bar.move(before + done)
+                if stop():
+                    break
+    there = len(present(args.data))  # with those that were written as the others were told to stop
+    if there < total:
+        raise StoppedError(
+            f"stopped: {args.data} keeps {there - before} new episodes, {there} of {total} in all; the same command "
+            "goes on"
+        )
+    text = f"{args.data}: {done} episodes, {frames} frames new; {there} episodes in all"
+    answer(args, text, data=args.data, new_episodes=done, new_frames=frames, episodes=there)
     return 0
 
 

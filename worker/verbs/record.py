@@ -6,7 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.seeds import TEST
 from dreamfleet.common.site import offer
@@ -36,6 +36,7 @@ def run(args: argparse.Namespace) -> int:
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.common.shelf import find_controller
+    from dreamfleet.common.stopping import heeding_signals
     from dreamfleet.worker.dream.daydream import DaydreamConfig
     from dreamfleet.worker.tools.evaluation import bundle_for
     from dreamfleet.worker.tools.recording import record
@@ -43,7 +44,19 @@ def run(args: argparse.Namespace) -> int:
     daydream = DaydreamConfig(args.temperature, seed=args.seed)
     controller, beside = find_controller(args.controller, args.runs_dir)
     bundle = bundle_for(controller, args.bundle, beside)
-    with progress_bar("record", args.steps, "steps") as bar:
-        score = record(controller, bundle, args.seed, args.steps, args.out, daydream, bar.move)
+    driven = 0
+
+    def move(done: int) -> None:
+        nonlocal driven
+        driven = done
+        bar.move(done)
+
+    with progress_bar("record", args.steps, "steps") as bar, heeding_signals() as stop:
+        score = record(controller, bundle, args.seed, args.steps, args.out, daydream, move, stop)
+        if stop():
+            raise StoppedError(
+                f"stopped: {args.out} shows the first {driven} steps on track {args.seed}, with a score of "
+                f"{score:.1f}; the same command records the whole drive"
+            )
     answer(args, f"{args.out}: score {score:.1f} on track {args.seed}", video=args.out, score=score, seed=args.seed)
     return 0

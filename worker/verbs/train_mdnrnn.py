@@ -21,6 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
     from dreamfleet.common.progress import progress_bar
+    from dreamfleet.common.stopping import heeding_signals
     from dreamfleet.worker.training.assemble import record_quality
     from dreamfleet.worker.training.flags import changed
     from dreamfleet.worker.training.presets import find_preset
@@ -33,8 +34,9 @@ def run(args: argparse.Namespace) -> int:
     if args.summary:
         print(summary(MDNRNN(layers)))
         return 0
-    with progress_bar("MDN-RNN", config.updates, "updates") as bar:
-        figures = train_mdnrnn(args.data, config, bar.move, layers, device_of(args.device), args.continue_from)
+    with progress_bar("MDN-RNN", config.updates, "updates") as bar, heeding_signals() as stop:
+        device, other = device_of(args.device), args.continue_from
+        figures = train_mdnrnn(args.data, config, bar.move, layers, device, other, stop)
     record_quality(args.data, figures)
     answer(args, "  ".join(f"{name} {value}" for name, value in figures.items()), **figures)
     return 0

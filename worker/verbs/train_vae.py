@@ -24,6 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
     from dreamfleet.common.progress import progress_bar
+    from dreamfleet.common.stopping import heeding_signals
     from dreamfleet.worker.training.assemble import record_quality
     from dreamfleet.worker.training.flags import changed
     from dreamfleet.worker.training.presets import find_preset
@@ -36,9 +37,9 @@ def run(args: argparse.Namespace) -> int:
     if args.summary:
         print(summary(VAE(layers)))
         return 0
-    with progress_bar("VAE", config.updates, "updates") as bar:
+    with progress_bar("VAE", config.updates, "updates") as bar, heeding_signals() as stop:
         device, other = device_of(args.device), args.continue_from
-        figures = train_vae(args.data, config, bar.move, layers, device, other, args.decoder_only)
+        figures = train_vae(args.data, config, bar.move, layers, device, other, args.decoder_only, stop)
     record_quality(args.data, figures)
     answer(args, "  ".join(f"{name} {value}" for name, value in figures.items()), **figures)
     return 0

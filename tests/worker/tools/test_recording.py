@@ -40,6 +40,18 @@ def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_
         assert len(list(container.decode(stream))) == STEPS
 
 
+@pytest.mark.parametrize("after", [0, 3])
+def test_a_recording_that_is_told_to_stop_can_be_played_as_far_as_it_came(controller, random_bundle, tmp_path, after):
+    told = [0]
+    record(
+        controller, random_bundle, SEED, STEPS, tmp_path / "drive.mp4", on_step=told.append,
+        stop=lambda: told[-1] >= after,
+    )  # fmt: skip
+    assert told[-1] == max(after, 1)
+    with av.open(str(tmp_path / "drive.mp4")) as container:
+        assert len(list(container.decode(container.streams.video[0]))) == told[-1]
+
+
 def test_a_controller_that_was_evolved_in_the_dream_is_recorded_in_reality(controller, random_bundle, tmp_path):
     dreamer = Controller(controller.shape, controller.parameters, "dream", controller.bundle)
     scores = [record(each, random_bundle, SEED, 3, tmp_path / "drive.mp4") for each in (controller, dreamer)]

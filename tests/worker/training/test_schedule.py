@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
@@ -55,6 +55,32 @@ def test_the_vae_goes_on_to_the_same_weights_as_without_a_stop(encoded, tmp_path
     for updates in (stop, 4):
         train_vae.train_vae(tmp_path, replace(SHORT, updates=updates), ignore, LAYERS)
     assert equal(encoded / train_vae.CHECKPOINT, tmp_path / train_vae.CHECKPOINT)
+
+
+@pytest.mark.parametrize("after", [1, 3])  # neither is an update after which the held-out drives are looked at
+def test_told_to_stop_it_keeps_every_update_and_goes_on_to_the_same_weights(encoded, tmp_path, after):
+    (tmp_path / "episodes").symlink_to(encoded / "episodes")
+    made = []
+    with pytest.raises(
+        StoppedError, match=rf"after update {after} of 4: .*vae\.safetensors keeps them; the same command"
+    ):
+        train_vae.train_vae(tmp_path, SHORT, lambda done, _: made.append(done), LAYERS, stop=lambda: made[-1] == after)
+    assert load_progress(tmp_path / train_vae.CHECKPOINT)["update"] == after
+    train_vae.train_vae(tmp_path, SHORT, ignore, LAYERS)
+    assert equal(encoded / train_vae.CHECKPOINT, tmp_path / train_vae.CHECKPOINT)
+
+
+def test_an_mdnrnn_that_is_told_to_stop_goes_on_to_the_same_weights(encoded, tmp_path):
+    whole, parts = (tmp_path / name for name in ("whole", "parts"))
+    for folder in (whole, parts):
+        folder.mkdir()
+        linked(encoded, folder)
+    made = []
+    train_mdnrnn.train_mdnrnn(whole, SHORT, ignore, SMALL)
+    with pytest.raises(StoppedError, match="after update 3 of 4"):
+        train_mdnrnn.train_mdnrnn(parts, SHORT, lambda done, _: made.append(done), SMALL, stop=lambda: made[-1] == 3)
+    train_mdnrnn.train_mdnrnn(parts, SHORT, ignore, SMALL)
+    assert equal(whole / train_mdnrnn.CHECKPOINT, parts / train_mdnrnn.CHECKPOINT)
 
 
 def test_a_decoder_that_learns_on_leaves_latents_and_mdnrnn_as_they_are(encoded, tmp_path):

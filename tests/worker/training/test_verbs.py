@@ -6,7 +6,7 @@ from dreamfleet.common.errors import DatasetError
 from dreamfleet.worker.training.checkpoint import load_config
 from dreamfleet.worker.verbs import collect, train_mdnrnn, train_vae
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.drives import write_drives
+from tests.support.drives import write_drive, write_drives
 
 
 def call(verb, *arguments):
@@ -33,6 +33,17 @@ def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):
     assert "0 episodes, 0 frames new; 3 episodes in all" in capsys.readouterr().out
     with pytest.raises(DatasetError, match="or --picture"):
         call(collect, "--data", str(tmp_path), "--episodes", "4")
+
+
+def test_a_set_that_has_more_than_is_asked_for_is_counted_whole(tmp_path, capsys):
+    write_drives(tmp_path, episodes=3, steps=4)
+    write_drive(tmp_path, 7, steps=4)
+    flags = ("--episodes", "4", "--jobs", "1", "--preset", "tiny")
+    assert call(collect, "--data", str(tmp_path), *flags) == 0
+    told = capsys.readouterr()
+    assert ": 1 episodes, " in told.out
+    assert "5 episodes in all" in told.out
+    assert "5/5" in told.err
 
 
 @pytest.mark.parametrize(("verb", "count"), [(train_vae, "4,348,547"), (train_mdnrnn, "422,368")])

@@ -1,0 +1,59 @@
+"""Verbs that work for long, and Ctrl-C or SIGTERM: what is there is kept and named, and the exit code says so."""
+
+import os
+import signal
+
+import av
+import pytest
+
+from dreamfleet.worker.training.checkpoint import load_progress
+from dreamfleet.worker.training.collect import present
+from tests.support.drives import write_drives
+
+pytestmark = pytest.mark.timeout(120)
+
+
+@pytest.fixture(params=[signal.SIGINT, signal.SIGTERM])
+def number(request):
+    return request.param
+
+
+def stopped(process, number, there):
+    """Send the signal to the whole group, as a terminal does, once something is `there`; what it said last."""
+    while not there():
+        assert process.popen.poll() is None, "".join(process.lines)
+    os.killpg(process.popen.pid, number)
+    code, _ = process.finish()
+    assert code == 130
+    assert "Traceback" not in "".join(process.lines)
+    return process.lines[-1]
+
+
+def test_training_keeps_all_updates(processes, tmp_path, number):
+    write_drives(tmp_path, episodes=4, steps=8)
+    curve = tmp_path / "vae.jsonl"
+    flags = ("--updates", 100_000, "--batch", 8, "--channels", 2, 2, 4, 4, "--validate-every", 100_000)
+    training = processes.start("train", "vae", "--data", tmp_path, *flags)
+    said = stopped(training, number, lambda: curve.exists() and curve.read_text().count("update") >= 2)
+    update = load_progress(tmp_path / "vae.safetensors")["update"]
+    assert update >= 40
+    assert f"after update {update} of 100000: {tmp_path}/vae.safetensors keeps them; the same command goes on" in said
+
+
+def test_a_recording_can_be_played(processes, tmp_path, number):
+    out = tmp_path / "drive.mp4"
+    recording = processes.start("record", "--controller", "tiny", "--out", out)
+    said = stopped(recording, number, lambda: out.exists() and out.stat().st_size > 0)
+    with av.open(str(out)) as container:
+        frames = len(list(container.decode(container.streams.video[0])))
+    assert 0 < frames < 1000
+    assert f"{out} shows the first {frames} steps" in said
+
+
+def test_a_collection_keeps_its_episodes_and_counts_them(processes, tmp_path, number):
+    flags = ("--episodes", 1000, "--jobs", 2)
+    collecting = processes.start("collect", "--data", tmp_path, *flags)
+    said = stopped(collecting, number, lambda: len(present(tmp_path)) >= 2)
+    kept = len(present(tmp_path))
+    assert f"stopped: {tmp_path} keeps {kept} new episodes, {kept} of 1000 in all; the same command goes on" in said
+    assert [path.name for path in (tmp_path / "episodes").iterdir() if path not in present(tmp_path)] == []
