@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from dreamfleet.worker.car_racing.preprocessing import preprocessing_to
 from dreamfleet.worker.training.collect import episode_path
+from dreamfleet.worker.training.world import preprocessing_to
 
 
 def write_drive(folder, number, steps=12, picture=64):

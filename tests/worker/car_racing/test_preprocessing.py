@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.car_racing.preprocessing import BOX, RAW, find_preprocessing, preprocessing_to
+from dreamfleet.worker.car_racing.preprocessing import BOX, RAW, find_preprocessing
+from dreamfleet.worker.training.world import preprocessing_to
 
 
 def overlap(target, step, source, unit):
