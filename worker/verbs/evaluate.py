@@ -23,8 +23,8 @@ EXTRAS = ("worker",)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--controller", help="a file, a run, or one that ships")
-    parser.add_argument("--run", dest="run_name", metavar="RUN", help="judge what this live run reports instead")
-    offer(parser, "connect", texts={"connect": "ask the live run here (give --run too where there are several)"})
+    offer(parser, "connect", texts={"connect": "ask a live run for its controller instead, through this router"})
+    parser.add_argument("--run", dest="run_name", metavar="RUN", help="ask this live run for its controller instead")
     parser.add_argument("--episodes", type=int, default=100, help="tracks (default 100)")
     parser.add_argument("--first-seed", type=int, default=TEST.start, help=f"first track's seed (default {TEST.start})")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
@@ -66,7 +66,7 @@ def _choose(args: argparse.Namespace) -> tuple[Controller, Bundle | None]:
     from dreamfleet.worker.service.bundle_fetch import fetch_for
     from dreamfleet.worker.tools.evaluation import bundle_for
 
-    live = bool(args.run_name) or "connect" in args.given
+    live = args.run_name is not None or "connect" in args.given
     if live and not args.controller:
         with Client(args.connect) as client:
             run = args.run_name or client.status().run
@@ -75,6 +75,6 @@ def _choose(args: argparse.Namespace) -> tuple[Controller, Bundle | None]:
                 return controller, fetch_for(controller, client.session, run)
         return controller, bundle_for(controller, args.bundle)
     if live or not args.controller:
-        raise UsageError("give either --controller, or --run (and --connect) to judge what a live run reports")
+        raise UsageError("give either --controller, or --run or --connect to judge what a live run reports")
     controller, beside = find_controller(args.controller, args.runs_dir)
     return controller, bundle_for(controller, args.bundle, beside)

@@ -1,0 +1,116 @@
+"""gymnasium's own environments on a fleet, without a bundle: they are learnt, and to the same bits by any fleet."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.runs import open_run
+
+pytestmark = pytest.mark.timeout(300)
+NORMAL = ("--normalise", "--population", 32, "--episodes", 4, "--evaluation-episodes", 16)
+LEARNT = {  # settings, generations, and the mean over 50 unseen seeds that is to be passed
+    "lander": (("--task", "gym:LunarLander-v3", *NORMAL, "--sigma0", 0.3), 80, 200),
+    "continuous": (
+        ("--task", "gym:LunarLander-v3", "--environment", "continuous=true", *NORMAL, "--sigma0", 0.3), 60, 200,
+    ),
+    "pendulum": (
+        ("--task", "gym:Pendulum-v1", *NORMAL, "--controller", "hidden", "--hidden-units", 16, "--sigma0", 1.0), 120,
+        -250,
+    ),
+}  # fmt: skip
+
+
+def outcome(processes, name):
+    """Every fitness of every candidate, and what is reported."""
+    with open_run(processes.runs, name) as run:
+        candidates = range(run.settings.population)
+        fitness = [[run.fitness(each.number, i) for i in candidates] for each in run.history()]
+        return fitness, np.load(run.controller_path)["parameters"].tobytes()
+
+
+def evolve(processes, name, workers, *settings):
+    coordinator = processes.coordinator(*settings, name=name)
+    working = [processes.worker("--run", name, "--name", f"w{number}") for number in range(workers)]
+    code, _ = coordinator.finish(1200)
+    assert code == 0, "".join(coordinator.lines)
+    for each in working:
+        each.end()
+    return outcome(processes, name)
+
+
+def test_a_run_without_a_bundle_evolves_and_any_fleet_gives_its_bits(processes):
+    settings = ("--task", "gym:CartPole-v1", "--population", 6, "--episodes", 2, "--generations", 3,
+                "--evaluate-every", 2, "--evaluation-episodes", 3)  # fmt: skip
+    assert evolve(processes, "one", 1, *settings) == evolve(processes, "two", 2, *settings)
+    assert not (processes.runs / "one" / "bundle.zip").exists()
+    code, out, err = processes.call("replay", "one", "--runs-dir", processes.runs, "--candidate", "2/3")
+    assert (code, out.count("same bits")) == (0, 2), err
+    code, out, err = processes.call(
+        "evaluate", "--controller", "one", "--runs-dir", processes.runs, "--episodes", 3, "--json"
+    )
+    assert code == 0, err
+    assert json.loads(out)["task"] == "gym:CartPole-v1"
+    video = processes.folder / "drive.mp4"
+    code, out, err = processes.call("record", "--controller", "one", "--runs-dir", processes.runs, "--out", video)
+    assert code == 0, err
+    assert video.stat().st_size > 1000
+    code, out, err = processes.call("inspect", "one", "--runs-dir", processes.runs, "--out", processes.folder / "page")
+    assert code == 0, err
+    forked = processes.start(
+        "fork", "one", "--run", "fork", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+        "--generations", 1,
+    )  # fmt: skip
+    processes.worker("--run", "fork", "--exit-when-done")
+    assert forked.finish()[0] == 0
+
+
+def test_a_worker_that_lacks_the_environment_says_so_and_the_run_waits(processes):
+    coordinator = processes.coordinator(
+        "--task", "tests.support.tasks:Toy", "--bundle", "tiny", "--population", 4, "--generations", 1
+    )
+    code, _, err = processes.call("worker", "--connect", processes.endpoint, "--slots", 1)
+    assert code == 1
+    assert "'tests.support.tasks:Toy'" in err
+    assert "install the package" in err
+    coordinator.wait_for("refused worker")
+    status = processes.status()
+    assert status["state"] == "waiting for workers"
+    assert any("does not know" in why for why in status["refused"].values())
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        (("--task", "gym:Nothing-v0"), "makes no environment 'Nothing-v0'"),
+        (("--task", "gym:CartPole-v1", "--environment", "wings"), "write KEY=VALUE"),
+        (("--task", "gym:CartPole-v1", "--environment", "wings=2"), "takes no such arguments"),
+        (("--task", "gym:CartPole-v1", "--temperature", "1.5"), "of tasks with a world model"),
+        (("--task", "gym:CartPole-v1", "--task-options", "[1]"), "must be a JSON object"),
+        (("--task", "car-racing", "--bundle", "none"), "needs a world model"),
+        (("--normalise",), "without a world model"),
+    ],
+)
+def test_settings_that_make_no_run_are_refused(processes, settings, says):
+    code, _, err = processes.call("coordinator", "--run", "bad", "--runs-dir", processes.runs, *settings)
+    assert code in (1, 2)
+    assert says in err
+    assert "Traceback" not in err
+    assert not (processes.runs / "bad" / "journal.sqlite").exists()
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", LEARNT)
+def test_it_is_learnt_from_zero_on_two_workers_and_one_gives_the_same_bits(processes, name, record_property):
+    settings, generations, wanted = LEARNT[name]
+    settings = (*settings, "--generations", generations, "--evaluate-every", 10)
+    two = evolve(processes, name, 2, *settings)
+    code, out, err = processes.call(
+        "evaluate", "--controller", name, "--runs-dir", processes.runs, "--episodes", 50, "--json", timeout=300
+    )
+    assert code == 0, err
+    told = json.loads(out)
+    record_property("score", f"{told['mean']:.1f}, standard error {told['std'] / 50**0.5:.1f}, 50 unseen seeds")
+    assert told["mean"] > wanted
+    assert evolve(processes, "alone", 1, *settings) == two
