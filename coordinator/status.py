@@ -5,7 +5,7 @@ Taking one costs the same however long the run is. What may be long is cut into 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 
@@ -47,11 +47,17 @@ class Snapshot:
 
 def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float) -> Snapshot:
     """The run as it is at `now`, seconds of the monotonic clock; `uptime` in seconds."""
-    exchange = run.exchange
-    workers = tuple(_worker(member, now) for member in exchange.members)
-    present = [member for member in exchange.members if member.present]
-    standing, evaluations, failures = run.generation.standing(), run.slack.evaluations, exchange.failures
-    status = Status(
+    workers = tuple(_worker(member, now) for member in run.exchange.members)
+    standing = run.generation.standing()
+    status = replace(_status(run, name, standing, now), uptime=round(uptime, 1), dropped=dict(dropped))
+    return Snapshot(status, workers, run.history.view(), standing, run.last, run.slack.report.current)
+
+
+def _status(run: Run, name: str, standing: Standing, now: float) -> Status:
+    """The status without heads, and without what only the service knows."""
+    present = [member for member in run.exchange.members if member.present]
+    evaluations, failures = run.slack.evaluations, run.exchange.failures
+    return Status(
         schema=SCHEMA,
         run=name,
         run_uid=run.uid,
@@ -61,7 +67,7 @@ def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float
         why=run.paused or run.ended or "",
         settings=run.settings,
         limits=asdict(run.limits),
-        uptime=round(uptime, 1),
+        uptime=0.0,
         generation=_open_generation(run, now),
         generations=len(run.history),
         last=run.history.last,
@@ -73,21 +79,17 @@ def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float
         evaluations=len(evaluations),
         evaluating=Progress(*evaluations.progress),
         collecting=Progress(*run.slack.collections.progress),
-        workers=WorkerCount(len(present), len(workers)),
+        workers=WorkerCount(len(present), len(run.exchange.members)),
         worker_list=(),
         slots=sum(member.slots for member in present),
-        fingerprint=exchange.fingerprint,
-        throughput=Throughput(
-            steps_per_second=round(sum(member.steps_per_second for member in present), 1),
-            environment_steps=run.history.steps + run.generation.steps,
-        ),
-        waste=_waste(exchange.counts),
+        fingerprint=run.exchange.fingerprint,
+        throughput=_throughput(run, present),
+        waste=_waste(run.exchange.counts),
         failing=len(failures),
         failures=tuple(_failure(each) for each in failures[:MOST_FAILURES]),
-        dropped=dict(dropped),
-        refused={name: shorten(why, LONGEST) for name, why in list(exchange.refusals.latest.items())[-MOST_NAMED:]},
+        dropped={},
+        refused=_refused(run),
     )
-    return Snapshot(status, workers, run.history.view(), standing, run.last, run.slack.report.current)
 
 
 def as_left(snapshot: Snapshot) -> Snapshot:
@@ -110,6 +112,16 @@ def _open_generation(run: Run, now: float) -> OpenGeneration:
 
 def _headless(standing: Standing) -> Population:
     return Population(standing.generation, 0, len(standing.done), (), (), ())
+
+
+def _throughput(run: Run, present: Sequence[Member]) -> Throughput:
+    rate = sum(member.steps_per_second for member in present)
+    return Throughput(round(rate, 1), run.history.steps + run.generation.steps)
+
+
+def _refused(run: Run) -> dict[str, str]:
+    latest = list(run.exchange.refusals.latest.items())[-MOST_NAMED:]
+    return {name: shorten(why, LONGEST) for name, why in latest}
 
 
 def _waste(counts: Mapping[str, int]) -> Waste:
