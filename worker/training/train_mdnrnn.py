@@ -33,8 +33,7 @@ def train_mdnrnn(
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
 
-    A stop changes nothing: batches and chance follow from the seed and the update alone. `StoppedError` if `stop` asks
-    for one.
+    A stop changes nothing: all follows from the seed and the update alone. `StoppedError` if `stop` asks for one.
     """
     train, held_out = split(episodes(folder, ENCODED))
     vae = encoder_of(folder)

@@ -61,17 +61,12 @@ def train_vae(
         pool, taken, batch = next(batches)
         schedule.set_rate(pool // epoch_pools)
         torch.manual_seed(config.seed * 1_000_003 + schedule.update)
-        model.train()
-        if decoder_only:
-            model.freeze_encoder()
-        noise = torch.randn(len(batch), layers.latent).to(device)
-        loss, error, divergence = model.loss(as_tensor(batch, device), noise)
-        loss.backward()  # type: ignore[no-untyped-call]
-        schedule.step(loss.item())
+        loss, error, divergence = backward(model, batch, decoder_only, device)
+        schedule.step(loss)
         schedule.progress |= {"pool": pool, "taken": taken}
-        report(schedule.update, f"error {error.item():.1f}  KL {divergence.item():.1f}")
+        report(schedule.update, f"error {error:.1f}  KL {divergence:.1f}")
         if schedule.update % 20 == 0:
-            append_curve(folder / "vae.jsonl", update=schedule.update, error=error.item(), kl=divergence.item())
+            append_curve(folder / "vae.jsonl", update=schedule.update, error=error, kl=divergence)
         if schedule.due:
             held_out_loss, held_out_error = validate(model, validation, device)
             append_curve(
@@ -79,6 +74,20 @@ def train_vae(
             )
             schedule.validated(held_out_loss)
     return quality(model, held_out, device)
+
+
+def backward(
+    model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device: torch.device | None
+) -> tuple[float, float, float]:
+    """Gradients of a batch; returns its loss, its squared error a picture and its divergence."""
+    model.train()
+    if decoder_only:
+        model.freeze_encoder()
+    noise = torch.randn(len(pictures), model.config.latent).to(device)
+    parts = model.loss(as_tensor(pictures, device), noise)
+    parts[0].backward()  # type: ignore[no-untyped-call]
+    loss, error, divergence = (part.item() for part in parts)
+    return loss, error, divergence
 
 
 def validate(model: VAE, pictures: NDArray[np.uint8], device: torch.device | None) -> tuple[float, float]:
