@@ -22,9 +22,9 @@ T = TypeVar("T")
 Table = Mapping[str, Any]
 
 
-def option(default: Any, text: str, *, alias: str = "") -> Any:
-    """A field with its default and the text that `--help` shows; `alias` is a second flag for it."""
-    return field(default=default, metadata={"help": text, "alias": alias})
+def option(default: Any, text: str) -> Any:
+    """A field with its default and the text that `--help` shows."""
+    return field(default=default, metadata={"help": text})
 
 
 def add_flags(
@@ -44,9 +44,8 @@ def add_flags(
         hints = get_type_hints(section)
         for each in fields(section):
             if wanted is None or each.name in wanted:
-                aliases = [alias] if (alias := each.metadata.get("alias")) else []
                 text = (texts or {}).get(each.name) or each.metadata["help"] + _shown_default(each, default)
-                group.add_argument(_flag(each), *aliases, **_flag_options(each, hints[each.name], text))
+                group.add_argument(_flag(each), **_flag_options(each, hints[each.name], text))
 
 
 def _group(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:

@@ -12,7 +12,7 @@ from dreamfleet.common.messages import HOTTEST, TaskSpec
 from dreamfleet.common.runs import RunFolder, RunSettings, StoredEvaluation
 
 
-def deciding_check(settings: RunSettings, generation: int) -> int:
+def deciding_evaluation(settings: RunSettings, generation: int) -> int:
     """The last evaluation, by its generation, that `generation`'s temperature depends on; negative: on none.
 
     It was scheduled at least `evaluate_every` generations earlier, which is the time that driving it may take.
@@ -22,7 +22,9 @@ def deciding_check(settings: RunSettings, generation: int) -> int:
 
 
 class Heat:
-    """The temperature of one generation after another; each evaluation is looked at once, however long the run is.
+    """What one generation after another is scored in: the run's specification, perhaps at a raised temperature.
+
+    Each evaluation is looked at once, however long the run is.
 
     Each evaluation that lies clearly behind the best one since the last raise multiplies the temperature by the run's
     heat, up to `HOTTEST`. Only evaluations that the schedule wants count: one that a limit called for depends on when a
@@ -33,35 +35,35 @@ class Heat:
         self._settings = settings
         self._temperature = settings.task.temperature
         self._best: StoredEvaluation | None = None  # since the last raise
-        self._next = settings.evaluate_every - 1  # the check to look at next, by its generation
+        self._next = settings.evaluate_every - 1  # the one to look at next, by its generation
 
-    def temperature(self, generation: int, finished: Mapping[int, StoredEvaluation]) -> float | None:
-        """What `generation` dreams at; `None` where it is the run's own. Ask for generations in rising order.
+    def spec(self, generation: int, finished: Mapping[int, StoredEvaluation]) -> TaskSpec:
+        """What `generation` is scored in. Ask for generations in rising order.
 
         `finished` holds by generation at least the evaluations that this one depends on.
         """
-        own, last = self._settings.task.temperature, deciding_check(self._settings, generation)
-        if own is None or last < 0:
-            return None
+        own, last = self._settings.task, deciding_evaluation(self._settings, generation)
+        if own.temperature is None or last < 0:
+            return own
         while self._next <= last:
-            if (check := finished.get(self._next)) is not None:
-                self._look(check)
+            if (evaluation := finished.get(self._next)) is not None:
+                self._look(evaluation)
             self._next += self._settings.evaluate_every
-        return None if self._temperature == own else self._temperature
+        return own.at(self._temperature)
 
-    def _look(self, check: StoredEvaluation) -> None:
-        if self._best is not None and check.behind(self._best):
+    def _look(self, evaluation: StoredEvaluation) -> None:
+        if self._best is not None and evaluation.behind(self._best):
             assert self._temperature is not None
             self._temperature, self._best = min(self._temperature * self._settings.heat, HOTTEST), None
-        elif self._best is None or check.mean > self._best.mean:
-            self._best = check
+        elif self._best is None or evaluation.mean > self._best.mean:
+            self._best = evaluation
 
 
-def raised_temperature(generation: int, settings: RunSettings, evaluations: Iterable[StoredEvaluation]) -> float | None:
-    """The temperature that one `generation` dreams at, as `Heat` tells it; `None` where it is the run's own."""
-    return Heat(settings).temperature(generation, {each.generation: each for each in evaluations})
+def spec_at(generation: int, settings: RunSettings, evaluations: Iterable[StoredEvaluation]) -> TaskSpec:
+    """What one `generation` is scored in, as `Heat` tells it."""
+    return Heat(settings).spec(generation, {each.generation: each for each in evaluations})
 
 
 def spec_of(run: RunFolder, generation: int) -> TaskSpec:
     """What the candidates of a stored run's generation are scored in."""
-    return run.spec.at(raised_temperature(generation, run.settings, run.evaluations()))
+    return spec_at(generation, run.settings, run.evaluations())

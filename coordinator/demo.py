@@ -29,7 +29,7 @@ from dreamfleet.common.table import run_panel
 REFRESH = 0.5
 START_SECONDS = 30.0
 PLOT, VIDEO = "fitness.png", "drive.mp4"
-CHECK_EVERY, CHECK_TRACKS = 5, 8  # generations between looks at reality, and tracks of each
+EVALUATE_EVERY, EVALUATION_TRACKS = 5, 8  # generations between looks at reality, and tracks of each
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ class Demo:
         """Evolve, judge, draw, record, and say what to try next."""
         for stage in self._stages:
             self._evolve(stage)
-        best = max(reversed(self._stages), key=self._checked)  # of equals the last
+        best = max(reversed(self._stages), key=self._evaluated)  # of equals the last
         if len(self._stages) > 1:
-            self._say(f"going on with the mean that drove best when it was checked: run {best.run}'s")
+            self._say(f"going on with the mean that drove best when it was evaluated: run {best.run}'s")
         folder = self._runs_dir / best.run
         self._say("judging the outcome on unseen tracks, whole episodes, in gymnasium's own environment")
         controller = str(folder / CONTROLLER)
@@ -93,7 +93,7 @@ class Demo:
         call("record", "--controller", controller, "--out", folder / VIDEO, "--steps", 1000)
         self._farewell(folder)
 
-    def _checked(self, stage: Stage) -> float:
+    def _evaluated(self, stage: Stage) -> float:
         """The best score of a stage's mean in reality, on tracks that are the same in every stage."""
         with open_run(self._runs_dir, stage.run) as run:
             return max((each.mean for each in run.evaluations()), default=-math.inf)
@@ -175,12 +175,12 @@ def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
         dream = f"{name}-dream"
         flags = {
             "preset": "dream", "temperature": config.temperature, "sigma0": config.sigma0, "seed": config.seed,
-            "minutes": config.dream_minutes, "reality-check": CHECK_EVERY, "evaluation-episodes": CHECK_TRACKS,
+            "minutes": config.dream_minutes, "evaluate-every": EVALUATE_EVERY, "evaluation-episodes": EVALUATION_TRACKS,
         }  # fmt: skip
         found.append(Stage(dream, f"evolving in the dream for {config.dream_minutes:g} minutes", flags))
         reality |= {
             "init": runs_dir / dream / CONTROLLER, "sigma0": config.sigma0 / 2,
-            "evaluate-every": CHECK_EVERY, "evaluation-episodes": CHECK_TRACKS,
+            "evaluate-every": EVALUATE_EVERY, "evaluation-episodes": EVALUATION_TRACKS,
         }  # fmt: skip
     if config.minutes:
         found.append(Stage(name, f"evolving in reality for {config.minutes:g} minutes", reality))

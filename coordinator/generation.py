@@ -26,20 +26,20 @@ class Generation:
     """Which candidate's which episode each digest is, and its fitness once known.
 
     With `racing` every candidate drives the first half of the episodes, and after this barrier the better half of the
-    candidates the others; of equals the one with the lower index goes on. `temperature` is one other than the
-    specification's.
+    candidates the others; of equals the one with the lower index goes on. `own` is the run's specification where
+    `spec`, at a raised temperature, is another.
     """
 
     def __init__(
         self, number: int, spec: TaskSpec, vectors: Sequence[bytes], seeds: Sequence[int], *, racing: bool = False,
-        temperature: float | None = None,
+        own: TaskSpec | None = None,
     ) -> None:  # fmt: skip
         self.number = number
-        self.temperature = temperature
+        self.spec = spec
         self.work = [
             work
             for candidate, vector in enumerate(vectors)
-            for work in make_work(spec, "score", number, candidate, vector, seeds, temperature)
+            for work in make_work(spec, "score", number, candidate, vector, seeds, own)
         ]
         # Equal vectors have equal digests: one job then fills the place of each of them.
         self._places: dict[bytes, list[tuple[int, int]]] = {}

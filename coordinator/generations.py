@@ -16,11 +16,11 @@ from dreamfleet.coordinator.journal import Journal, OpenGeneration
 
 
 class Generations:
-    """One generation is open at a time; `checks` are the finished evaluations, by generation, as they become known."""
+    """One generation is open at a time; `evaluations` are the finished ones, by generation, as they become known."""
 
     def __init__(
         self, journal: Journal, settings: RunSettings, strategy: Evolution, history: History,
-        checks: Mapping[int, StoredEvaluation],
+        evaluations: Mapping[int, StoredEvaluation],
     ) -> None:  # fmt: skip
         self.history = history
         self.last: Standing | None = None  # of the generation that was closed last
@@ -28,7 +28,7 @@ class Generations:
         self._settings = settings
         self._strategy = strategy
         self._heat = Heat(settings)
-        self._checks = checks
+        self._evaluations = evaluations
 
     @property
     def mean(self) -> bytes:
@@ -86,6 +86,5 @@ class Generations:
         return generation
 
     def _generation(self, number: int, vectors: Sequence[bytes], seeds: Sequence[int]) -> Generation:
-        temperature = self._heat.temperature(number, self._checks)
-        settings = self._settings
-        return Generation(number, settings.task, vectors, seeds, racing=settings.racing, temperature=temperature)
+        settings, spec = self._settings, self._heat.spec(number, self._evaluations)
+        return Generation(number, spec, vectors, seeds, racing=settings.racing, own=settings.task)

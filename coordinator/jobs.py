@@ -29,10 +29,14 @@ def travelling(vector: NDArray[np.float64]) -> bytes:
 
 def make_work(
     spec: TaskSpec, kind: Kind, generation: int, candidate: int, vector: bytes, seeds: Sequence[int],
-    temperature: float | None = None,
+    own: TaskSpec | None = None,
 ) -> list[Work]:  # fmt: skip
-    """One job an episode; `seeds` holds one seed an episode, `temperature` is one other than the specification's."""
-    identity, spec = hashlib.sha256(vector).digest(), spec.at(temperature)
+    """One job an episode; `seeds` holds one seed an episode. `own` is the run's specification where `spec` is another.
+
+    A job names its temperature only where that is not the run's own.
+    """
+    identity = hashlib.sha256(vector).digest()
+    temperature = None if own is None or spec.temperature == own.temperature else spec.temperature
     return [
         Work(
             Job(

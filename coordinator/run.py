@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dreamfleet.common.heat import deciding_check
+from dreamfleet.common.heat import deciding_evaluation
 from dreamfleet.common.messages import Result
 from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.config import LimitsConfig
@@ -53,8 +53,8 @@ class Run:
         self._evolution = Evolution(EvolutionConfig.of(settings), start.mean if start else None)
         if start:
             journal.set_fact("start", start.source)
-        checks = self.slack.evaluations.finished
-        self._generations = Generations(journal, settings, self._evolution, self.history, checks)
+        evaluated = self.slack.evaluations.finished
+        self._generations = Generations(journal, settings, self._evolution, self.history, evaluated)
         self.opened = now
         self.generation = self._begin(now)
 
@@ -66,7 +66,7 @@ class Run:
     @property
     def temperature(self) -> float | None:
         """At which the open generation dreams; `None` where a task has none."""
-        return self.settings.task.at(self.generation.temperature).temperature
+        return self.generation.spec.temperature
 
     @property
     def last(self) -> Standing | None:
@@ -141,8 +141,8 @@ class Run:
     @property
     def _waiting(self) -> bool:
         """Whether the run is ending, or the next generation's temperature hangs on an evaluation in progress."""
-        check = deciding_check(self.settings, self.generation.number + 1)
-        return self._ending or (self.slack.evaluations.awaits(check) and self.generation.complete)
+        deciding = deciding_evaluation(self.settings, self.generation.number + 1)
+        return self._ending or (self.slack.evaluations.awaits(deciding) and self.generation.complete)
 
     def _begin(self, now: float) -> Generation:
         generation = self._generations.begin()
@@ -166,10 +166,10 @@ class Run:
         self.fleet.offer(self.slack.schedule(closed.number, self._generations.mean, now, last=reason is not None))
         # Opened also when the run ends here: a later life with wider limits then goes on from it.
         generation = self._generations.open(closed.number + 1)
-        if generation.temperature != self.generation.temperature:
+        if generation.spec != self.generation.spec:
             self.fleet.notes.append(
-                f"generation {generation.number} dreams at temperature {generation.temperature:g}: the evaluated mean "
-                "fell"
+                f"generation {generation.number} dreams at temperature {generation.spec.temperature:g}: the evaluated "
+                "mean fell"
             )
         self.generation, self.opened = generation, now
         self.fleet.begin(generation.number)

@@ -21,7 +21,7 @@ def points(*more):
     ("words", "said"),
     [
         (("coordinator", "--populaton", "8"), "unrecognized arguments: --populaton 8; did you mean --population?"),
-        (("coordinator", "--reality-chek=3"), "did you mean --reality-check?"),
+        (("coordinator", "--evaluate-evry=3"), "did you mean --evaluate-every?"),
         (("worker", "--conect", "tcp/a:1"), "did you mean --connect?"),
         (("train", "vae", "--data", "x", "--updats", "3"), "did you mean --updates?"),
         (("status", "--xyzzy"), "unrecognized arguments: --xyzzy\n"),

@@ -20,7 +20,7 @@ HEATED_GENERATIONS = 14
 def begin(processes, bundle, name):
     return processes.coordinator(
         "--preset", "dream", "--bundle", bundle.path, "--population", POPULATION, "--episodes", EPISODES,
-        "--horizon", 300, "--generations", GENERATIONS, "--reality-check", 2, "--evaluation-episodes", 2, name=name,
+        "--horizon", 300, "--generations", GENERATIONS, "--evaluate-every", 2, "--evaluation-episodes", 2, name=name,
     )  # fmt: skip
 
 
@@ -55,7 +55,7 @@ def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bund
 def begin_heated(processes, bundle, name):
     return processes.coordinator(
         "--bundle", bundle.path, "--task", tasks.OPTIMISTIC, "--population", POPULATION, "--episodes", EPISODES,
-        "--sigma0", 0.5, "--temperature", 1.0, "--heat", 1.5, "--reality-check", 2, "--evaluation-episodes", 8,
+        "--sigma0", 0.5, "--temperature", 1.0, "--heat", 1.5, "--evaluate-every", 2, "--evaluation-episodes", 8,
         "--generations", HEATED_GENERATIONS, name=name,
     )  # fmt: skip
 

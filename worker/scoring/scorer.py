@@ -37,41 +37,43 @@ class Scorer:
                 f"the run scores in version {spec.version} of task {spec.task}, here is version {self.world.version}: "
                 "install the package version that the run was begun with"
             )
-        self._spec = spec
-        self._batch_at: Callable[[float | None], Batch] | None = None
+        self.spec = spec
+        self._batch_for: Callable[[TaskSpec], Batch] | None = None
         if isinstance(task, Batched) and not judge:
             make = task.make_batch
             # One is kept: a run's temperature is raised now and then, and making a batch takes milliseconds.
-            self._batch_at = lru_cache(maxsize=1)(lambda temperature: make(assignment.at(temperature)))
-            self._batch_at(None)  # so that what is wrong with it shows at once
+            self._batch_for = lru_cache(maxsize=1)(lambda each: make(Assignment(each, assignment.bundle)))
+            self._batch_for(spec)  # so that what is wrong with it shows at once
         self._environment = task.make_judge(assignment) if judge else task.make_environment(assignment)
         self._policy = task.make_policy(assignment)
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,
-        temperature: float | None = None,
+        spec: TaskSpec | None = None,
     ) -> Score:  # fmt: skip
         """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode.
 
-        `temperature` is one other than the run's.
+        `spec` is one other than the run's: the same at another temperature.
         """
-        if kind == "score" and self._batch_at is not None:
-            return self._batch_at(temperature).score([(parameters, seed)], on_step)[0]
+        if kind == "score" and self._batch_for is not None:
+            return self._batch_for(spec or self.spec).score([(parameters, seed)], on_step)[0]
         return score(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
 
     def score_all(
         self, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]], on_step: Callable[[int], None],
-        temperature: float | None = None,
+        spec: TaskSpec | None = None,
     ) -> list[Score]:  # fmt: skip
         """A turn's jobs, as `score` does; `on_step` hears of all steps made so far."""
-        if self._batch_at is not None and all(kind == "score" for kind, _, _ in jobs):
-            return self._batch_at(temperature).score([(parameters, seed) for _, parameters, seed in jobs], on_step)
+        if self._batch_for is not None and all(kind == "score" for kind, _, _ in jobs):
+            return self._batch_for(spec or self.spec).score(
+                [(parameters, seed) for _, parameters, seed in jobs], on_step
+            )
         scores: list[Score] = []
         for job in jobs:
             before = sum(each.steps for each in scores)
             scores.append(
-                self.score(*job, lambda done, before=before: on_step(before + done), temperature)  # type: ignore[misc]
+                self.score(*job, lambda done, before=before: on_step(before + done), spec)  # type: ignore[misc]
             )
         return scores
 
@@ -92,7 +94,7 @@ class Scorer:
         """The episode that a job of this kind and seed is."""
         if kind == "evaluate":
             return Course(seed, self.world.horizon)
-        return Course(seed, self._spec.horizon, self._spec.patience, self.world.idle_cost)
+        return Course(seed, self.spec.horizon, self.spec.patience, self.world.idle_cost)
 
     def close(self) -> None:
         """Release the environment."""

@@ -120,7 +120,7 @@ def _score(scorer: Scorer, work: Sequence[Work], on_step: Callable[[int], None])
         _, vector, seed = episodes[0]
         score, drive = scorer.collect(vector, seed, on_step)
         return [score], _packed(drive)
-    return scorer.score_all(episodes, on_step, work[0][0].temperature), None
+    return scorer.score_all(episodes, on_step, scorer.spec.at(work[0][0].temperature)), None
 
 
 def _results(work: Sequence[Work], scores: list[Score], spent: float, upload: bytes | None) -> tuple[Result, ...]:

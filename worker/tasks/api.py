@@ -7,7 +7,7 @@ environment satisfy the same contract, so that no caller can tell them apart.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import gymnasium
@@ -126,10 +126,6 @@ class Assignment:
         if self.spec.controller is None:
             return self.world_model.controller_shape
         return self.spec.controller
-
-    def at(self, temperature: float | None) -> Assignment:
-        """The same at another temperature; `None`: at its own."""
-        return replace(self, spec=self.spec.at(temperature))
 
 
 class Task:

@@ -113,8 +113,8 @@ def test_a_turn_is_scored_at_its_jobs_temperature_as_a_run_of_that_temperature_s
     jobs = [("score", random.normal(size=867).astype(np.float32), seed) for seed in (1, 2, 3)]
     scorer, found = Scorer(spec, random_bundle), {}
     for temperature in (None, 1.5, None, 2.25, 1.5):
-        scores = scorer.score_all(jobs, lambda _: None, temperature)
-        assert scores == [scorer.score(*each, temperature=temperature) for each in jobs]
+        scores = scorer.score_all(jobs, lambda _: None, spec.at(temperature))
+        assert scores == [scorer.score(*each, spec=spec.at(temperature)) for each in jobs]
         assert scores == found.setdefault(temperature, scores)
         assert scores == Scorer(spec.at(temperature), random_bundle).score_all(jobs, lambda _: None)
     assert len({score.fitness for scores in found.values() for score in scores}) == 9
