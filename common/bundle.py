@@ -233,10 +233,10 @@ def _look(path: Path, manifest: Manifest, name: str, data: bytes) -> None:
     if latents.ndim != 3 or latents.shape[1:] != (2, manifest.latent) or not len(latents):
         raise BundleError(
             f"{path}: {name} must be (N, 2, {manifest.latent}) with N at least 1, not {latents.shape}; build the "
-            "bundle again from encoded drives"
+            "bundle again from encoded rollouts"
         )
     if not np.isfinite(latents).all():
-        raise BundleError(f"{path}: {name} holds NaN or infinity; encode the drives again")
+        raise BundleError(f"{path}: {name} holds NaN or infinity; encode the rollouts again")
 
 
 def _read_manifest(archive: zipfile.ZipFile, path: Path) -> Manifest:

@@ -239,7 +239,7 @@ _RESULT = "kind, generation, candidate, episode, seed, fitness, steps, seconds, 
 
 
 def rollout_path(folder: Path, generation: int, episode: int) -> Path:
-    """Where a drive that a run collected lies: an episode as data sets hold it."""
+    """Where a rollout that a run collected lies: an episode as data sets hold it."""
     return folder / ROLLOUTS / f"{generation:06d}-{episode:04d}.npz"
 
 

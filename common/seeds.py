@@ -22,7 +22,7 @@ def training_seed(run_seed: int, generation: int, episode: int) -> int:
 
 
 def collection_seed(run_seed: int, generation: int, episode: int) -> int:
-    """Seed of one drive that is kept for training: a training track, and none that a candidate is scored on."""
+    """Seed of one rollout that is kept for training: a training track, and none that a candidate is scored on."""
     return _derived(f"dreamfleet collection {run_seed} {generation} {episode}")
 
 

@@ -106,7 +106,7 @@ def _progress(status: Status) -> Table:
     parts: dict[str, OpenGeneration | Progress] = {
         f"generation {status.generation.number}": status.generation,
         "evaluation": status.evaluating,
-        "kept drives": status.collecting,
+        "kept rollouts": status.collecting,
     }
     for label, part in parts.items():
         if part.episodes and not (part is status.generation and status.state in ("ended", "evaluating")):

@@ -1,4 +1,4 @@
-"""Drives of the mean that are kept: the next world model then learns from what evolved controllers see."""
+"""Rollouts of the mean that are kept: the next world model then learns from what evolved controllers see."""
 
 from __future__ import annotations
 
@@ -30,41 +30,41 @@ class Collection:
 
 
 class Collections:
-    """A run's kept drives: which are still to come, and each one's file in the run's `folder` once it is whole."""
+    """A run's kept rollouts: which are still to come, and each one's file in the run's `folder` once it is whole."""
 
     def __init__(self, folder: Path) -> None:
         self.uploads = Uploads()
         self._folder = folder
         self._missing: set[bytes] = set()  # digests
-        self._scheduled = 0  # drives, ever
+        self._scheduled = 0  # rollouts, ever
 
     def open(self, work: list[Work], known: Container[bytes]) -> list[Work]:
-        """Want these drives, of which some may be kept already; the missing jobs."""
+        """Want these rollouts, of which some may be kept already; the missing jobs."""
         missing = [each for each in work if each.job.digest not in known]
         self._scheduled += len(work)
         self._missing.update(each.job.digest for each in missing)
         return missing
 
     def finish(self, digest: bytes) -> None:
-        """Count a drive whose result was accepted."""
+        """Count a rollout whose result was accepted."""
         self._missing.discard(digest)
 
     @property
     def in_progress(self) -> int:
-        """Drives that are still to come."""
+        """Rollouts that are still to come."""
         return len(self._missing)
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Drives of the whole run: kept, wanted."""
+        """Rollouts of the whole run: kept, wanted."""
         return self._scheduled - len(self._missing), self._scheduled
 
     def receive(self, worker: str, result: Result, work: Work | None) -> Result | None:
-        """The result as it may be judged, its drive on disk if it has one; `None` while the drive is on its way."""
+        """The result as it may be judged, its rollout on disk if it has one; `None` while the rollout is on its way."""
         if work is None or work.job.kind != "collect" or result.fitness is None:
             return result
         if result.upload is None:
-            return replace(result, fitness=None, error="the drive was not kept: update dreamfleet on this host")
+            return replace(result, fitness=None, error="the rollout was not kept: update dreamfleet on this host")
         data = self.uploads.take(worker, result.digest, result.upload)
         if data is None:
             return None

@@ -52,7 +52,7 @@ class RunConfig:
     seed: int = option(1, "makes the run: population and tracks follow from it")
     evaluate_every: int = option(25, "drive the mean in reality every so many generations; 0: never")
     evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation tracks")
-    collect_every: int = option(0, "keep drives of the mean for training, every so many generations; 0: never")
+    collect_every: int = option(0, "keep rollouts of the mean for training, every so many generations; 0: never")
     collect_episodes: int = option(8, "drives that are kept each time, on training tracks")
 
     def __post_init__(self) -> None:

@@ -69,7 +69,7 @@ class Exchange:
             self._uploads.forget(result.digest)
 
     def upload(self, worker: str, part: UploadPart, now: float) -> None:
-        """Take in part of a drive, from a worker that was given the job and while it is wanted."""
+        """Take in part of a rollout, from a worker that was given the job and while it is wanted."""
         work = self._fleet.wants(part.digest)
         if work is None or work.job.kind != "collect" or not self._fleet.holds(worker, part.digest):
             self._uploads.dropped["unwanted upload"] += 1

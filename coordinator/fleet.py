@@ -60,7 +60,7 @@ class Fleet:
         self._tags: dict[bytes, bytes] = {}
         self._queue: list[tuple[bool, int, bytes]] = []  # what waits for slack last, then in order of offer
         self._orders = 0
-        self._in_slack = 0  # evaluations and collected drives that somebody holds
+        self._in_slack = 0  # evaluations and collected rollouts that somebody holds
         self._failing: dict[bytes, Wanted] = {}  # those of the wanted that failed somewhere
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this one and the last
         self._tail = Tail(beat)
@@ -68,7 +68,7 @@ class Fleet:
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
         self.notes: list[str] = []  # what happened, for whoever writes it down and clears it
-        self.hurry = False  # nothing but evaluations and collected drives is left to wait for
+        self.hurry = False  # nothing but evaluations and collected rollouts is left to wait for
         self.paused = False
 
     def offer(self, work: Iterable[Work]) -> None:
@@ -364,7 +364,7 @@ class Fleet:
         return given
 
     def _slack_slots(self) -> int:
-        """Drives of a mean fill the tail of a generation and never more than a quarter of the slots."""
+        """Rollouts of a mean fill the tail of a generation and never more than a quarter of the slots."""
         return max(1, sum(member.slots for member in self.members.values() if member.present) // 4)
 
 

@@ -45,7 +45,7 @@ class Run:
         self.incarnation = journal.begin_incarnation()
         self._journal = journal
         self._untold: list[StoredGeneration] = []
-        self._ending = False  # a limit is reached: only evaluations and collected drives are waited for
+        self._ending = False  # a limit is reached: only evaluations and collected rollouts are waited for
         closed, evaluations = journal.closed()
         self.history = History(closed)
         self.slack = Slack(journal, settings, self.uid, self.history, evaluations)

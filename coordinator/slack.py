@@ -1,4 +1,4 @@
-"""What a run wants beside scoring: its mean evaluated, drives of it kept. It fills what scoring leaves idle."""
+"""What a run wants beside scoring: its mean evaluated, rollouts of it kept. It fills what scoring leaves idle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dreamfleet.coordinator.report import Report
 
 
 class Slack:
-    """Evaluations and kept drives of one run, and the report that follows from the evaluations."""
+    """Evaluations and kept rollouts of one run, and the report that follows from the evaluations."""
 
     def __init__(
         self, journal: Journal, settings: RunSettings, run_uid: str, history: History,

@@ -1,4 +1,4 @@
-"""Drives on their way in: parts in any order, doubled or missing, until the whole has its hash. Pure.
+"""Rollouts on their way in: parts in any order, doubled or missing, until the whole has its hash. Pure.
 
 Memory is bounded whatever arrives: so many uploads, so many bytes, and none that stands still for long.
 """

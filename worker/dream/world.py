@@ -90,6 +90,6 @@ def check_temperature(temperature: float) -> None:
 
 
 def read_initial(bundle: Bundle) -> Floats:
-    """First latents of recorded drives `(N, 2, latent)`, mu and logvar; an opened bundle has at least one."""
+    """First latents of recorded rollouts `(N, 2, latent)`, mu and logvar; an opened bundle has at least one."""
     initial: Floats = np.load(io.BytesIO(bundle.read(INITIAL)), allow_pickle=False).astype(np.float32)
     return initial

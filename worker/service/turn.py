@@ -114,7 +114,7 @@ def do_turn(scorer: Scorer, turn: int, work: Sequence[Work], count: Callable[[in
 
 
 def _score(scorer: Scorer, work: Sequence[Work], on_step: Callable[[int], None]) -> tuple[list[Score], bytes | None]:
-    """The score of each job, and the file of a kept drive."""
+    """The score of each job, and the file of a kept rollout."""
     episodes = [(job.kind, np.frombuffer(vector, dtype="<f4"), job.seeds[0]) for job, vector in work]
     if episodes[0][0] == "collect":
         _, vector, seed = episodes[0]
@@ -139,5 +139,5 @@ def _results(work: Sequence[Work], scores: list[Score], spent: float, upload: by
 def _packed(drive: Rollout) -> bytes:
     data = drive.packed()
     if len(data) > MAX_UPLOAD:
-        raise ValueError(f"a drive of {len(drive)} steps is larger than {MAX_UPLOAD >> 20} MiB: shorten the horizon")
+        raise ValueError(f"a rollout of {len(drive)} steps is larger than {MAX_UPLOAD >> 20} MiB: shorten the horizon")
     return data

@@ -1,4 +1,4 @@
-"""Drives that are on their way to the coordinator. Pure: a clock in, parts to send out.
+"""Rollouts that are on their way to the coordinator. Pure: a clock in, parts to send out.
 
 The whole is sent again and again, with longer and longer pauses, until the verdict on its job comes: a slow link is
 not filled with repetitions, and a part that was lost comes with the next round.

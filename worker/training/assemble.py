@@ -128,7 +128,7 @@ def graphs(
 
 
 def initial_latents(folder: Path) -> NDArray[np.float32]:
-    """First `mu` and `logvar` of recorded drives, `(N, 2, latent)`: where dreams begin."""
+    """First `mu` and `logvar` of recorded rollouts, `(N, 2, latent)`: where dreams begin."""
     firsts = []
     for path in episodes(folder, ENCODED)[:INITIAL_LATENTS]:
         arrays = load(path, "mu", "logvar")

@@ -1,4 +1,4 @@
-"""Collecting drives: one compressed `.npz` an episode, each a pure function of (seed, number)."""
+"""Collecting rollouts: one compressed `.npz` an episode, each a pure function of (seed, number)."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ def collect(folder: Path, config: CollectConfig, jobs: int) -> Generator[int, No
     pool = ProcessPoolExecutor(min(jobs, len(numbers)), get_context("spawn"), _start_process, (os.getpid(),))
     try:
         with signals_held():
-            drives = [pool.submit(_collect_one, (folder, config, number)) for number in numbers]
-        for each in as_completed(drives):
+            rollouts = [pool.submit(_collect_one, (folder, config, number)) for number in numbers]
+        for each in as_completed(rollouts):
             yield each.result()
     except BrokenProcessPool as error:
         raise DreamfleetError("a process that drove has crashed; `dreamfleet doctor` looks for the cause") from error

@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dreamfleet.worker.training.drives import Drives, load_drives
+from dreamfleet.worker.training.rollouts import Rollouts, load_rollouts
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction, reward_labels
 
 AHEAD = (1, 10, 50)  # steps of dreaming
 EVERY = 25  # a dream begins behind so many recorded steps more
-MOST = 40  # held-out drives
+MOST = 40  # held-out rollouts
 
 Floats = NDArray[np.float32]
 
@@ -24,23 +24,23 @@ def foresight(model: MDNRNN, held_out: Sequence[Path]) -> dict[str, float]:
     """Of each head, how it judges recorded steps, and `_after_N` those that N dreamt steps lead to.
 
     Binary heads by the area under the curve, a value by its root mean square error; latents by theirs, in units of
-    their spread. A figure that the drives cannot tell (they are too short, or all labels equal) is left out.
+    their spread. A figure that the rollouts cannot tell (they are too short, or all labels equal) is left out.
     """
     device = next(model.parameters()).device
-    drives = load_drives(held_out[:MOST]).to(device)
+    rollouts = load_rollouts(held_out[:MOST]).to(device)
     model.eval()
     with torch.no_grad():
-        told, hidden_states = _follow(model, drives)
-        labels = _labels(model, drives)
-        mask = drives.mask > 0
+        told, hidden_states = _follow(model, rollouts)
+        labels = _labels(model, rollouts)
+        mask = rollouts.mask > 0
         figures = {name: _judge(model, name, _head(told, name)[mask], labels[name][mask]) for name in labels}
-        for ahead, (seen, predicted, latents) in _dream(model, drives, hidden_states).items():
+        for ahead, (seen, predicted, latents) in _dream(model, rollouts, hidden_states).items():
             rows, steps = seen
             for name in labels:
                 figures[f"{name}_after_{ahead}"] = _judge(
                     model, name, _head(predicted, name), labels[name][rows, steps]
                 )
-            error = (latents - drives.mu[rows, steps]).square().mean().sqrt() / drives.mu[mask].std()
+            error = (latents - rollouts.mu[rows, steps]).square().mean().sqrt() / rollouts.mu[mask].std()
             figures[f"latent_error_after_{ahead}"] = float(error)
     named = {name if "error" in name else _figure(model, name): value for name, value in figures.items()}
     return {name: round(value, 3) for name, value in named.items() if np.isfinite(value)}
@@ -55,41 +55,41 @@ def area_under_curve(scores: Floats, positive: NDArray[np.bool_]) -> float:
     return float((ranks[positive].sum() - positives * (positives + 1) / 2) / pairs) if pairs else float("nan")
 
 
-def _follow(model: MDNRNN, drives: Drives) -> tuple[Prediction, list[Tensor]]:
-    """Predictions along the recorded drives, and the state before each step."""
+def _follow(model: MDNRNN, rollouts: Rollouts) -> tuple[Prediction, list[Tensor]]:
+    """Predictions along the recorded rollouts, and the state before each step."""
     config = model.config
-    labels = reward_labels(config.reward, drives.reward, drives.done)
-    state = drives.mu.new_zeros(len(drives.mu), config.state)
+    labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
+    state = rollouts.mu.new_zeros(len(rollouts.mu), config.state)
     states, hidden = [], []
-    for step in range(drives.mu.shape[1]):
+    for step in range(rollouts.mu.shape[1]):
         if config.previous_reward and step:
             state = _remember(model, state, labels[:, step - 1])
         states.append(state)
-        last, state = model.advance(torch.cat([drives.mu[:, step], drives.action[:, step]], dim=1), state)
+        last, state = model.advance(torch.cat([rollouts.mu[:, step], rollouts.action[:, step]], dim=1), state)
         hidden.append(last)
     return model.predict(torch.stack(hidden, dim=1)), states
 
 
 def _dream(
-    model: MDNRNN, drives: Drives, states: list[Tensor]
+    model: MDNRNN, rollouts: Rollouts, states: list[Tensor]
 ) -> dict[int, tuple[tuple[Tensor, Tensor], Prediction, Tensor]]:
     """From recorded prefixes on, dreaming means under the recorded actions.
 
     By steps ahead: which recorded steps (rows, steps) the dreams have come to, what is told there, dreamt latents.
     """
-    config, length = model.config, drives.mu.shape[1]
+    config, length = model.config, rollouts.mu.shape[1]
     found: dict[int, list[tuple[Tensor, Tensor, Tensor, Tensor]]] = {ahead: [] for ahead in AHEAD}
     for start in range(EVERY, length - 1, EVERY):
-        latent, state = drives.mu[:, start], states[start]
+        latent, state = rollouts.mu[:, start], states[start]
         for ahead in range(1, min(max(AHEAD), length - 1 - start) + 1):
-            hidden, state = model.advance(torch.cat([latent, drives.action[:, start + ahead - 1]], dim=1), state)
+            hidden, state = model.advance(torch.cat([latent, rollouts.action[:, start + ahead - 1]], dim=1), state)
             told = model.predict(hidden)
             latent = (told.log_weights.exp() * told.means).sum(dim=-1)
             if config.previous_reward:
                 state = _remember(model, state, told.reward if config.reward == "value" else (told.reward > 0).float())
             if ahead in found:
-                rows = torch.nonzero(drives.mask[:, start + ahead])[:, 0]
-                last, _ = model.advance(torch.cat([latent, drives.action[:, start + ahead]], dim=1), state)
+                rows = torch.nonzero(rollouts.mask[:, start + ahead])[:, 0]
+                last, _ = model.advance(torch.cat([latent, rollouts.action[:, start + ahead]], dim=1), state)
                 found[ahead].append((rows, torch.full_like(rows, start + ahead), last[rows], latent[rows]))
     result = {}
     for ahead, parts in found.items():
@@ -105,12 +105,12 @@ def _remember(model: MDNRNN, state: Tensor, label: Tensor) -> Tensor:
     return state
 
 
-def _labels(model: MDNRNN, drives: Drives) -> dict[str, Tensor]:
+def _labels(model: MDNRNN, rollouts: Rollouts) -> dict[str, Tensor]:
     config, labels = model.config, dict[str, Tensor]()
     if config.rewarded:
-        labels["reward"] = reward_labels(config.reward, drives.reward, drives.done)
+        labels["reward"] = reward_labels(config.reward, rollouts.reward, rollouts.done)
     if config.done:
-        labels["done"] = drives.done
+        labels["done"] = rollouts.done
     return labels
 
 

@@ -1,4 +1,4 @@
-"""Drives that a run collected, taken into a data set: each once, under the next free number."""
+"""Rollouts that a run collected, taken into a data set: each once, under the next free number."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from dreamfleet.worker.training.collect import episode_path, present
 from dreamfleet.worker.training.dataset import load, load_pictures, preprocessing_of
 
 
-def take_in(folder: Path, drives: Sequence[Path]) -> Iterator[int]:
-    """Copy the drives that the data set lacks; yields the frames of each. Which it has, their bytes tell.
+def take_in(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
+    """Copy the rollouts that the data set lacks; yields the frames of each. Which it has, their bytes tell.
 
     `DatasetError` before anything is copied if not all pictures, the data set's among them, are of one preprocessing.
     """
     there = present(folder)
-    kinds = {preprocessing_of(path): path for path in (*there, *drives)}
+    kinds = {preprocessing_of(path): path for path in (*there, *rollouts)}
     if len(kinds) > 1:
         told = " and ".join(f"{kind!r} ({path})" for kind, path in kinds.items())
         raise DatasetError(f"a data set's pictures are of one kind, and these are {told}; choose another --data")
-    sizes = {path.stat().st_size for path in drives if path.exists()}
+    sizes = {path.stat().st_size for path in rollouts if path.exists()}
     known = {hash_file(path) for path in there if path.stat().st_size in sizes}
     number = int(there[-1].stem) + 1 if there else 0
-    for path in drives:
+    for path in rollouts:
         frames = _check(path)
         if (identity := hash_file(path)) in known:
             continue

@@ -32,7 +32,7 @@ TINY = Preset(
     vae=TrainConfig(updates=1500, batch=100, rate=5e-4, clip=0),
     mdnrnn=TrainConfig(updates=800, batch=32, rate=1e-3),
 )
-# The sources' amounts: ten passes over the frames for the VAE, 4000 updates of 100 drives for the MDN-RNN.
+# The sources' amounts: ten passes over the frames for the VAE, 4000 updates of 100 rollouts for the MDN-RNN.
 _RNN = TrainConfig(updates=4000, batch=100, rate=1e-3, patience=10)
 NOTEBOOK = Preset(
     name="notebook",

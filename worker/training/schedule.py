@@ -17,7 +17,7 @@ from dreamfleet.worker.training.train_config import TrainConfig
 
 
 class Schedule:
-    """A training's progress on disk: goes on where it stopped, and ends early when held-out drives gain nothing."""
+    """A training's progress on disk: goes on where it stopped, and ends early when held-out rollouts gain nothing."""
 
     def __init__(
         self, path: Path, model: torch.nn.Module, config: TrainConfig, episodes: int, other: Path | None = None
@@ -81,7 +81,7 @@ class Schedule:
 
     @property
     def due(self) -> bool:
-        """Whether to look at the held-out drives."""
+        """Whether to look at the held-out rollouts."""
         return self.update % self._config.validate_every == 0 or self.update == self._config.updates
 
     def save(self) -> None:

@@ -1,4 +1,4 @@
-"""Training the MDN-RNN on encoded drives."""
+"""Training the MDN-RNN on encoded rollouts."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from dreamfleet.common.progress import append_curve
 from dreamfleet.common.stopping import Stop, never
 from dreamfleet.worker.training.checkpoint import load_progress
 from dreamfleet.worker.training.dataset import episodes, load, split
-from dreamfleet.worker.training.drives import Drives, inputs_of, load_drives
 from dreamfleet.worker.training.encode import ENCODED, encoder_of
 from dreamfleet.worker.training.foresight import foresight
+from dreamfleet.worker.training.rollouts import Rollouts, inputs_of, load_rollouts
 from dreamfleet.worker.training.schedule import Schedule
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.training.train_vae import Report
@@ -24,7 +24,7 @@ from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss
 from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
 
 CHECKPOINT = "mdnrnn.safetensors"
-VALIDATION_DRIVES = 20  # for the curve while training
+VALIDATION_ROLLOUTS = 20  # for the curve while training
 
 
 def train_mdnrnn(
@@ -39,7 +39,7 @@ def train_mdnrnn(
     vae = encoder_of(folder)
     latents = load(train[0], "mu")["mu"].shape[1]
     if layers.latent != latents:
-        raise DatasetError(f"the encoded drives have {latents} latents, this MDN-RNN {layers.latent}: give --latent")
+        raise DatasetError(f"the encoded rollouts have {latents} latents, this MDN-RNN {layers.latent}: give --latent")
     torch.manual_seed(config.seed)
     model = MDNRNN(layers).to(device)
     schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from)
@@ -53,15 +53,15 @@ def train_mdnrnn(
         noise = torch.Generator().manual_seed(config.seed * 1_000_003 + update)
         torch.manual_seed(config.seed * 1_000_003 + update)  # of the dropout
         chosen = random.choice(len(train), size=min(config.batch, len(train)), replace=False)
-        drives = load_drives([train[index] for index in chosen], random.random(len(chosen)) < 0.5)
+        rollouts = load_rollouts([train[index] for index in chosen], random.random(len(chosen)) < 0.5)
         model.train()
-        values = backward(model, drives, noise, device)
+        values = backward(model, rollouts, noise, device)
         schedule.step(sum(values.values()))
         report(update, "  ".join(f"{name} {value:.3f}" for name, value in values.items()))
         if update % 10 == 0:
             append_curve(folder / "mdnrnn.jsonl", update=update, **values)
         if schedule.due:
-            parts = validate(model, held_out[:VALIDATION_DRIVES], device)
+            parts = validate(model, held_out[:VALIDATION_ROLLOUTS], device)
             append_curve(
                 folder / "mdnrnn.jsonl", update=update, **{f"held_out_{name}": part for name, part in parts.items()}
             )
@@ -75,57 +75,57 @@ def vae_of(folder: Path) -> str:
 
 
 def backward(
-    model: MDNRNN, drives: Drives, noise: torch.Generator, device: torch.device | None = None
+    model: MDNRNN, rollouts: Rollouts, noise: torch.Generator, device: torch.device | None = None
 ) -> dict[str, float]:
-    """Gradients of a batch, few drives at a time, so that memory does not grow with it; returns the losses."""
+    """Gradients of a batch, few rollouts at a time, so that memory does not grow with it; returns the losses."""
     values: dict[str, float] = {}
-    for chunk in drives.chunks():
-        parts = shares(losses(model, chunk.to(device), noise), chunk, drives)
+    for chunk in rollouts.chunks():
+        parts = shares(losses(model, chunk.to(device), noise), chunk, rollouts)
         torch.stack(list(parts.values())).sum().backward()  # type: ignore[no-untyped-call]
         values = {name: values.get(name, 0.0) + part.item() for name, part in parts.items()}
     return values
 
 
 def validate(model: MDNRNN, paths: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
-    """Losses on held-out drives."""
+    """Losses on held-out rollouts."""
     model.eval()
     noise, values, weight = torch.Generator().manual_seed(0), dict[str, float](), 0.0
     with torch.no_grad():
-        for start in range(0, len(paths), VALIDATION_DRIVES):
-            drives = load_drives(paths[start : start + VALIDATION_DRIVES])
-            steps = float(drives.mask.sum())
-            for chunk in drives.chunks():
-                for name, part in shares(losses(model, chunk.to(device), noise), chunk, drives).items():
+        for start in range(0, len(paths), VALIDATION_ROLLOUTS):
+            rollouts = load_rollouts(paths[start : start + VALIDATION_ROLLOUTS])
+            steps = float(rollouts.mask.sum())
+            for chunk in rollouts.chunks():
+                for name, part in shares(losses(model, chunk.to(device), noise), chunk, rollouts).items():
                     values[name] = values.get(name, 0.0) + part.item() * steps
             weight += steps
     return {name: value / weight for name, value in values.items()}
 
 
-def losses(model: MDNRNN, drives: Drives, noise: torch.Generator) -> dict[str, Tensor]:
+def losses(model: MDNRNN, rollouts: Rollouts, noise: torch.Generator) -> dict[str, Tensor]:
     """The loss of the latents and of each other head, in one pass; the latents are drawn anew from mu and logvar."""
     config = model.config
-    drawn = torch.randn(drives.mu.shape, generator=noise).to(drives.mu.device)
-    sampled = drives.mu + torch.exp(0.5 * drives.logvar) * drawn
-    prediction = model(inputs_of(config, sampled, drives))
+    drawn = torch.randn(rollouts.mu.shape, generator=noise).to(rollouts.mu.device)
+    sampled = rollouts.mu + torch.exp(0.5 * rollouts.logvar) * drawn
+    prediction = model(inputs_of(config, sampled, rollouts))
     ahead = type(prediction)(*(part[:, :-1] for part in prediction))
-    parts = {"latent": latent_loss(ahead, sampled[:, 1:], drives.mask[:, 1:])}
+    parts = {"latent": latent_loss(ahead, sampled[:, 1:], rollouts.mask[:, 1:])}
     if config.rewarded:
-        labels = reward_labels(config.reward, drives.reward, drives.done)
-        parts["reward"] = reward_loss(config.reward, prediction.reward, labels, drives.mask)
+        labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
+        parts["reward"] = reward_loss(config.reward, prediction.reward, labels, rollouts.mask)
     if config.done:
-        parts["done"] = binary_loss(prediction.done, drives.done, drives.mask)
+        parts["done"] = binary_loss(prediction.done, rollouts.done, rollouts.mask)
     return parts
 
 
-def shares(parts: dict[str, Tensor], chunk: Drives, drives: Drives) -> dict[str, Tensor]:
-    """A chunk's mean losses as what they add to those of all drives."""
-    ahead = float(chunk.mask[:, 1:].sum() / drives.mask[:, 1:].sum())
-    every = float(chunk.mask.sum() / drives.mask.sum())
+def shares(parts: dict[str, Tensor], chunk: Rollouts, rollouts: Rollouts) -> dict[str, Tensor]:
+    """A chunk's mean losses as what they add to those of all rollouts."""
+    ahead = float(chunk.mask[:, 1:].sum() / rollouts.mask[:, 1:].sum())
+    every = float(chunk.mask.sum() / rollouts.mask.sum())
     return {name: part * (ahead if name == "latent" else every) for name, part in parts.items()}
 
 
 def quality(model: MDNRNN, held_out: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
-    """Nats a latent dimension, each head's loss, and how well heads foresee, on held-out drives."""
+    """Nats a latent dimension, each head's loss, and how well heads foresee, on held-out rollouts."""
     parts = validate(model, held_out, device)
     figures = {"nats_per_dimension": round(parts.pop("latent"), 3)}
     return figures | {f"{name}_loss": round(value, 4) for name, value in parts.items()} | foresight(model, held_out)

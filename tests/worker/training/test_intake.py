@@ -14,13 +14,13 @@ def test_drives_take_the_next_free_numbers_each_once(tmp_path):
     data, run = tmp_path / "data", tmp_path / "run"
     write_drive(data, 0)
     write_drive(data, 7, steps=10)
-    drives = [write_drive(run, number, steps=5 + number) for number in (3, 4)]
-    assert list(take_in(data, drives)) == [8, 9]
+    rollouts = [write_drive(run, number, steps=5 + number) for number in (3, 4)]
+    assert list(take_in(data, rollouts)) == [8, 9]
     assert [path.name for path in episodes(data)] == ["000000.npz", "000007.npz", "000008.npz", "000009.npz"]
-    assert episode_path(data, 9).read_bytes() == drives[1].read_bytes()
-    assert list(take_in(data, drives)) == []
+    assert episode_path(data, 9).read_bytes() == rollouts[1].read_bytes()
+    assert list(take_in(data, rollouts)) == []
     later = write_drive(run, 5)
-    assert list(take_in(data, [*drives, later, later])) == [12]
+    assert list(take_in(data, [*rollouts, later, later])) == [12]
 
 
 def test_an_empty_folder_begins_at_zero(tmp_path):

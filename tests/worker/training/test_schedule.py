@@ -9,9 +9,9 @@ from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
-from dreamfleet.worker.training.drives import load_drives
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import PRESETS
+from dreamfleet.worker.training.rollouts import load_rollouts
 from dreamfleet.worker.training.schedule import device_of, summary
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
@@ -57,7 +57,7 @@ def test_the_vae_goes_on_to_the_same_weights_as_without_a_stop(encoded, tmp_path
     assert equal(encoded / train_vae.CHECKPOINT, tmp_path / train_vae.CHECKPOINT)
 
 
-@pytest.mark.parametrize("after", [1, 3])  # neither is an update after which the held-out drives are looked at
+@pytest.mark.parametrize("after", [1, 3])  # neither is an update after which the held-out rollouts are looked at
 def test_told_to_stop_it_keeps_every_update_and_goes_on_to_the_same_weights(encoded, tmp_path, after):
     (tmp_path / "episodes").symlink_to(encoded / "episodes")
     made = []
@@ -164,13 +164,13 @@ def test_a_batch_in_chunks_has_the_same_gradients(encoded, monkeypatch):
     import torch
 
     model = MDNRNN(replace(SMALL, dropout=0.0, done=True))
-    drives = load_drives(sorted((encoded / "encoded").glob("*.npz")))
-    drives.logvar.fill_(-100)  # chance is drawn a chunk at a time
+    rollouts = load_rollouts(sorted((encoded / "encoded").glob("*.npz")))
+    rollouts.logvar.fill_(-100)  # chance is drawn a chunk at a time
     found = []
     for steps in (10_000, 1):
-        monkeypatch.setattr("dreamfleet.worker.training.drives.CHUNK_STEPS", steps)
+        monkeypatch.setattr("dreamfleet.worker.training.rollouts.CHUNK_STEPS", steps)
         model.zero_grad()
-        values = train_mdnrnn.backward(model, drives, torch.Generator().manual_seed(0))
+        values = train_mdnrnn.backward(model, rollouts, torch.Generator().manual_seed(0))
         found.append((values, [each.grad.clone() for each in model.parameters() if each.requires_grad]))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-5)
     for one, other in zip(found[0][1], found[1][1], strict=True):

@@ -1,4 +1,4 @@
-"""World models of the whole 96x96 observation: from drives in the real CarRacing to scores, and no mixture of kinds."""
+"""World models of the whole 96x96 observation: from rollouts in the real CarRacing to scores, and no mixture of kinds."""
 
 from dataclasses import replace
 
@@ -127,11 +127,11 @@ def test_no_folder_gets_two_kinds_of_pictures(tmp_path, there, wanted):
     path = write_drive(tmp_path, 7, picture=there)
     with pytest.raises(DatasetError, match=rf"{path.name} holds pictures .*-{there}', and .*-{wanted}'"):
         list(collect(tmp_path, replace(COLLECT, picture=wanted), jobs=1))
-    drives = [write_drive(tmp_path / "run", 0, picture=wanted)]
+    rollouts = [write_drive(tmp_path / "run", 0, picture=wanted)]
     with pytest.raises(DatasetError, match="of one kind"):
-        list(take_in(tmp_path, drives))
+        list(take_in(tmp_path, rollouts))
     with pytest.raises(DatasetError, match="of one kind"):
-        list(take_in(tmp_path / "new", [path, *drives]))
+        list(take_in(tmp_path / "new", [path, *rollouts]))
     assert not (tmp_path / "new").exists()
     assert [each.name for each in (tmp_path / "episodes").iterdir()] == [path.name]
 

@@ -1,4 +1,4 @@
-"""Encoded drives as batches of an MDN-RNN."""
+"""Encoded rollouts as batches of an MDN-RNN."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ CHUNK_STEPS = 10_000  # that go through a model at once: about 300 MB
 
 
 @dataclass(frozen=True)
-class Drives:
-    """A batch `(N, T, ...)` of drives, padded; `mask` `(N, T)` is 1 where a step is real, `done` where one ended."""
+class Rollouts:
+    """A batch `(N, T, ...)` of rollouts, padded; `mask` `(N, T)` is 1 where a step is real, `done` where one ended."""
 
     mu: Tensor
     logvar: Tensor
@@ -31,20 +31,20 @@ class Drives:
     done: Tensor
     mask: Tensor
 
-    def chunks(self) -> Iterator[Drives]:
-        """The same drives, few at a time."""
+    def chunks(self) -> Iterator[Rollouts]:
+        """The same rollouts, few at a time."""
         rows = max(1, CHUNK_STEPS // self.mask.shape[1])
         for start in range(0, len(self.mask), rows):
-            yield Drives(*(getattr(self, each.name)[start : start + rows] for each in fields(self)))
+            yield Rollouts(*(getattr(self, each.name)[start : start + rows] for each in fields(self)))
 
-    def to(self, device: torch.device | None) -> Drives:
+    def to(self, device: torch.device | None) -> Rollouts:
         """On a device."""
-        return Drives(*(getattr(self, each.name).to(device) for each in fields(self)))
+        return Rollouts(*(getattr(self, each.name).to(device) for each in fields(self)))
 
 
-def load_drives(paths: Sequence[Path], mirrored: NDArray[np.bool_] | None = None) -> Drives:
-    """The drives of these episodes, some of them mirrored."""
-    columns: dict[str, list[NDArray[np.float32]]] = {each.name: [] for each in fields(Drives)}
+def load_rollouts(paths: Sequence[Path], mirrored: NDArray[np.bool_] | None = None) -> Rollouts:
+    """The rollouts of these episodes, some of them mirrored."""
+    columns: dict[str, list[NDArray[np.float32]]] = {each.name: [] for each in fields(Rollouts)}
     for path, flip in zip(paths, np.zeros(len(paths), np.bool_) if mirrored is None else mirrored, strict=True):
         prefix = "mirrored_" if flip else ""
         arrays = load(path, f"{prefix}mu", f"{prefix}logvar", "action", "reward", "ended")
@@ -56,13 +56,13 @@ def load_drives(paths: Sequence[Path], mirrored: NDArray[np.bool_] | None = None
         done[-1] = arrays["ended"]
         columns["done"].append(done)
         columns["mask"].append(np.ones(len(arrays["reward"]), dtype=np.float32))
-    return Drives(**{name: torch.from_numpy(pad(arrays)) for name, arrays in columns.items()})
+    return Rollouts(**{name: torch.from_numpy(pad(arrays)) for name, arrays in columns.items()})
 
 
-def inputs_of(config: MDNRNNConfig, latents: Tensor, drives: Drives) -> Tensor:
+def inputs_of(config: MDNRNNConfig, latents: Tensor, rollouts: Rollouts) -> Tensor:
     """`(N, T, inputs)`: latents, actions, and where the model takes it the reward head's label of the step before."""
-    parts = [latents, drives.action]
+    parts = [latents, rollouts.action]
     if config.previous_reward:
-        labels = reward_labels(config.reward, drives.reward, drives.done)
+        labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
         parts.append(functional.pad(labels, (1, 0))[:, :-1, None])
     return torch.cat(parts, dim=-1)
