@@ -11,7 +11,7 @@ demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(ARGS)
 
 test: $(VENV)/.dev  ## every test that ends within minutes
-	$(BIN)/pytest -m "not long" $(ARGS)
+	$(BIN)/pytest -m "not long" --numprocesses 2 --dist worksteal $(ARGS)
 
 setup: $(VENV)/.dev  ## everything that development needs
 
