@@ -1,4 +1,4 @@
-"""World models of the whole 96x96 observation: from rollouts in the real CarRacing to scores, and no mixture of kinds."""
+"""World models of the whole 96x96 observation: from rollouts in CarRacing to scores, and no mixture of kinds."""
 
 from dataclasses import replace
 
