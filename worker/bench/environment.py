@@ -32,25 +32,7 @@ def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
 
     Every kind drives the same actions, which the shipped controller chose on that track beforehand.
     """
-    task, assignment = CarRacing(), Assignment.of(CarRacing.name, bundle)
-    cases: dict[str, Callable[[Plan], float]] = {
-        "gymnasium": lambda plan: seconds_a_step(gymnasium.make("CarRacing-v3"), plan),
-        "observation": lambda plan: seconds_a_step(make_car_racing(), plan),
-        "gymnasium_picture": lambda plan: seconds_a_step(PictureObservation(gymnasium.make("CarRacing-v3"), BOX), plan),
-        "picture": lambda plan: seconds_a_step(make_car_racing(preprocessing=BOX.name), plan),
-        "fitness_step": lambda plan: seconds_a_step(task.make_environment(assignment), plan, policy_of(bundle)),
-    }
-    notes = []
-    if find_spec("torch"):
-        cases["torch_fitness_step"] = lambda plan: seconds_a_step(
-            task.make_judge(assignment), plan, torch_policy_of(bundle)
-        )
-    else:
-        notes.append("ratio_fitness_step needs torch: pip install 'dreamfleet[train]'")
-    if find_spec("envpool"):
-        cases["envpool"] = envpool_seconds_a_step
-    else:
-        notes.append("ratio_envpool needs envpool: pip install envpool")
+    cases, notes = _cases(bundle)
     times: dict[str, list[float]] = {name: [] for name in cases}
     for round_number in range(rounds):
         plan = recorded_plan(VALIDATION.start + round_number)
@@ -71,6 +53,30 @@ def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
         "episodes": rounds,
         **({"notes": notes} if notes else {}),
     }
+
+
+def _cases(bundle: Bundle) -> tuple[dict[str, Callable[[Plan], float]], list[str]]:
+    """What is measured, by name, and what is not for want of a package."""
+    task, assignment = CarRacing(), Assignment.of(CarRacing.name, bundle)
+    cases: dict[str, Callable[[Plan], float]] = {
+        "gymnasium": lambda plan: seconds_a_step(gymnasium.make("CarRacing-v3"), plan),
+        "observation": lambda plan: seconds_a_step(make_car_racing(), plan),
+        "gymnasium_picture": lambda plan: seconds_a_step(PictureObservation(gymnasium.make("CarRacing-v3"), BOX), plan),
+        "picture": lambda plan: seconds_a_step(make_car_racing(preprocessing=BOX.name), plan),
+        "fitness_step": lambda plan: seconds_a_step(task.make_environment(assignment), plan, policy_of(bundle)),
+    }
+    notes = []
+    if find_spec("torch"):
+        cases["torch_fitness_step"] = lambda plan: seconds_a_step(
+            task.make_judge(assignment), plan, torch_policy_of(bundle)
+        )
+    else:
+        notes.append("ratio_fitness_step needs torch: pip install 'dreamfleet[train]'")
+    if find_spec("envpool"):
+        cases["envpool"] = envpool_seconds_a_step
+    else:
+        notes.append("ratio_envpool needs envpool: pip install envpool")
+    return cases, notes
 
 
 @dataclass(frozen=True)
