@@ -79,6 +79,14 @@ def test_a_worker_that_lacks_the_environment_says_so_and_the_run_waits(processes
     assert any("does not know" in why for why in status["refused"].values())
 
 
+def test_what_can_be_scored_in_is_listed(processes):
+    code, out, err = processes.call("tasks", "--json")
+    assert code == 0, err
+    rows = {row["task"]: row["ready"] for row in json.loads(out)}
+    assert rows["car-racing"] and rows["dream"] and rows["gym:ENVIRONMENT"]  # noqa: PT018
+    assert "gym:ENVIRONMENT" in processes.call("tasks")[1]
+
+
 @pytest.mark.parametrize(
     ("settings", "says"),
     [

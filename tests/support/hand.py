@@ -9,6 +9,7 @@ import zenoh
 
 from dreamfleet.common import keys
 from dreamfleet.common.codec import decode, decode_json, encode, encode_json
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import (
     MAX_PART,
     TAG_BYTES,
@@ -41,6 +42,7 @@ class Hand:
         self.nonce, self.incarnation, self.run_uid = FIRST, 1, samples.UID
         self.intervals = Intervals(beat=0.1, repeat=0.1)
         self.refusal = None
+        self.packages = NUMERIC_PACKAGES  # that its run's fingerprint names
         self.worker = None
         self.slots = 0  # that its status shows
         self.offsets = queue.SimpleQueue()  # of the bundle's parts that were asked for
@@ -136,11 +138,13 @@ class Hand:
         with query:
             request = decode_json(HelloRequest, query.payload.to_bytes())
             self.worker = request.worker
-            why, remedy = self.refusal or ("", "")
+            other = request.packages != self.packages
+            why, remedy = self.refusal or (("other packages", "say hello again") if other else ("", ""))
             reply = HelloReply(
                 accepted=not why, protocol_min=1, protocol_max=1, package="0", run=self.run, run_uid=self.run_uid,
                 incarnation=self.incarnation, nonce=self.nonce, why=why, remedy=remedy,
                 spec={} if why else asdict(self.spec), intervals={} if why else asdict(self.intervals),
+                packages=self.packages,
             )  # fmt: skip
             query.reply(keys.hello(self.run), encode_json(reply), encoding="application/json")
         self._said.put(request)

@@ -3,6 +3,7 @@
 import pytest
 
 from dreamfleet.common.errors import RefusedError, UsageError
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, fingerprint
 from dreamfleet.common.messages import Intervals
 from dreamfleet.common.session import Network
 from dreamfleet.worker.service.config import WorkerConfig
@@ -51,6 +52,18 @@ def test_without_a_name_several_runs_are_listed(stage, cached):
     assert "day, night" in str(error)
     answer.undeclare()
     other.close()
+
+
+def test_it_says_hello_again_about_the_packages_that_the_runs_fingerprint_names(stage, cached):
+    hand = stage.hand()
+    hand.packages = ("numpy", "no-such-package")
+    stage.worker()
+    first, second = hand.hello(), hand.hello()
+    assert (first.packages, second.packages) == (NUMERIC_PACKAGES, hand.packages)
+    assert "gymnasium" in first.fingerprint
+    assert second.fingerprint == fingerprint(hand.packages)
+    assert "gymnasium" not in second.fingerprint
+    assert hand.beat(lambda beat: beat.capacity > 0).slots == 1
 
 
 def test_a_refusal_ends_it_with_the_reason_and_the_remedy(stage):

@@ -1,0 +1,53 @@
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.fingerprint import fingerprint
+from dreamfleet.coordinator.admission import MOST_REFUSED, Refusals, refusal
+from tests.support.samples import JSON
+
+HELLO = next(each for each in JSON.values() if type(each).__name__ == "HelloRequest")
+LANDER, PACKAGES = "gym:LunarLander-v3", ("numpy", "gymnasium", "box2d", "box2d-py")
+
+
+def hello(**changes):
+    return replace(HELLO, **{"tasks": ("car-racing", "gym"), "fingerprint": "here", **changes})
+
+
+@pytest.mark.parametrize("tasks", [("gym",), (LANDER,), ("dream", "gym")])
+def test_a_familys_name_stands_for_all_its_members(tasks):
+    assert refusal(hello(tasks=tasks, packages=PACKAGES), LANDER, None, PACKAGES) is None
+
+
+def test_who_does_not_know_the_task_is_told_what_to_install():
+    why, remedy = refusal(hello(tasks=("dream",)), LANDER, None)
+    assert LANDER in why
+    assert "it knows: dream" in why
+    assert "install the package" in remedy
+
+
+def test_a_fingerprint_of_other_packages_is_asked_for_again_before_it_is_judged():
+    why, remedy = refusal(hello(), LANDER, None, PACKAGES)
+    assert "numpy, gymnasium, box2d" in why
+    assert "again" in remedy
+    about = hello(packages=PACKAGES, fingerprint=fingerprint(PACKAGES))
+    assert refusal(about, LANDER, fingerprint(PACKAGES), PACKAGES) is None
+    assert refusal(about, LANDER, "elsewhere", PACKAGES)[0].startswith("fingerprints differ")
+
+
+def test_another_worlds_package_does_not_change_a_fingerprint():
+    assert fingerprint(("numpy",)) == fingerprint(("numpy", "no-such-package"))
+    assert fingerprint(("numpy",)) != fingerprint(("numpy", "gymnasium"))
+
+
+def test_refusals_are_news_once_are_bounded_and_end_with_admission():
+    refusals = Refusals()
+    assert refusals.add("a/1", "no task")
+    assert not refusals.add("a/2", "no task")
+    assert refusals.add("a/3", "another fingerprint")
+    for number in range(MOST_REFUSED):
+        refusals.add(f"w{number}/1", "no task")
+    assert len(refusals.latest) == MOST_REFUSED
+    assert "a" not in refusals.latest
+    refusals.admitted("w3/9")
+    assert "w3" not in refusals.latest
