@@ -129,6 +129,8 @@ class Controller:
                 raise ControllerError(f"{path} has controller format {about['format']}; this version reads {FORMAT}")
             shape = ControllerShape(**about["shape"])
             details = {name: type(value)(about.get(name, value)) for name, value in _PLAIN.items()}
+            if details["options"] and not isinstance(json.loads(details["options"]), dict):
+                raise ControllerError(f"{path} is not a controller file: its task's options are no JSON object")
             task, bundle = str(about["task"]), str(about["bundle"])
             return cls(shape, parameters, task, bundle, dict(about["provenance"]), **details)
         except FileNotFoundError:

@@ -11,6 +11,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from dreamfleet.common.printable import printable
 from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.status import FailureStatus, OpenGeneration, Progress, Status, WorkerStatus
 
@@ -45,9 +46,9 @@ def run_panel(status: Status) -> RenderableType:
     title = f"[bold]{status.run}[/] · [{STATE_STYLES.get(status.state, '')}]{status.state}[/]"
     parts: list[RenderableType] = [_facts(status)]
     if status.why:
-        parts.append(Text(status.why, style="bold red" if status.state == "paused" else ""))
+        parts.append(Text(printable(status.why), style="bold red" if status.state == "paused" else ""))
     elif status.failures:
-        parts.append(Text(_failure(status.failures[0]), style="red"))
+        parts.append(Text(printable(_failure(status.failures[0])), style="red"))
     parts.append(_progress(status))
     if status.recent:
         parts.append(Text.assemble(("mean fitness by generation  ", "dim"), _sparkline(status.recent)))
@@ -64,21 +65,28 @@ def _facts(status: Status) -> Table:
     grid.add_column()
     temperature = status.generation.temperature
     warm = "" if temperature is None else f", temperature {temperature:g}"
-    grid.add_row(
-        "task", f"{task.task}, {task.horizon} steps{warm}", "population", f"{settings.population} x {settings.episodes}"
+
+    def row(*cells: str) -> None:
+        grid.add_row(*map(Text, cells))  # texts of others are no markup
+
+    row(
+        "task",
+        f"{printable(task.task)}, {task.horizon} steps{warm}",
+        "population",
+        f"{settings.population} x {settings.episodes}",
     )
-    grid.add_row(
+    row(
         "last generation", _spread(status.last) if status.last else "-",
         "step size", f"{status.generation.sigma:.4f} ({_optimiser(settings)})",
     )  # fmt: skip
-    grid.add_row("evaluated mean", _evaluated(status.evaluation), "best", _evaluated(status.best))
+    row("evaluated mean", _evaluated(status.evaluation), "best", _evaluated(status.best))
     steps, rate = status.throughput.environment_steps, status.throughput.steps_per_second
-    grid.add_row(
+    row(
         "throughput", f"{rate:,.0f} steps/s, {steps:,} in all",
         "waste", f"{waste.share:.1%}, {waste.reissued} jobs issued again",
     )  # fmt: skip
     if sum(status.dropped.values()):
-        grid.add_row("dropped messages", ", ".join(f"{count} {why}" for why, count in status.dropped.items()))
+        row("dropped messages", ", ".join(f"{count} {why}" for why, count in status.dropped.items()))
     return grid
 
 
@@ -127,7 +135,7 @@ def _worker_table(status: Status) -> RenderableType:
     if not status.worker_list:
         lines = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
         lines = lines or ["no workers yet: start one with  dreamfleet worker --connect tcp/HOST:PORT"]
-        return Text("\n".join(lines), style="yellow")
+        return Text("\n".join(map(printable, lines)), style="yellow")
     return WorkerTable(status.worker_list[:MOST_WORKERS], status.workers.known)
 
 

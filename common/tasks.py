@@ -6,6 +6,8 @@ one of it (`gym:LunarLander-v3`); or `module:attribute`, for a task that no pack
 
 from __future__ import annotations
 
+import difflib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -16,6 +18,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 
 GROUP = "dreamfleet.tasks"
+_NAME = re.compile(r"[\w-][\w.-]*(:\S+)?", re.ASCII)
 GYM = "gym"  # the family of gymnasium's environments: they need no bundle
 
 
@@ -59,6 +62,32 @@ def load_task(name: str) -> Any:
         raise UsageError(f"task {name!r} cannot be loaded: {error}") from error
     known = ", ".join(f"{each}:ENVIRONMENT" if each == GYM else each for each in points) or "none"
     raise UsageError(f"unknown task {name!r}: known are {known}")
+
+
+def describes_itself(name: str) -> bool:
+    """Whether a task needs no bundle, as far as that can be found out on this host."""
+    if family_of(name) == GYM:
+        return True
+    point = registered_tasks().get(name)
+    if point is not None and point.dist is not None and point.dist.name == "dreamfleet":
+        return False  # not worth loading a simulator for
+    try:
+        return callable(getattr(load_task(name), "describe", None))
+    except UsageError:
+        return False
+
+
+def check_task(name: str) -> None:
+    """`UsageError` for what cannot name a task, or nearly names a registered one."""
+    if not _NAME.fullmatch(name):
+        raise UsageError(f"{name!r} cannot name a task: give a registered name, {GYM}:ENVIRONMENT, or module:attribute")
+    points = registered_tasks()
+    head, colon, _ = name.partition(":")
+    if head in points or "." in head:
+        return
+    near = difflib.get_close_matches(head, points, n=1, cutoff=0.75)
+    if near:
+        raise UsageError(f"unknown task {name!r}: did you mean {near[0]}{':...' if colon else ''}?")
 
 
 def describe_task(name: str, options: Mapping[str, Any]) -> Description:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import HelloRequest
+from dreamfleet.common.printable import printable
 
 MOST_REFUSED = 8  # names that are remembered
 
@@ -16,7 +17,7 @@ def refusal(
     `fingerprint` is the one that the run admits, `None` admits any; it names the versions of `packages`.
     """
     if not {task, task.partition(":")[0]} & set(request.tasks):  # itself, or the family that it is of
-        known = ", ".join(request.tasks) or "none"
+        known = printable(", ".join(request.tasks)) or "none"
         return f"this run scores in {task!r}, which the worker does not know (it knows: {known})", (
             "install the package that registers this task on the worker's host"
         )
@@ -26,7 +27,7 @@ def refusal(
         )
     if fingerprint in (None, request.fingerprint):
         return None
-    return f"fingerprints differ: the run has [{fingerprint}], the worker [{request.fingerprint}]", (
+    return f"fingerprints differ: the run has [{fingerprint}], the worker [{printable(request.fingerprint)}]", (
         "install the same package versions on a host of the same CPU features, or start the coordinator with --mixed"
     )
 
@@ -39,7 +40,7 @@ class Refusals:
 
     def add(self, worker: str, why: str) -> bool:
         """Remember one; whether that is news. A worker that is started again and again has one name, many lives."""
-        name = worker.partition("/")[0]
+        name, why = worker.partition("/")[0], printable(why)
         news = self.latest.pop(name, None) != why
         self.latest[name] = why
         while len(self.latest) > MOST_REFUSED:

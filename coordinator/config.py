@@ -13,12 +13,21 @@ from dreamfleet.common.config import option
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
-from dreamfleet.common.messages import COLDEST, HOTTEST, TaskSpec
+from dreamfleet.common.messages import COLDEST, HOTTEST, MAX_OPTIONS, TaskSpec
 from dreamfleet.common.presets import check_preset, preset_help
 from dreamfleet.common.runs import RunSettings
-from dreamfleet.common.tasks import GYM, describe_task
+from dreamfleet.common.tasks import GYM, check_task, describe_task, describes_itself
 
 DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
+
+
+LARGEST_STEP = 1e6  # first step size; parameters travel in single precision
+# What a journal and a message can hold.
+BOUNDS = {
+    "population": (2, 10**5), "episodes": (1, 10**4), "horizon": (1, 10**6), "patience": (0, 10**6),
+    "seed": (0, 2**63 - 1), "evaluate_every": (0, 10**6), "evaluation_episodes": (1, 10**4),
+    "collect_every": (0, 10**6), "collect_episodes": (1, 10**4), "hidden_units": (1, 10**5),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -56,15 +65,17 @@ class RunConfig:
     collect_episodes: int = option(8, "drives that are kept each time, on training tracks")
 
     def __post_init__(self) -> None:
-        bounds = {"population": 2, "episodes": 1, "horizon": 1, "patience": 0, "seed": 0, "evaluate_every": 0}
-        bounds |= {"evaluation_episodes": 1, "collect_every": 0, "collect_episodes": 1, "hidden_units": 1}
-        for name, least in bounds.items():
-            if getattr(self, name) < least:
-                raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
+        for name, (least, most) in BOUNDS.items():
+            flag, value = f"--{name.replace('_', '-')}", getattr(self, name)
+            if value < least:
+                raise UsageError(f"{flag} must be at least {least}, not {value}")
+            if value > most:
+                raise UsageError(f"{flag} must be at most {most}, not {value}")
+        check_task(self.task)
         if self.racing and self.episodes < 2:
             raise UsageError("--racing needs at least 2 episodes: there is no second half of one")
-        if not 0 < self.sigma0 < float("inf"):
-            raise UsageError(f"--sigma0 must be a positive number, not {self.sigma0}")
+        if not 0 < self.sigma0 <= LARGEST_STEP:
+            raise UsageError(f"--sigma0 must be a positive number of at most {LARGEST_STEP:g}, not {self.sigma0}")
         if self.temperature is not None and not COLDEST <= self.temperature <= HOTTEST:
             raise UsageError(f"--temperature must be from {COLDEST:g} to {HOTTEST:g}, not {self.temperature}")
         if not 1 <= self.heat < float("inf"):
@@ -75,7 +86,7 @@ class RunConfig:
     @property
     def needs_no_bundle(self) -> bool:
         """Whether candidates are scored without a world model."""
-        return self.bundle == NO_BUNDLE or (self.bundle is None and self.task.startswith(f"{GYM}:"))
+        return self.bundle == NO_BUNDLE or (self.bundle is None and describes_itself(self.task))
 
     def settings(self, bundle: Bundle | None) -> RunSettings:
         """What the journal keeps: the bundle by its hash, or what a task that needs none says of itself."""
@@ -107,6 +118,8 @@ class RunConfig:
         return self.hidden_units if self.controller == "hidden" else 0
 
     def _on(self, bundle: Bundle) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
+        if self.task.partition(":")[0] == GYM:
+            raise UsageError(f"{self.task} is scored without a world model: leave --bundle out, or give --bundle none")
         if self.environment or self.normalise or self.task_options:
             raise UsageError("--environment, --normalise and --task-options are of tasks without a world model")
         shape = bundle.shape_of(self.features, self._hidden)
@@ -120,6 +133,12 @@ class RunConfig:
         told = describe_task(self.task, self._options())
         options = told.options if self.task_options is None else self.task_options
         shape = ControllerShape(told.observations, told.outputs, self._hidden)
+        if len(options) > MAX_OPTIONS:
+            raise UsageError(
+                f"what the run would freeze of {self.task} takes {len(options)} characters, {MAX_OPTIONS} at most: "
+                "leave --normalise out, or give smaller arguments"
+            )
+        _check_normal(options, told.observations)
         spec = TaskSpec(self.task, "", self.horizon, self.patience, shape, options=options, version=told.version)
         return spec, shape, told.packages
 
@@ -131,8 +150,26 @@ class RunConfig:
                 return {"environment": dict(frozen.get("environment", {}))}
             except (ValueError, AttributeError, TypeError) as error:
                 raise UsageError(f"--task-options must be a JSON object, not {self.task_options!r}") from error
-        options: dict[str, Any] = {"environment": dict(map(_argument, self.environment))} if self.environment else {}
+        arguments = list(map(_argument, self.environment))
+        if len(dict(arguments)) < len(arguments):
+            raise UsageError("--environment: a KEY stands there twice")
+        options: dict[str, Any] = {"environment": dict(arguments)} if arguments else {}
         return options | ({"normalise": True, "seed": self.seed} if self.normalise else {})
+
+
+def _check_normal(options: str, observations: int) -> None:
+    """`UsageError` if a normalisation that was given by hand cannot be one of so many observations."""
+    normal = json.loads(options or "{}").get("normal")
+    if normal is None:
+        return
+    try:
+        mean, deviation = normal["mean"], normal["deviation"]
+        whole = len(mean) == len(deviation) == observations and all(map(math.isfinite, (*mean, *deviation)))
+        fits = whole and min(deviation) > 0
+    except (TypeError, KeyError, ValueError):
+        fits = False
+    if not fits:
+        raise UsageError(f"--task-options: normal must have a mean and a positive deviation of {observations} numbers")
 
 
 def _argument(text: str) -> tuple[str, Any]:

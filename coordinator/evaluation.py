@@ -64,12 +64,20 @@ class Evaluations:
         """Begin an evaluation of which some scores may be known already; its missing jobs."""
         work = evaluation.work(spec)
         digests = [each.job.digest for each in work]
-        self._open[evaluation.generation] = OpenEvaluation(evaluation, digests, dict(known))
-        return [each for each in work if each.job.digest not in known]
+        asked = {digest for each in self._open.values() for digest in each.digests}
+        scores = {digest: known[digest] for digest in digests if digest in known}
+        self._open[evaluation.generation] = OpenEvaluation(evaluation, digests, scores)
+        return [each for each in work if each.job.digest not in scores and each.job.digest not in asked]
 
-    def record(self, generation: int, digest: bytes, score: float) -> None:
-        """Take one accepted score of an evaluation in progress."""
-        self._open[generation].scores[digest] = score
+    def record(self, digest: bytes, score: float) -> list[int]:
+        """Take one accepted score; the generations whose evaluations it is of.
+
+        A run that has converged evaluates the same mean again: its jobs are the same, and one score is each one's.
+        """
+        wanting = [generation for generation, each in self._open.items() if digest in each.digests]
+        for generation in wanting:
+            self._open[generation].scores[digest] = score
+        return wanting
 
     def finish(self, generation: int) -> tuple[StoredEvaluation, bytes] | None:
         """End an evaluation that has all of its scores: what it gave, and the vector; `None` while it has not."""

@@ -87,10 +87,12 @@ class Evolution:
         wanted = self._config.population, self._config.dimension
         if asked.shape != wanted:
             raise DreamfleetError(f"optimiser {self._config.optimiser!r} asked for {asked.shape} numbers, not {wanted}")
-        if not np.isfinite(asked).all():
+        with np.errstate(over="ignore"):
+            travels = np.isfinite(asked.astype(np.float32)).all() and np.isfinite(self.sigma)
+        if not travels:
             raise DreamfleetError(
-                f"optimiser {self._config.optimiser!r} asked for candidates that are not finite, at step size "
-                f"{self.sigma:g}: it cannot go on; fork the run with another --sigma0 or --optimiser"
+                f"optimiser {self._config.optimiser!r} asked for what no single-precision number can hold, at "
+                f"step size {self.sigma:g}: it cannot go on; fork the run with another --sigma0 or --optimiser"
             )
         self._is_open = True
         return asked

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dreamfleet.common.printable import printable
 from dreamfleet.coordinator.jobs import Work
 
 LONGEST_ERROR = 300  # characters of a worker's error that are told
@@ -25,7 +26,7 @@ class Failure:
         words = {
             "score": f"candidate {job.generation}/{job.candidate}",
             "evaluate": f"the evaluation of generation {job.generation}'s mean",
-            "collect": f"a kept drive of generation {job.generation}'s mean",
+            "collect": f"a kept rollout of generation {job.generation}'s mean",
         }
         return f"{words[job.kind]}, seed {', '.join(map(str, job.seeds))},"
 
@@ -42,6 +43,7 @@ class Failure:
 
 def shorten(error: str, longest: int = LONGEST_ERROR) -> str:
     """An error's text, cut to what a line can hold."""
+    error = printable(error)  # it came over the wire
     return error if len(error) <= longest else error[: longest - 3] + "..."
 
 

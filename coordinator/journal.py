@@ -27,6 +27,8 @@ from dreamfleet.coordinator.evaluation import Evaluation
 
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
+MOST_VARIABLES = 500  # of one SQL statement
+
 
 @dataclass(frozen=True)
 class OpenGeneration:
@@ -190,6 +192,15 @@ class Journal:
         query = "SELECT digest, fitness, steps FROM result WHERE kind = ? AND generation = ?"
         return {digest: (fitness, steps) for digest, fitness, steps in self._read(query, kind, generation)}
 
+    def fitness_of(self, digests: Sequence[bytes]) -> dict[bytes, float]:
+        """Fitness of those of these jobs that have an accepted result, whichever generation asked for it."""
+        found: dict[bytes, float] = {}
+        for start in range(0, len(digests), MOST_VARIABLES):
+            some = digests[start : start + MOST_VARIABLES]
+            marks = ", ".join("?" * len(some))
+            found.update(self._read(f"SELECT digest, fitness FROM result WHERE digest IN ({marks})", *some))  # noqa: S608
+        return found
+
     def pending_evaluations(self) -> list[Evaluation]:
         """Evaluations that were scheduled and not finished, oldest first."""
         query = "SELECT generation, vector, episodes FROM evaluation WHERE mean IS NULL ORDER BY generation"
@@ -231,5 +242,9 @@ def _translated(path: Path) -> Iterator[None]:
         raise
     except sqlite3.OperationalError as error:
         raise JournalError(f"cannot write {path}: {error}; nothing counted that was not written before") from error
+    except sqlite3.IntegrityError as error:
+        raise JournalError(
+            f"{path} was not written: {error}; what was committed before is whole, and the run can be continued"
+        ) from error
     except sqlite3.DatabaseError as error:
         raise JournalError(f"{path} is damaged or no journal: {error}; restore it from a copy") from error

@@ -41,10 +41,11 @@ def choose_addresses(own: NetworkConfig, site: SiteConfig, kept: Table) -> Netwo
     `connect` of the site says where everybody finds the router. A coordinator that listens is that router, and
     connects to another one only if its own flag or table says so.
     """
-    listen = own.listen or site.listen
-    connect = own.connect or (() if listen else site.connect)
-    if not listen and not connect:
+    listen, connect = own.listen or site.listen, own.connect
+    if not listen and not connect:  # where everybody else connects to does not say where this one was
         listen, connect = kept.get("listen", ()), kept.get("connect", ())
+    if not listen and not connect:
+        connect = site.connect
     return replace(own, listen=listen or (() if connect else (DEFAULT_ENDPOINT,)), connect=connect)
 
 

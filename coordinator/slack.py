@@ -66,13 +66,12 @@ class Slack:
             self.collections.finish(result.digest)
             return
         assert result.fitness is not None
-        self.evaluations.record(work.job.generation, result.digest, result.fitness)
-        self._finish(work.job.generation)
+        for generation in self.evaluations.record(result.digest, result.fitness):
+            self._finish(generation)
 
     def _evaluate(self, evaluation: Evaluation) -> list[Work]:
-        results = self._journal.results_of("evaluate", evaluation.generation)
-        known = {digest: fitness for digest, (fitness, _) in results.items()}
-        work = self.evaluations.open(evaluation, self._settings.task, known)
+        wanted = [each.job.digest for each in evaluation.work(self._settings.task)]
+        work = self.evaluations.open(evaluation, self._settings.task, self._journal.fitness_of(wanted))
         self._finish(evaluation.generation)
         return work
 

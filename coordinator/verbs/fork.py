@@ -29,5 +29,7 @@ def run(args: argparse.Namespace) -> int:
         start, (_, sigma) = start_of(stored), latest(stored)
         present = {"sigma0": sigma, "temperature": spec_of(stored, len(stored.history())).temperature}
         settings = {**settings_of(stored.settings, stored.bundle_path), **present}
+    if {"environment", "normalise"} & args.given:
+        settings.pop("task_options", None)  # described anew, and refused if that makes another world of it
     args.run_name = args.run_name or f"{args.source}-fork"
     return serve(args, settings, start)

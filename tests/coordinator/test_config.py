@@ -7,8 +7,10 @@ from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.fields import written
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.runs import RunSettings
+from dreamfleet.common.tasks import Description
 from dreamfleet.coordinator.config import RunConfig, settings_of
 from dreamfleet.coordinator.start import Start
+from dreamfleet.worker.tasks.api import Task
 
 
 @pytest.mark.parametrize(
@@ -112,3 +114,56 @@ def test_a_run_that_says_nothing_of_optimisers_keeps_the_words_of_the_first_vers
 def test_what_an_optimiser_cannot_do_is_refused_before_there_is_a_run(random_bundle, changes, says):
     with pytest.raises(UsageError, match=says):
         RunConfig(**changes).settings(random_bundle)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"horizon": 2_000_000}, "--horizon must be at most 1000000"),
+        ({"patience": 10**8}, "--patience must be at most"),
+        ({"seed": 10**20}, "--seed must be at most"),
+        ({"population": 10**11}, "--population must be at most 100000"),
+        ({"hidden_units": 10**12}, "--hidden-units must be at most"),
+        ({"sigma0": 1e300}, "at most 1e"),
+        ({"task": ""}, "cannot name a task"),
+        ({"task": "a b:x"}, "cannot name a task"),
+        ({"task": "car-racng"}, "did you mean car-racing"),
+        ({"task": "gymm:CartPole-v1"}, "did you mean gym:..."),
+    ],
+)
+def test_what_a_journal_cannot_hold_is_refused_before_there_is_one(changes, says):
+    with pytest.raises(UsageError, match=says):
+        RunConfig(**changes)
+
+
+class Field(Task):
+    """Needs no bundle, and says so."""
+
+    name = "field"
+
+    def describe(self, options):
+        return Description(2, 2)
+
+
+def test_a_task_that_describes_itself_needs_no_bundle(random_bundle):
+    config = RunConfig(task=f"{__name__}:Field")
+    assert config.needs_no_bundle
+    assert config.settings(None).task.bundle == ""
+    assert not RunConfig().needs_no_bundle
+    assert not RunConfig(task="dream").needs_no_bundle
+    assert not RunConfig(task="no.such.module:Task").needs_no_bundle
+    with pytest.raises(UsageError, match="without a world model"):
+        RunConfig(task="gym:CartPole-v1", bundle="tiny").settings(random_bundle)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"environment": ("x=1", "x=2")}, "stands there twice"),
+        ({"task_options": '{"normal": {"mean": [1], "deviation": [0]}}'}, "mean and a positive deviation of 4 numbers"),
+        ({"task_options": "{"}, "must be a JSON object"),
+    ],
+)
+def test_options_that_describe_no_world_are_refused(changes, says):
+    with pytest.raises(UsageError, match=says):
+        RunConfig(task="gym:CartPole-v1", **changes).settings(None)

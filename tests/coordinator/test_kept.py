@@ -77,3 +77,10 @@ def test_a_target_that_cannot_be_kept_is_refused(target):
 def test_addresses_are_as_told_else_as_kept_else_this_host_alone(own, site, kept, addresses):
     chosen = choose_addresses(NetworkConfig(**own), SiteConfig(**site), kept)
     assert (chosen.listen, chosen.connect) == addresses
+
+
+def test_where_everybody_connects_to_does_not_say_where_a_run_listened():
+    kept = {"listen": (HERE,)}
+    assert choose_addresses(NetworkConfig(), SiteConfig(connect=(THERE,)), kept).listen == (HERE,)
+    assert choose_addresses(NetworkConfig(), SiteConfig(connect=(THERE,)), {}).connect == (THERE,)
+    assert choose_addresses(NetworkConfig(connect=(FAR,)), SiteConfig(), kept).listen == ()

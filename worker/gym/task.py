@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from dreamfleet.common.actions import Actions, Continuous, Discrete
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.tasks import GYM
-from dreamfleet.worker.tasks.api import Assignment, Description, Policy, Task, World
+from dreamfleet.worker.tasks.api import ENVIRONMENTS_OWN, Assignment, Description, Policy, Task, World
 from dreamfleet.worker.tasks.policy import FlatPolicy
 
 OPTIONS = ("environment", "normalise", "seed")
 NORMALISING_EPISODES = 20
+MOST_STEPS = 10_000  # of an episode where the environment was registered without a limit of its own
 # What gymnasium's own environments compute with; of any other the distribution that its module is from.
 ENGINES = {
     "gymnasium.envs.box2d": ("box2d", "box2d-py"),
@@ -96,6 +97,8 @@ class GymTask(Task):
             ) from error
         except TypeError as error:
             raise UsageError(f"{self._id} takes no such arguments: {error}") from error
+        except (Exception, SystemExit) as error:  # whatever an environment does as it is made
+            raise UsageError(f"{self._id} cannot be made: {type(error).__name__}: {error}") from error
 
 
 def _world_of(environment: gymnasium.Env[Any, Any], name: str) -> World:
@@ -110,14 +113,23 @@ def _world_of(environment: gymnasium.Env[Any, Any], name: str) -> World:
     return World(
         actions=_actions(environment.action_space, name),
         packages=("numpy", "gymnasium", *engine),
-        frames_per_second=int(rate),
+        horizon=ENVIRONMENTS_OWN if _limited(environment) else MOST_STEPS,
+        frames_per_second=max(1, round(rate)),
     )
+
+
+def _limited(environment: gymnasium.Env[Any, Any]) -> bool:
+    return environment.spec is not None and bool(environment.spec.max_episode_steps)
 
 
 def _actions(space: Any, name: str) -> Actions:
     if isinstance(space, spaces.Discrete):
         return Discrete(int(space.n), int(space.start))
-    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+    if isinstance(space, spaces.Box) and len(space.shape) == 1 and space.shape[0]:
+        if not np.issubdtype(space.dtype, np.floating):
+            raise UsageError(
+                f"{name} takes whole numbers as actions: wrap it so that they are Discrete, or of a float Box"
+            )
         if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise UsageError(f"{name} takes actions without bounds: wrap it so that its actions have a range")
         return Continuous.between(space.low, space.high)
@@ -130,8 +142,9 @@ def _normal(environment: gymnasium.Env[Any, Any], seed: int) -> tuple[NDArray[np
     seen = []
     for episode in range(NORMALISING_EPISODES):
         observation, _ = environment.reset(seed=seed + episode)
-        over = False
-        while not over:
+        over, steps = False, 0
+        while not over and steps < MOST_STEPS:
+            steps += 1
             seen.append(np.asarray(observation, dtype=np.float64).reshape(-1))
             observation, _, terminated, truncated, _ = environment.step(environment.action_space.sample())
             over = terminated or truncated

@@ -198,6 +198,7 @@ class JoinedRun:
             return
         if (admission.run_uid, admission.spec) != (self._admission.run_uid, self._admission.spec):
             raise RefusedError(f"run {admission.run} is another run now; start this worker again to join it")
+        anew = admission.nonce != self._admission.nonce
         self._admission = admission
         self._post = Post(self._line.session, self._line.identity, admission)
         self._drop_batches()
@@ -207,7 +208,8 @@ class JoinedRun:
         self._uploads.resend_all()
         self._beat_at = 0.0
         self._membership.rejoin(admission.nonce, monotonic())
-        log.info("joined run %s again, incarnation %d", admission.run, admission.incarnation)
+        level = logging.INFO if anew else logging.DEBUG  # an idle worker of a paused run asks again and again
+        log.log(level, "joined run %s again, incarnation %d", admission.run, admission.incarnation)
 
     def _drop_batches(self) -> None:
         """Batches that wait in the queue are of the numbering that has ended, and would pass for later ones."""

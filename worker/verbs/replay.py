@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.runs import open_run
     from dreamfleet.worker.tools.replay import replay
 
-    found = re.fullmatch(r"(\d+)/(\d+)", args.candidate)
+    found = re.fullmatch(r"(\d{1,12})/(\d{1,12})", args.candidate)
     if not found:
         raise UsageError(f"--candidate {args.candidate!r}: write generation/index, such as 3/0")
     with open_run(args.runs_dir, args.run_name) as stored:

@@ -86,7 +86,8 @@ def test_an_option_reaches_an_optimiser_of_ones_own():
 
 
 @pytest.mark.parametrize(
-    ("name", "says"), [("AsksForTooMany", r"asked for \(9, 12\) numbers, not \(8, 12\)"), ("Diverged", "not finite")]
+    ("name", "says"),
+    [("AsksForTooMany", r"asked for \(9, 12\) numbers, not \(8, 12\)"), ("Diverged", "no single-precision number")],
 )
 def test_a_population_that_is_none_is_refused(name, says):
     with pytest.raises(DreamfleetError, match=says):

@@ -9,6 +9,7 @@ from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.tasks import describe_task, family_of
+from dreamfleet.worker.gym.task import MOST_STEPS
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
 
@@ -97,6 +98,59 @@ def test_observations_are_normalised_by_what_the_run_froze():
 def test_what_cannot_be_scored_in_is_refused_with_why(name, says):
     with pytest.raises(UsageError, match=says):
         describe_task(name, {})
+
+
+class Strange(gymnasium.Env):
+    """What its arguments say."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,))
+
+    def __init__(self, actions="float", fails=None, render_mode=None):
+        if fails == "exit":
+            raise SystemExit(3)
+        if fails:
+            raise RuntimeError(fails)
+        self.action_space = {
+            "float": gymnasium.spaces.Box(-1, 1, (1,)),
+            "whole": gymnasium.spaces.Box(0, 3, (1,), np.int64),
+            "none": gymnasium.spaces.Box(-1, 1, (0,)),
+        }[actions]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+@pytest.fixture
+def strange():
+    gymnasium.register("Strange-v0", entry_point=Strange)
+    yield "gym:Strange-v0"
+    del gymnasium.registry["Strange-v0"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"actions": "whole"}, "takes whole numbers as actions"),
+        ({"actions": "none"}, "takes actions Box"),
+        ({"actions": "?"}, "cannot be made: KeyError"),
+        ({"fails": "boom"}, "cannot be made: RuntimeError: boom"),
+        ({"fails": "exit"}, "cannot be made: SystemExit"),
+    ],
+)
+def test_whatever_an_environment_does_as_it_is_made_is_one_error(strange, arguments, says):
+    with pytest.raises(UsageError, match=says):
+        describe_task(strange, {"environment": arguments})
+
+
+def test_an_environment_without_a_time_limit_is_bounded(strange):
+    assert describe_task(strange, {"normalise": True}).observations == 2
+    scorer = Scorer(spec(strange))
+    assert scorer.score("evaluate", np.zeros(3, np.float32), 1).steps == MOST_STEPS
+    scorer.close()
 
 
 def test_unknown_options_and_arguments_are_refused():

@@ -1,0 +1,8 @@
+"""Texts of others as a terminal may show them."""
+
+from __future__ import annotations
+
+
+def printable(text: str) -> str:
+    """The text with control characters, which a terminal would obey, as what they are written like."""
+    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
