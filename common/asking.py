@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable, Iterable
+from time import monotonic
 from typing import Any
 
 import zenoh
 
+GRACE = 2.0  # seconds after which no end of replies is waited for
 LOOK = 0.2  # seconds between looks at whether to stop
 
 
@@ -27,8 +29,9 @@ def ask_all(
         handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
         session.get(selector, handler, timeout=timeout, payload=payload, encoding=encoding)
         left += 1
-    payloads = []
-    while left and not stopped():
+    payloads: list[bytes] = []
+    deadline = monotonic() + timeout + GRACE  # Ctrl-C in Zenoh's thread can take an end of replies with it
+    while left and not stopped() and monotonic() < deadline:
         try:
             reply = replies.get(timeout=LOOK)
         except queue.Empty:

@@ -173,7 +173,13 @@ def _controller(about: dict[str, Any], data: bytes) -> Controller:
         shape = from_plain(ControllerShape, known(ControllerShape, about["shape"]))
         parameters = np.frombuffer(data, dtype="<f4").astype(np.float32)
         controller = Controller(
-            shape, parameters, str(about["task"]), str(about["bundle"]), dict(about.get("provenance", {}))
+            shape,
+            parameters,
+            str(about["task"]),
+            str(about["bundle"]),
+            dict(about.get("provenance", {})),
+            str(about.get("options", "")),
+            int(about.get("version", 1)),
         )
     except (ValueError, KeyError, TypeError) as error:
         raise ControllerError(f"the run's controller cannot be read ({error}): update dreamfleet") from error

@@ -19,7 +19,7 @@ from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 MAX_MESSAGE = 48 * 1024
 MAX_PART = 40 * 1024  # room for the envelope around a part's bytes
 MAX_UPLOAD = 32 << 20  # a rollout of 1000 steps is 12 MB (64x64) or 28 MB (96x96) before it is compressed
-MAX_OPTIONS = 20_000  # characters
+MAX_OPTIONS = 8_000  # characters: a status and a controller carry them too
 MAX_LEASES = 1024  # of one worker: so that a beat, which names them all, stays under MAX_MESSAGE
 TAG_BYTES = 8
 COLDEST, HOTTEST = 1e-3, 1e3  # of a dream

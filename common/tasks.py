@@ -56,7 +56,8 @@ def load_task(name: str) -> Any:
             return getattr(import_module(head), rest)()
     except ModuleNotFoundError as error:
         raise UsageError(
-            f"task {name!r} cannot be loaded: no module {error.name!r} here; install the package that has it"
+            f"task {name!r} cannot be loaded: no module {error.name!r} here; install the package that has it, or name "
+            "its folder in PYTHONPATH: the current folder is not searched"
         ) from error
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise UsageError(f"task {name!r} cannot be loaded: {error}") from error

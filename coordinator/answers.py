@@ -19,7 +19,7 @@ from dreamfleet.coordinator.status import Snapshot
 PAGE_BYTES = 36_000  # of the rows of a page
 PAGE, CANDIDATES, RECENT = 100, 1000, 60  # rows of a page, candidates of a page, closed generations in the status
 HEAD_WORKERS, HEAD_HISTORY, HEAD_CANDIDATES = 11_000, 12_000, 6_000  # bytes of each head in the status
-PARAMETERS = 6_000  # parameters of a controller in one answer: 32 KB in base64
+PARAMETERS = 4_000  # parameters of a controller in one answer: 21 KB in base64
 
 
 T = TypeVar("T")
@@ -106,6 +106,8 @@ def _best(snapshot: Snapshot, offset: int) -> dict[str, Any]:
         "task": controller.task,
         "bundle": controller.bundle,
         "provenance": controller.provenance,
+        "options": controller.options,
+        "version": controller.version,
         "sha256": controller.sha256,  # of all parameters: parts of one controller have the same
         "dtype": "<f4",
         "offset": offset,

@@ -21,6 +21,7 @@ from dreamfleet.common.tasks import GYM, check_task, describe_task, describes_it
 DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
 
 
+PYTHONS = {"True": True, "False": False, "None": None}
 LARGEST_STEP = 1e6  # first step size; parameters travel in single precision
 # What a journal and a message can hold.
 BOUNDS = {
@@ -176,6 +177,8 @@ def _argument(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not (equals and name.isidentifier()):
         raise UsageError(f"--environment {text!r}: write KEY=VALUE, such as continuous=true")
+    if value in PYTHONS:  # as people who know gymnasium write it
+        return name, PYTHONS[value]
     try:
         return name, json.loads(value)
     except ValueError:

@@ -69,6 +69,7 @@ class Service:
         self._overflow: Counter[str] = Counter()  # counted in Zenoh's threads, under the lock
         self._lock = threading.Lock()
         self._stopping = self._draining = False
+        self._evaluations_told = 0
 
     def stop(self) -> None:
         """End the loop soon; the run can be continued. Safe in a signal handler."""
@@ -87,6 +88,9 @@ class Service:
             declared = self._declare(session)
             log.info("run %s, incarnation %d, generation %d", self._name, self._run.incarnation,
                      self._run.generation.number)  # fmt: skip
+            if self._network.listen:
+                log.info("listening on %s", ", ".join(self._network.listen))
+            self._evaluations_told = len(self._run.slack.evaluations)
             on_ready(self._run)
             self._loop(session)
             self._run.leave()
@@ -306,6 +310,11 @@ class Service:
             )
             session.put(keys.event_generation(self._name), encode_json(event), encoding="application/json")
             log.info("generation %d: mean %.1f, best %.1f", closed.number, closed.mean, closed.best)
+        evaluations = self._run.slack.evaluations
+        if (last := evaluations.last) is not None and len(evaluations) > self._evaluations_told:
+            log.info("evaluation of generation %d's mean: %.1f ± %.1f (standard error), %d episodes",
+                     last.generation, last.mean, last.error, last.episodes)  # fmt: skip
+        self._evaluations_told = len(evaluations)
 
     def _take_snapshot(self) -> Snapshot:
         now = monotonic()

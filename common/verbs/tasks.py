@@ -6,6 +6,8 @@ import argparse
 import json
 from importlib.metadata import EntryPoint
 
+from dreamfleet.common.listing import print_rows
+
 SUMMARY = "list the tasks that installed packages register, and what keeps one from running here"
 EXTRAS = ()
 
@@ -17,22 +19,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a line a task; the exit code is 0 also where one cannot run."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     from dreamfleet.common.tasks import registered_tasks
 
     rows = [_row(name, point) for name, point in registered_tasks().items()]
     if args.json:
         print(json.dumps(rows, indent=2))
         return 0
-    table = Table(box=None, padding=(0, 2), header_style="dim")
-    for column in ("task", "package", "here"):
-        table.add_column(column, overflow="fold")
-    for row in rows:
-        table.add_row(*(Text(str(row[key])) for key in ("task", "package", "here")))
-    Console().print(table)
+    print_rows([{name: row[name] for name in ("task", "package", "here")} for row in rows])
     return 0
 
 

@@ -31,5 +31,7 @@ def run(args: argparse.Namespace) -> int:
         settings = {**settings_of(stored.settings, stored.bundle_path), **present}
     if {"environment", "normalise"} & args.given:
         settings.pop("task_options", None)  # described anew, and refused if that makes another world of it
+    if "optimiser" in args.given and "optimiser_options" not in args.given:
+        settings.pop("optimiser_options", None)  # they are the other one's
     args.run_name = args.run_name or f"{args.source}-fork"
     return serve(args, settings, start)

@@ -3,11 +3,12 @@
 import dataclasses
 import json
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
 from dreamfleet.common.codec import from_plain
-from dreamfleet.common.messages import MAX_MESSAGE, Result
+from dreamfleet.common.messages import MAX_MESSAGE, MAX_OPTIONS, Result
 from dreamfleet.common.runs import StoredGeneration
 from dreamfleet.common.status import PARTS, Population, read_document, read_status
 from dreamfleet.coordinator import answers
@@ -94,6 +95,9 @@ def large(population, workers, generations, text="x"):
 @pytest.mark.parametrize("text", ["x", "\N{SNOWMAN}", "\N{ROLLING ON THE FLOOR LAUGHING}"])
 def test_no_answer_is_longer_than_a_message_whatever_the_run(population, workers, generations, text):
     snapshot = large(population, workers, generations, text)
+    longest = replace(snapshot.status.settings.task, options="x" * MAX_OPTIONS)
+    settings = replace(snapshot.status.settings, task=longest)
+    snapshot = replace(snapshot, status=replace(snapshot.status, settings=settings))
     for part in PARTS:
         payload = answers.answer(snapshot, part, {})
         assert len(payload) <= MAX_MESSAGE, part

@@ -125,6 +125,10 @@ class JoinedRun:
         nonce = str(event.key_expr).rsplit("/", 1)[-1]
         if event.kind == zenoh.SampleKind.DELETE:
             self._membership.vanish(nonce, monotonic())
+            log.info(
+                "the coordinator of run %s left; this worker waits for it (--any takes another run)",
+                self._admission.run,
+            )
         else:
             self._membership.appear(nonce)
 

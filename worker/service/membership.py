@@ -106,8 +106,12 @@ class Membership:
         if self._told_to_stop > 1:
             return True
         if self._drain_until is not None:
-            return not busy or now > self._drain_until
-        return self._terms.leaves_alone and self._alone_since is not None and now - self._alone_since > GONE
+            return not busy or now > self._drain_until or self._alone(now)
+        return self._terms.leaves_alone and self._alone(now)
+
+    def _alone(self, now: float) -> bool:
+        """Whether no coordinator was in sight for so long that none is waited for."""
+        return self._alone_since is not None and now - self._alone_since > GONE
 
     def must_rejoin(self, now: float, hands: Hands) -> bool:
         """Whether to say hello again: a coordinator is there, and may not know this worker."""

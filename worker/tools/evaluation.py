@@ -66,9 +66,15 @@ def bundle_for(controller: Controller, named: str | None, beside: Path | None = 
 def evaluate(
     controller: Controller, bundle: Bundle | None, seeds: tuple[int, ...], jobs: int
 ) -> Iterator[tuple[int, float]]:
-    """Drive one whole episode a seed in `jobs` processes; yields (seed, score) as each ends."""
+    """Drive one whole episode a seed in `jobs` processes, in this one if it is 1; yields (seed, score) as each ends."""
     pin_thread_pools()
     spec = spec_for(controller, bundle)
+    if jobs == 1:  # here: a script of one's own need not guard its main part
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        scorer = Scorer(spec, bundle, judge=True)
+        yield from ((seed, scorer.score("evaluate", controller.parameters, seed).fitness) for seed in seeds)
+        scorer.close()
+        return
     pool = ProcessPoolExecutor(min(jobs, len(seeds)), get_context("spawn"), _start_process)
     try:
         path = bundle.path if bundle else None
@@ -76,7 +82,10 @@ def evaluate(
         for drive in as_completed(drives):
             yield drive.result()
     except BrokenProcessPool as error:
-        raise DreamfleetError("a process that drove has crashed; `dreamfleet doctor` looks for the cause") from error
+        raise DreamfleetError(
+            'a process that drove has crashed; in a script of your own call this under `if __name__ == "__main__":` or '
+            "with jobs=1; else `dreamfleet doctor` looks for the cause"
+        ) from error
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -52,7 +52,10 @@ def evaluate(
     controller: Controller, bundle: Bundle | None = None, episodes: int = 100, first_seed: int = TEST.start,
     jobs: int | None = None,
 ) -> Evaluated:  # fmt: skip
-    """Scores of whole episodes, one a seed, in `jobs` processes (one a core), as `dreamfleet evaluate` gives them."""
+    """Scores of whole episodes, one a seed, in `jobs` processes (one a core), as `dreamfleet evaluate` gives them.
+
+    With more than one job a script calls this under `if __name__ == "__main__":`, for processes are spawned.
+    """
     if episodes < 1 or first_seed < 0 or (jobs is not None and jobs < 1):
         raise UsageError("episodes and jobs must be at least 1, first_seed at least 0")
     seeds = tuple(range(first_seed, first_seed + episodes))

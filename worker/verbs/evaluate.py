@@ -55,7 +55,11 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({**report, "task": controller.task, "bundle": controller.bundle, "judge": "gymnasium"}))
     else:
         low, high = min(done.scores), max(done.scores)
-        print(f"{done.mean:.1f} ± {done.std:.1f} on {len(seeds)} tracks ({low:.0f} to {high:.0f}), judged by gymnasium")
+        error = done.std / len(seeds) ** 0.5
+        print(
+            f"{done.mean:.1f} ± {error:.1f} (standard error) on {len(seeds)} seeds, {low:.0f} to {high:.0f}, "
+            f"standard deviation {done.std:.1f}; judged by gymnasium's own environment"
+        )
     return 0
 
 

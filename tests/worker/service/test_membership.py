@@ -200,7 +200,8 @@ class AnyOrder(RuleBasedStateMachine):
             if self.stops > 1:
                 assert over
             elif self.drains:
-                assert over == (not busy or self.now > self.drain_until)
+                alone = not self.seen and self.now - self.alone > GONE  # nobody takes what it would deliver
+                assert over == (not busy or self.now > self.drain_until or alone)
             else:
                 assert over == (not self.seen and self.now - self.alone > GONE)
 

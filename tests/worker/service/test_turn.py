@@ -7,7 +7,7 @@ import pytest
 
 from dreamfleet.worker.service.turn import AbandonedError, do_turn
 from dreamfleet.worker.tasks.api import Score
-from tests.support.samples import VECTOR, job
+from tests.support.samples import SPEC, VECTOR, job
 
 WORK = [(job(number), VECTOR) for number in range(3)]
 
@@ -18,9 +18,11 @@ class Scorer:
     def __init__(self, *scores):
         self._scores = scores
 
-    def score_all(self, episodes, on_step, temperature):
+    spec = SPEC
+
+    def score_all(self, episodes, on_step, spec):
         assert all(np.array_equal(vector, np.frombuffer(VECTOR, "<f4")) for _, vector, _ in episodes)
-        assert temperature == WORK[0][0].temperature
+        assert spec == SPEC.at(WORK[0][0].temperature)
         for number, _ in enumerate(self._scores):
             on_step(number + 1)
         return list(self._scores)
