@@ -9,6 +9,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -36,6 +37,7 @@ WEIGHTS = "weights.safetensors"  # only in bundles that training goes on from
 REQUIRED = (ENCODER, DECODER, POLICY, INITIAL)
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _MAX_MANIFEST = 1_000_000
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,9 @@ class Bundle:
         self._shape = shape
 
     @classmethod
-    def open(cls, path: Path) -> Bundle:
+    def open(cls, path: Path | str) -> Bundle:
         """Verify a bundle whole: archive, manifest, each part's hash; `BundleError` says what is wrong."""
+        path = Path(path)  # a text is one too
         try:
             sha256 = hash_file(path)
             with zipfile.ZipFile(path) as archive:
@@ -156,7 +159,7 @@ class BundleStore:
 
         Waits while another process of this host downloads it; look with `find` again before you do.
         """
-        partial = self._folder / f"{sha256}.part"
+        partial = self._partial(sha256)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             lock = partial.with_suffix(".lock").open("w")
@@ -170,7 +173,7 @@ class BundleStore:
 
     def complete(self, sha256: str) -> Bundle:
         """Verify a finished download and give it its name; a wrong one is removed."""
-        partial = self._folder / f"{sha256}.part"
+        partial = self._partial(sha256)
         if (found := hash_file(partial)) != sha256:
             partial.unlink()
             raise BundleError(
@@ -180,7 +183,17 @@ class BundleStore:
         return Bundle.open(self._path(sha256))
 
     def _path(self, sha256: str) -> Path:
-        return self._folder / f"{sha256}.zip"
+        return self._folder / f"{_checked(sha256)}.zip"
+
+    def _partial(self, sha256: str) -> Path:
+        return self._folder / f"{_checked(sha256)}.part"
+
+
+def _checked(sha256: str) -> str:
+    """A hash that comes over the wire becomes part of a path: it must be one."""
+    if not _SHA256.fullmatch(sha256):
+        raise BundleError(f"{sha256!r} is no hash of a bundle: the run's specification is damaged")
+    return sha256
 
 
 def default_cache() -> Path:

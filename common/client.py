@@ -33,7 +33,8 @@ class Client:
     ...     print(client.status("my-run").state)
     """
 
-    def __init__(self, connect: tuple[str, ...]) -> None:
+    def __init__(self, connect: tuple[str, ...] | str) -> None:
+        connect = (connect,) if isinstance(connect, str) else connect
         self._where = ", ".join(connect)
         self.session = open_session(Network(connect=connect))  # also for what asks in other words, as for a bundle
 

@@ -85,10 +85,10 @@ class Controller:
     """Parameters `(size,)` float32, and for which task and world model they were evolved."""
 
     shape: ControllerShape
-    parameters: NDArray[np.float32]
+    parameters: NDArray[np.float32] = field(repr=False)
     task: str
     bundle: str  # SHA-256 of the bundle's file, hexadecimal; empty where the task needs none
-    provenance: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict, repr=False)
     options: str = ""  # the task's own, as its specification has them
     version: int = 1  # the task's
 

@@ -166,3 +166,13 @@ def test_a_damaged_cached_copy_is_fetched_again(random_bundle, tmp_path):
 
 def test_other_weights_are_another_bundle(random_bundle, tmp_path):
     assert write_random_bundle(tmp_path / "other.zip", seed=1).sha256 != random_bundle.sha256
+
+
+@pytest.mark.parametrize("name", ["", "abc", "../" * 20 + "etc0", "AB" * 32, "ab" * 31 + "/x"])
+def test_what_is_no_hash_is_never_part_of_a_path(tmp_path, name):
+    store = BundleStore(tmp_path)
+    with pytest.raises(BundleError, match="no hash of a bundle"):
+        store.find(name)
+    with pytest.raises(BundleError, match="no hash of a bundle"), store.downloading(name):
+        pass
+    assert not list(tmp_path.iterdir())
