@@ -94,7 +94,10 @@ def test_a_live_runs_controller_is_fetched_and_judged_on_another_host(processes,
         worker.popen.send_signal(signal.SIGTERM)
         assert worker.finish()[0] == 0
         with open_run(processes.runs, "test") as run:
+            closed = len(run.history())
             here = Controller.load(run.controller_path)
+        while client.status("test").generations < closed:
+            pass  # a snapshot is a fifth of a second old, or more on a busy host
         there = client.controller("test")
         assert len(there.parameters) > 6000
         assert (there.shape, there.task, there.bundle) == (here.shape, here.task, here.bundle)
