@@ -131,8 +131,9 @@ class Assignment:
 class Task:
     """One thing to score in; what is not told here is refused by name when the task is looked up.
 
-    A subclass gives `name`, `world` and `make_environment`. Its policy is a linear or hidden
-    controller on the flat observation unless `make_policy` says otherwise.
+    A subclass gives `name`, `world` and `make_environment`; one that needs no bundle also `describe(options)`: the
+    `Description` that a new run freezes, or `UsageError` for an option that it does not know. Its policy is a linear or
+    hidden controller on the flat observation unless `make_policy` says otherwise.
     """
 
     name: str
@@ -156,14 +157,6 @@ class Task:
     def make_policy(self, assignment: Assignment) -> Policy:
         """What drives; `BundleError` if the bundle is of another task."""
         return FlatPolicy(assignment.controller, self.world_of(assignment).actions)
-
-
-@runtime_checkable
-class Describing(Protocol):
-    """A task that needs no bundle: it says itself how large its controllers are."""
-
-    def describe(self, options: Mapping[str, Any]) -> Description:
-        """What a new run freezes; `options` are the run's own for the task, `UsageError` for one it does not know."""
 
 
 class Batch(Protocol):
