@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import queue
 from collections.abc import Iterator
+from contextlib import suppress
+from time import monotonic
 from types import TracebackType
 from typing import Any
 
@@ -22,7 +24,7 @@ from dreamfleet.common.session import Network, enqueue_into, open_session
 from dreamfleet.common.status import OVER, Population, Status, WorkerStatus, read_document, read_status
 
 QUERY_TIMEOUT = 3.0
-FAREWELL = 1.0  # seconds that the last status may take once its coordinator no longer answers
+PATIENCE = 1.0  # seconds without an answer after which a watched run counts as left
 CHANGES = 5  # controllers that may replace one another while one is fetched in parts
 
 
@@ -65,35 +67,36 @@ class Client:
             raise self._nobody(f"run {run!r}" if run else "any run")
         return documents[0]
 
-    def watch(self, run: str, pause: float) -> Iterator[Status]:
+    def watch(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[Status]:
         """How `run` is every `pause` seconds, and at last how its coordinator left it.
 
-        `ConnectionFailedError` if the coordinator vanished without a word.
+        `ConnectionFailedError` if for `patience` seconds nobody answers: the coordinator vanished without a word, or
+        never came. Give more to wait for one that is being started, or started again.
         """
-        return map(read_status, self.watch_documents(run, pause))
+        return map(read_status, self.watch_documents(run, pause, patience))
 
-    def watch_documents(self, run: str, pause: float) -> Iterator[dict[str, Any]]:
+    def watch_documents(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[dict[str, Any]]:
         """As `watch`, but as the wire has it."""
         farewells: queue.SimpleQueue[Any] = queue.SimpleQueue()
         heard = enqueue_into(farewells, "status")
         subscriber: Any = self.session.declare_subscriber(keys.event_status(keys.check_run_name(run)), heard)
+        lost_at: float | None = None  # when it counts as left, while nobody answers
         try:
             while True:
-                silent = False
                 try:
                     document = self.document(run)
                 except ConnectionFailedError:
-                    silent = True
+                    lost_at = monotonic() + patience if lost_at is None else lost_at
+                    if monotonic() >= lost_at:
+                        raise
                 else:
+                    lost_at = None
                     yield document
                     if document.get("state") in OVER:
                         return
-                try:
-                    _, sample = farewells.get(timeout=FAREWELL if silent else pause)
-                except queue.Empty:
-                    if silent:
-                        raise self._nobody(f"run {run!r}") from None
-                else:
+                wait = pause if lost_at is None else min(pause, max(lost_at - monotonic(), 0.0))
+                with suppress(queue.Empty):
+                    _, sample = farewells.get(timeout=wait)
                     yield read_document(sample.payload.to_bytes())
                     return
         finally:
