@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
-.PHONY: demo test setup check wheel long box2d-py chaos sanitize bundle worker-size stranger clean
+.PHONY: demo test setup check wheel long box2d-py simulate chaos sanitize bundle worker-size stranger clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(ARGS)
@@ -43,6 +43,9 @@ box2d-py: $(VENV)/bin/python  ## the same library from its source archive instea
 	.venv-box2d-py/bin/python -m pip uninstall --quiet --yes box2d
 	PATH=$(CURDIR)/.venv-box2d-py/bin:$$PATH .venv-box2d-py/bin/python -m pip install --quiet --no-build-isolation box2d-py==2.3.8
 	.venv-box2d-py/bin/pytest -m "not long" $(ARGS)
+
+simulate: $(VENV)/.dev  ## SCHEDULES seeded schedules of faults against the pure parts, by a virtual clock: 100,000 take ten minutes
+	$(BIN)/python -m tests.simulation --schedules $(or $(SCHEDULES),100000) --seed $(or $(SEED),1) --jobs $(or $(JOBS),2)
 
 chaos: $(VENV)/.dev  ## a fleet under FAULTS seeded faults gives the bits of one that nobody disturbs
 	$(BIN)/python -m tests.chaos.chaos --faults $(or $(FAULTS),200) --seed $(or $(SEED),7)

@@ -1,0 +1,131 @@
+"""What must be true of the books of both sides between any two turns; all private state that is read is read here."""
+
+from __future__ import annotations
+
+from dreamfleet.common.messages import TAG_BYTES
+from dreamfleet.coordinator.fleet import Fleet, Send
+from dreamfleet.coordinator.run import Run
+from dreamfleet.worker.service.backlog import KEPT_VECTORS
+from tests.simulation.violation import Violation
+from tests.simulation.worker import Worker
+
+MOST_HOLDERS = 2
+MOST_ABSENCES = 1  # beats in a row that have seen a lease's batch and do not show it: the next one ends the lease
+# Virtual seconds, each a little longer than the product's own rule, which a wake of either side may overshoot.
+SENT_AGAIN_WITHIN = 3.6  # a batch that was not seen, while its coordinator is awake
+REPEATED_WITHIN = 1.6  # a result without a verdict, while its worker is awake
+ASKS_WITHIN = 4.0  # a worker that sees another life than it has joined
+
+
+def check_coordinator(fleet: Fleet) -> None:
+    """Leases, queue and counts agree with each other, and nothing is kept that nobody needs."""
+    wanted, members = fleet._wanted, fleet.members
+    queued = [digest for *_, digest in fleet._queue if digest in wanted]
+    named = set(queued)
+    _require(len(named) == len(queued), "the queue names a job twice")
+    in_slack = 0
+    for digest, each in wanted.items():
+        holders = each.holders
+        _require(each.queued == (digest in named), "a job and the queue disagree on whether it is queued")
+        _require(bool(holders) or digest in named, "a wanted job is neither held nor queued")
+        _require(len(holders) <= MOST_HOLDERS, "a job has more copies than two")
+        for holder in holders:
+            _require(holder in members, "a job is held by no member")
+            _require(digest in members[holder].leases, "a holder has no lease")
+        in_slack += each.in_slack and bool(holders)
+    for name, member in members.items():
+        _require(name == member.identity, "a member has another's name")
+        for digest, lease in member.leases.items():
+            _require(lease.absent <= MOST_ABSENCES, "a lease outlives beats that do not show it")
+            _require(digest in wanted, "a lease is on a job that nobody wants")
+            _require(name in wanted[digest].holders, "a lease is on a job that it does not hold")
+        _require(not (member.silent and member.leases), "a silent worker holds leases")
+        _require(all(number <= member.number for number in member.unseen), "a batch is unseen that was not sent")
+    _require(fleet._in_slack == in_slack, "what fills the slack is miscounted")
+    _require(fleet._tags.keys() == {digest[:TAG_BYTES] for digest in wanted}, "tags are not those of the wanted jobs")
+    _require(fleet._failing.keys() <= wanted.keys(), "a job fails that nobody wants")
+    _require(not fleet._accepted.keys() & wanted.keys(), "an accepted job is wanted still")
+    _require(all(count >= 0 for count in fleet.counts.values()), "a count is negative")
+
+
+def check_opening(fleet: Fleet, run: Run) -> None:
+    """As a generation opens, the ones before the last are forgotten."""
+    oldest = run.generation.number - 1
+    _require(all(number >= oldest for number in fleet._accepted.values()), "an old acceptance is remembered", "memory")
+
+
+def check_credit(fleet: Fleet, send: Send) -> None:
+    """A batch with new work fits the credit of its worker."""
+    member = fleet.members[send.identity]
+    if send.content.work and send.number == member.number:
+        _require(len(member.leases) <= 2 * member.capacity, "a worker was given more than its credit", "credit")
+
+
+class Sendings:
+    """When each batch of a coordinator's life was last sent, by the time that it was awake."""
+
+    def __init__(self) -> None:
+        self._awake = 0.0
+        self._last: dict[tuple[int, int], float] = {}
+
+    def pass_by(self, seconds: float) -> None:
+        """It was awake for so long."""
+        self._awake += seconds
+
+    def sent(self, fleet: Fleet, send: Send) -> None:
+        """A batch has left."""
+        self._last[id(fleet.members[send.identity]), send.number] = self._awake
+
+    def check(self, fleet: Fleet) -> None:
+        """What a present worker has not seen is sent again before long."""
+        for member in fleet.members.values():
+            for number in member.unseen if member.present else ():
+                quiet = self._awake - self._last.get((id(member), number), self._awake)
+                _require(quiet <= SENT_AGAIN_WITHIN, "a batch that was not seen is not sent again", "promptness")
+
+
+def check_sight(worker: Worker, sees: str | None, since: float, now: float) -> None:
+    """A worker that sees another life of its coordinator than it has joined says hello."""
+    if worker.nonce is not None and sees not in (None, worker.nonce) and not worker.stopped:
+        quiet = now - max(since, worker.asked_at, worker.awake_since)
+        _require(quiet <= ASKS_WITHIN, "a worker does not join the life that it sees", "promptness")
+
+
+def check_worker(worker: Worker, now: float) -> None:
+    """What it keeps is bounded by what it was given, and what it owes is repeated."""
+    vectors, queued = len(worker.backlog._vectors), len(worker.backlog.queued)
+    _require(vectors <= queued + KEPT_VECTORS, "a worker keeps vectors that no job needs", "memory")
+    for digest in worker.outbox.digests if worker.nonce is not None and not worker.asking else ():
+        quiet = now - worker.told_at.get(digest, now)
+        _require(quiet <= REPEATED_WITHIN, "a result without a verdict is not repeated", "promptness")
+
+
+def check_rest(fleet: Fleet, run: Run) -> None:
+    """After the last verdict nothing is left of anything but what waits for the run to be resumed."""
+    _require(not fleet.leased, "a paused fleet holds leases", "memory")
+    for member in fleet.members.values():
+        _require(not member.unseen, f"{member.identity} has batches that are not seen", "memory")
+        _require(not member.verdicts and not member.cancels, f"{member.identity} is owed words", "memory")
+    _require(len(run.slack.collections.uploads) == 0, "an upload is open that nobody sends", "memory")
+
+
+def check_end(fleet: Fleet, run: Run) -> None:
+    """An ended run wants nothing."""
+    _require(fleet.open == 0 and fleet.leased == 0, "an ended run wants jobs", "memory")
+    _require(not fleet._queue or not any(digest in fleet._wanted for *_, digest in fleet._queue), "queued at the end")
+    _require(not fleet._tags and not fleet._failing, "an ended run keeps books", "memory")
+    _require(len(run.slack.collections.uploads) == 0, "an upload is open at the end", "memory")
+
+
+def at_rest(fleet: Fleet, run: Run) -> bool:
+    """Whether `check_rest` would find nothing."""
+    try:
+        check_rest(fleet, run)
+    except Violation:
+        return False
+    return True
+
+
+def _require(holds: bool, otherwise: str, rule: str = "books") -> None:
+    if not holds:
+        raise Violation(rule, otherwise)

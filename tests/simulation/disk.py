@@ -1,0 +1,166 @@
+"""A disk that keeps what was committed and nothing else, and a journal on it with the real one's interface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Protocol
+
+from dreamfleet.common.messages import Job, Result
+from dreamfleet.common.runs import JOURNAL, StoredEvaluation, StoredGeneration
+from dreamfleet.coordinator.collection import Collection
+from dreamfleet.coordinator.evaluation import Evaluation
+from dreamfleet.coordinator.journal import OpenGeneration
+from tests.simulation.violation import Violation
+
+TABLES = ("fact", "generation", "result", "evaluation", "collection")
+FOLDER = Path("/simulated/run")
+
+
+class Disk:
+    """Tables that were committed, and files that were written aside; it outlives every coordinator."""
+
+    def __init__(self) -> None:
+        self.tables: dict[str, dict[Any, Any]] = {name: {} for name in TABLES}
+        self.files: dict[str, bytes] = {}
+        self.tables["fact"]["uid"] = "0123456789abcdef" * 2
+
+    @contextmanager
+    def write_aside(self, path: Path) -> Any:
+        """As `dreamfleet.common.files` has it: whole or not there."""
+        file = BytesIO()
+        yield file
+        self.files[path.name] = file.getvalue()
+
+
+class Witness(Protocol):
+    """Who looks at each row before it is written."""
+
+    def opened(self, number: int, vectors: tuple[bytes, ...]) -> None: ...
+    def counted(self, job: Job, result: Result) -> None: ...
+    def told(self, number: int, fitness: list[float]) -> None: ...
+    def evaluated(self, generation: int, mean: float, std: float) -> None: ...
+
+
+class MemoryJournal:
+    """One life's view of a disk: what it writes it reads, and what it did not commit is gone with it."""
+
+    def __init__(self, disk: Disk, witness: Witness) -> None:
+        self.path = FOLDER / JOURNAL
+        self._witness = witness
+        self._disk = disk
+        self._tables = {name: dict(rows) for name, rows in disk.tables.items()}
+        self._pending: list[tuple[str, Any, Any]] = []
+
+    def commit(self) -> None:
+        for table, key, row in self._pending:
+            _apply(self._disk.tables[table], key, row)
+        self._pending.clear()
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def fact(self, key: str) -> str | None:
+        found: str | None = self._tables["fact"].get(key)
+        return found
+
+    def set_fact(self, key: str, value: str) -> None:
+        self._put("fact", key, value)
+
+    def drop_fact(self, key: str) -> None:
+        self._put("fact", key, None)
+
+    def begin_incarnation(self) -> int:
+        number = int(self.fact("incarnation") or 0) + 1
+        self.set_fact("incarnation", str(number))
+        self.commit()
+        return number
+
+    def open_generation(self, number: int, state: Any, sigma: float, seeds: Sequence[int], vectors: Any) -> None:
+        self._witness.opened(number, tuple(vectors))
+        self._insert("generation", number, {"state": state, "seeds": tuple(seeds), "vectors": tuple(vectors)})
+
+    def close_generation(self, closed: StoredGeneration, fitness: Any) -> None:
+        row = self._tables["generation"][closed.number]
+        if "closed" in row:
+            raise Violation("counted twice", f"generation {closed.number} was closed before")
+        self._witness.told(closed.number, fitness.tolist())
+        self._put("generation", closed.number, {**row, "closed": closed, "fitness": fitness.tolist()})
+
+    def add_result(self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int) -> None:
+        self._witness.counted(job, result)
+        self._insert("result", result.digest, (job, result))
+
+    def schedule_evaluation(self, evaluation: Evaluation) -> None:
+        self._insert("evaluation", evaluation.generation, (evaluation, None))
+
+    def finish_evaluation(self, generation: int, mean: float, std: float) -> None:
+        self._witness.evaluated(generation, mean, std)
+        evaluation, _ = self._tables["evaluation"][generation]
+        finished = StoredEvaluation(generation, evaluation.episodes, mean, std)
+        self._put("evaluation", generation, (evaluation, finished))
+
+    def schedule_collection(self, collection: Collection) -> None:
+        self._insert("collection", collection.generation, collection)
+
+    def collections(self) -> list[Collection]:
+        return [row for _, row in sorted(self._tables["collection"].items())]
+
+    def last_generation(self) -> OpenGeneration | None:
+        numbers = self._tables["generation"]
+        return self.generation(max(numbers)) if numbers else None
+
+    def generation(self, number: int) -> OpenGeneration | None:
+        row = self._tables["generation"].get(number)
+        if row is None or number < max(self._tables["generation"]) - 1:
+            return None
+        return OpenGeneration(number, row["state"].packed(), row["seeds"], row["vectors"])
+
+    def closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
+        generations = [row["closed"] for _, row in sorted(self._tables["generation"].items()) if "closed" in row]
+        return generations, [done for _, (_, done) in sorted(self._tables["evaluation"].items()) if done]
+
+    def results_of(self, kind: str, generation: int) -> dict[bytes, tuple[float, int]]:
+        rows = self._tables["result"].items()
+        return {
+            digest: (result.fitness, result.steps)
+            for digest, (job, result) in rows
+            if job.kind == kind and job.generation == generation
+        }
+
+    def fitness_of(self, digests: Sequence[bytes]) -> dict[bytes, float]:
+        rows = self._tables["result"]
+        return {digest: rows[digest][1].fitness for digest in digests if digest in rows}
+
+    def pending_evaluations(self) -> list[Evaluation]:
+        return [evaluation for _, (evaluation, done) in sorted(self._tables["evaluation"].items()) if done is None]
+
+    def best_evaluation(self) -> tuple[int, float, bytes] | None:
+        rows = [
+            (done.mean, -done.generation, each.vector) for each, done in self._tables["evaluation"].values() if done
+        ]
+        best = max(rows, default=None)
+        return None if best is None else (-best[1], best[0], best[2])
+
+    def _insert(self, table: str, key: Any, row: Any) -> None:
+        """As a table with a primary key does."""
+        if key in self._tables[table]:
+            raise Violation("counted twice", f"the journal's {table} holds {_told(key)} already")
+        self._put(table, key, row)
+
+    def _put(self, table: str, key: Any, row: Any) -> None:
+        _apply(self._tables[table], key, row)
+        self._pending.append((table, key, row))
+
+
+def _apply(rows: dict[Any, Any], key: Any, row: Any) -> None:
+    if row is None:
+        rows.pop(key, None)
+    else:
+        rows[key] = row
+
+
+def _told(key: Any) -> str:
+    return key.hex()[:12] if isinstance(key, bytes) else str(key)

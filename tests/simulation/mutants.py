@@ -1,0 +1,351 @@
+"""Faults that are planted in the pure parts, one rule each: a simulation that does not find them proves nothing.
+
+Each mutant replaces one function by one that forgets a rule. `shape` turns the drawn schedules to where the rule
+matters, for rules that few shapes exercise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+from unittest.mock import patch
+
+from dreamfleet.common.messages import MAX_PART
+from dreamfleet.coordinator import fleet, packing
+from dreamfleet.coordinator.collection import Collections
+from dreamfleet.coordinator.evaluation import Evaluations
+from dreamfleet.coordinator.fleet import Fleet
+from dreamfleet.coordinator.generation import Generation
+from dreamfleet.coordinator.generations import Generations
+from dreamfleet.coordinator.member import Member, Sent
+from dreamfleet.coordinator.run import Run
+from dreamfleet.coordinator.uploads import Uploads as Intake
+from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.membership import Membership
+from dreamfleet.worker.service.outbox import Outbox
+from dreamfleet.worker.service.uploads import Uploads
+from tests.simulation.schedule import Schedule, draw
+from tests.simulation.world import Outcome, play
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One attribute that is replaced, and the shape in which that should be noticed."""
+
+    target: Any
+    attribute: str
+    replacement: Any
+    shape: Mapping[str, Any]
+
+    @contextmanager
+    def planted(self) -> Iterator[None]:
+        """The product without this rule."""
+        with patch.object(self.target, self.attribute, self.replacement):
+            yield
+
+    def schedule(self, seed: int, number: int) -> Schedule:
+        """The schedule of that number, in a shape that has what the mutant is about."""
+        drawn = draw(seed, number)
+        return replace(drawn, shape=replace(drawn.shape, **self.shape))
+
+    def find(self, seed: int, most: int) -> tuple[int, Outcome] | None:
+        """Which schedule finds it first, and how; `None` if none of so many does."""
+        with self.planted():
+            for number in range(most):
+                outcome = play(self.schedule(seed, number))
+                if outcome.violation is not None:
+                    return number, outcome
+        return None
+
+
+MUTANTS: dict[str, Mutant] = {}
+COLLECTING = {"collect_every": 1, "rollout": 90_000, "heat": 1.0}
+LONG = {"parameters": 23_000, "width": 1, "heat": 1.0}
+
+
+def mutant(target: Any, attribute: str, **shape: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Register a function that takes what it replaces, and gives the replacement."""
+
+    def register(make: Callable[..., Any]) -> Callable[..., Any]:
+        original = getattr(target, attribute)
+        MUTANTS[make.__name__] = Mutant(target, attribute, make(original), shape)
+        return make
+
+    return register
+
+
+# The coordinator: fleet, member, packing.
+
+
+@mutant(Fleet, "_release")
+def fleet_forgets_to_queue_what_a_lost_worker_held(_original):
+    def release(self, member):
+        member.leases.clear()
+        member.unseen.clear()
+
+    return release
+
+
+@mutant(Fleet, "_judge")
+def fleet_accepts_what_it_has_accepted_already(original):
+    def judge(self, identity, result):
+        wanted = self._wanted.get(result.digest)
+        works = self.__dict__.setdefault("mutated", {})
+        if wanted is not None:
+            works[result.digest] = wanted.work
+        elif result.digest in self._accepted and result.digest in works:
+            return "accepted", works[result.digest]
+        return original(self, identity, result)
+
+    return judge
+
+
+@mutant(Fleet, "_judge")
+def fleet_believes_every_result_of_the_generation_that_is_open(original):
+    def judge(self, identity, result):
+        if result.digest not in self._wanted and result.fitness is not None and self._wanted:
+            return original(self, identity, replace(result, digest=next(iter(self._wanted))))
+        return original(self, identity, result)
+
+    return judge
+
+
+@mutant(fleet, "Sent")
+def fleet_never_sends_a_batch_again(_original):
+    return lambda content, _now: Sent(content, math.inf)
+
+
+@mutant(fleet, "ABSENT_BEATS")
+def fleet_never_misses_a_job_that_beats_do_not_show(_original):
+    return 10**9
+
+
+@mutant(Fleet, "welcome")
+def fleet_keeps_the_leases_of_a_worker_that_joins_again(_original):
+    def welcome(self, identity, slots, fingerprint, now):
+        self.members[identity] = Member(identity, slots, fingerprint, heard=now)
+
+    return welcome
+
+
+@mutant(Fleet, "dispatch")
+def fleet_sends_verdicts_before_they_are_durable(original):
+    return lambda self, now, *, durable=True: original(self, now, durable=True)
+
+
+@mutant(Fleet, "_hold")
+def fleet_does_not_count_what_fills_the_slack(_original):
+    return lambda self, wanted, identity: wanted.holders.add(identity)
+
+
+@mutant(Fleet, "result")
+def fleet_gives_no_verdict_on_a_duplicate(original):
+    def result(self, identity, result, now):
+        judged = original(self, identity, result, now)
+        if judged[0] == "duplicate" and identity in self.members:
+            self.members[identity].verdicts.pop()
+        return judged
+
+    return result
+
+
+@mutant(Fleet, "begin")
+def fleet_remembers_every_acceptance(_original):
+    return lambda self, generation: None
+
+
+@mutant(Fleet, "pardon")
+def fleet_does_not_forget_failures_when_it_is_resumed(_original):
+    return lambda self: None
+
+
+@mutant(Fleet, "_unwant")
+def fleet_keeps_the_tag_of_an_answered_job(original):
+    def unwant(self, digest):
+        tags = dict(self._tags)
+        original(self, digest)
+        self._tags = tags
+
+    return unwant
+
+
+@mutant(Member, "credit")
+def member_has_credit_whatever_it_holds(_original):
+    return property(lambda self: 2 * self.capacity if self.present else 0)
+
+
+@mutant(packing, "vector_parts", **LONG)
+def packing_leaves_out_a_part_of_a_long_vector(original):
+    return lambda work: [part for part in original(work) if part.offset != MAX_PART]
+
+
+# The coordinator: run, generations, evaluations, uploads.
+
+
+@mutant(Generation, "record")
+def generation_fills_places_in_the_order_in_which_results_come(original):
+    def record(self, digest, fitness, steps):
+        missing = self.missing
+        return original(self, missing[0].job.digest if missing else digest, fitness, steps)
+
+    return record
+
+
+@mutant(Generation, "record")
+def generation_adds_to_a_place_what_has_been_counted(original):
+    def record(self, digest, fitness, steps):
+        (row, column), *_ = self._places[digest]
+        return original(self, digest, fitness + (self._scores[row, column - 1] == fitness) + (column > 1) * 1e-9, steps)
+
+    return record
+
+
+@mutant(Generation, "_pass_barrier", racing=True, episodes=3)
+def generation_lets_the_worse_half_pass_the_barrier(original):
+    def barrier(self):
+        self._scores *= -1
+        passed = original(self)
+        self._scores *= -1
+        return passed
+
+    return barrier
+
+
+@mutant(Generations, "_recall")
+def generations_forget_the_results_of_the_life_before(_original):
+    return lambda self, stored: self._generation(stored.number, stored.vectors, stored.seeds)
+
+
+@mutant(Run, "commit")
+def run_commits_only_what_closes_a_generation(original):
+    def commit(self):
+        if self._untold:
+            original(self)
+
+    return commit
+
+
+@mutant(Evaluations, "open", evaluate_every=1)
+def evaluations_forget_the_scores_of_the_life_before(original):
+    return lambda self, evaluation, spec, _known: original(self, evaluation, spec, {})
+
+
+@mutant(Collections, "receive", **COLLECTING)
+def collections_accept_a_rollout_that_has_not_come(_original):
+    return lambda self, _worker, result, _work: result
+
+
+@mutant(Intake, "_finish", **COLLECTING)
+def intake_joins_parts_in_the_order_in_which_they_come(_original):
+    def finish(self, worker, digest, upload):
+        upload.whole = b"".join(upload.parts.values())
+        upload.parts.clear()
+
+    return finish
+
+
+@mutant(Intake, "forget", **COLLECTING)
+def intake_never_lets_go_of_a_file(_original):
+    return lambda self, digest: None
+
+
+# The worker.
+
+
+@mutant(Backlog, "take_in")
+def backlog_counts_a_batch_twice(original):
+    def take_in(self, batch):
+        seen, ahead = self.seen, set(self._ahead)
+        if batch.number > seen and batch.number not in ahead:
+            return original(self, batch)
+        self.seen, self._ahead = batch.number - 1, set()
+        refused = original(self, batch)
+        self.seen, self._ahead = seen, ahead
+        return refused
+
+    return take_in
+
+
+@mutant(Backlog, "take_in")
+def backlog_believes_a_digest_that_is_not_of_its_content(original):
+    def take_in(self, batch):
+        self._jobs.update({job.digest: job for job, _ in original(self, batch)})
+        return []
+
+    return take_in
+
+
+@mutant(Backlog, "begin")
+def backlog_goes_on_counting_in_a_new_life(original):
+    def begin(self):
+        if not hasattr(self, "seen"):
+            original(self)
+
+    return begin
+
+
+@mutant(Backlog, "_whole", **LONG)
+def backlog_joins_a_long_vector_before_it_is_whole(_original):
+    def whole(self, identity):
+        vector = self._vectors.get(identity)
+        return vector if isinstance(vector, bytes) else b"".join((vector or {}).values()) or None
+
+    return whole
+
+
+@mutant(Outbox, "due")
+def outbox_never_repeats(original):
+    def due(self, now):
+        self.repeat = math.inf
+        return original(self, now)
+
+    return due
+
+
+@mutant(Outbox, "settle")
+def outbox_settles_another_result(original):
+    return lambda self, digests: original(
+        self, [each for _, each in zip(digests, reversed(self._waiting), strict=False)]
+    )
+
+
+@mutant(Outbox, "settle")
+def outbox_ignores_verdicts(_original):
+    return lambda self, digests: None
+
+
+@mutant(Uploads, "_advance", **COLLECTING)
+def uploads_forget_an_offset(original):
+    def advance(self, each, now):
+        original(self, each, now)
+        if each.offset == MAX_PART:
+            original(self, each, now)
+
+    return advance
+
+
+@mutant(Uploads, "settle", **COLLECTING)
+def uploads_go_on_after_the_verdict(_original):
+    return lambda self, digests: None
+
+
+@mutant(Membership, "must_rejoin")
+def membership_never_rejoins(_original):
+    return lambda self, now, hands: False
+
+
+@mutant(Membership, "must_rejoin")
+def membership_trusts_a_silent_coordinator(original):
+    def must_rejoin(self, now, hands):
+        self._quiet_since = now
+        return original(self, now, hands)
+
+    return must_rejoin
+
+
+@mutant(Membership, "vanish")
+def membership_does_not_notice_that_it_was_out_of_sight(_original):
+    return lambda self, nonce, now: None

@@ -1,0 +1,145 @@
+"""What a play is made of: a small fleet, and faults at moments of the virtual clock. Plain data, from a number."""
+
+from __future__ import annotations
+
+import json
+import random
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+
+SPAN = 9.0  # virtual seconds over which faults are spread: an undisturbed run takes about as long
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The fleet and the run that are disturbed."""
+
+    workers: int = 2
+    slots: int = 1  # of each worker
+    width: int = 1  # jobs that a slot scores together
+    generations: int = 2
+    population: int = 3
+    episodes: int = 2
+    parameters: int = 4  # more than 10,240 are spread over several batches
+    racing: bool = False
+    heat: float = 1.0
+    evaluate_every: int = 0
+    evaluation_episodes: int = 2
+    collect_every: int = 0
+    rollout: int = 300  # bytes; more than 40,960 travel in several parts
+    turn: float = 0.6  # virtual seconds that a slot's turn takes
+    run_seed: int = 1
+    ends: bool = True  # whether the run reaches its limit, or is paused after its last generation, and falls silent
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One disturbance. What `amount` means is told by the kind, in `faults.py`."""
+
+    at: float
+    kind: str
+    worker: int
+    seconds: float
+    amount: float
+
+
+# How often each kind comes, how many seconds it lasts, and the largest `amount` that is drawn.
+KINDS: dict[str, tuple[int, float, float]] = {
+    "lose_up": (4, 2.0, 0),
+    "lose_down": (4, 2.0, 0),
+    "double_up": (3, 2.0, 1.5),
+    "double_down": (3, 2.0, 1.5),
+    "delay_up": (3, 1.5, 4.0),
+    "delay_down": (3, 1.5, 4.0),
+    "jumble_up": (3, 2.0, 1.0),
+    "jumble_down": (3, 2.0, 1.0),
+    "cut": (4, 4.0, 1.0),
+    "cut_unnoticed": (2, 4.0, 1.0),
+    "lose_token": (2, 0.0, 1.0),
+    "late_token": (1, 0.0, 4.0),
+    "kill_worker": (4, 2.0, 0.3),
+    "stop_worker": (3, 7.0, 0),
+    "slow_worker": (2, 4.0, 9.0),
+    "drain_worker": (1, 2.0, 0),
+    "fail": (2, 0.0, 2.0),
+    "kill_coordinator": (4, 1.5, 30.0),
+    "kill_at_opening": (3, 1.5, 12.0),
+    "stop_coordinator": (2, 6.0, 0),
+    "leave": (1, 1.0, 0),
+    "pause": (1, 2.0, 0),
+    "stranger": (1, 0.0, 3.0),
+    "garble": (1, 0.0, 3.0),
+}
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """A play: the same one every time."""
+
+    shape: Shape
+    faults: tuple[Fault, ...]
+    name: str = "by hand"
+
+    def to_json(self) -> str:
+        """One line, which `--replay` takes; only what differs from a default is written."""
+        plain = Shape()
+        shape = {key: value for key, value in asdict(self.shape).items() if value != getattr(plain, key)}
+        rows = [[*asdict(fault).values()] for fault in self.faults]
+        return json.dumps({"name": self.name, "shape": shape, "faults": rows})
+
+    @classmethod
+    def from_json(cls, text: str) -> Schedule:
+        """What `to_json` wrote."""
+        told = json.loads(text)
+        known = {field.name for field in fields(Shape)}
+        shape = Shape(**{key: value for key, value in told["shape"].items() if key in known})
+        return cls(shape, tuple(Fault(*row) for row in told["faults"]), told["name"])
+
+    def without(self, start: int, end: int) -> Schedule:
+        """The same without some of its faults."""
+        return replace(self, faults=self.faults[:start] + self.faults[end:])
+
+
+def draw(seed: int, number: int) -> Schedule:
+    """The schedule of this number in the campaign of this seed."""
+    source = random.Random(f"{seed}/{number}")
+    shape = _draw_shape(source)
+    count = source.choice((0, 1, 5, 20, 20, 30, 40, 60))  # few faults too: each alone must be harmless
+    kinds, weights = list(KINDS), [often for often, _, _ in KINDS.values()]
+    faults = [_draw_fault(source, kind, shape.workers) for kind in source.choices(kinds, weights, k=count)]
+    return Schedule(shape, tuple(sorted(faults, key=lambda fault: fault.at)), f"seed {seed}, schedule {number}")
+
+
+def _draw_fault(source: random.Random, kind: str, workers: int) -> Fault:
+    _, longest, most = KINDS[kind]
+    fraction = partial(source.uniform, 0.02, 1.0)
+    return Fault(
+        at=round(source.uniform(0.0, SPAN), 3),
+        kind=kind,
+        worker=source.randrange(workers),
+        seconds=round(longest * fraction() ** 2, 3),  # short ones are the more frequent
+        amount=round(most * fraction(), 3),
+    )
+
+
+def _draw_shape(source: random.Random) -> Shape:
+    wide = source.random() < 0.1
+    long = source.random() < 0.03
+    heated = source.random() < 0.1
+    return Shape(
+        workers=source.choice((2, 2, 3, 4)),
+        slots=source.choice((1, 1, 2)),
+        width=256 if wide else 1,
+        generations=3 if heated else source.choice((2, 2, 3)),
+        population=12 if wide else source.choice((2, 3, 4)),
+        episodes=2 if long else source.choice((1, 2, 3)),
+        parameters=23_000 if long else 4,
+        racing=source.random() < 0.15,
+        heat=1.5 if heated else 1.0,
+        evaluate_every=1 if heated else source.choice((0, 0, 1, 2)),
+        collect_every=source.choice((0, 0, 0, 2)),
+        rollout=source.choice((300, 300, 90_000)),
+        turn=source.choice((0.15, 0.5, 0.5, 1.2)),
+        run_seed=source.randrange(4),
+        ends=source.random() < 0.5,
+    )

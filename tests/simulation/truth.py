@@ -1,0 +1,160 @@
+"""What is true of a run whatever happens to it: what every episode gives, and what a fleet without faults would tell.
+
+Restated here from the protocol, apart from the product's own code, so that a fault in that is not a fault in both.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.heat import spec_at
+from dreamfleet.common.messages import Job, TaskSpec
+from dreamfleet.common.runs import RunSettings, StoredEvaluation
+from dreamfleet.common.seeds import collection_seed, training_seed, validation_seeds
+from dreamfleet.coordinator.optimisers.api import Search
+from tests.simulation.schedule import Shape
+
+STEPS = 100  # of every episode
+TASK = "simulated"
+
+
+class Strategy:
+    """A search that is cheap, exact, and depends on every bit that it is told."""
+
+    requirement = "simulated==1"
+    options: ClassVar[Mapping[str, str]] = {}
+
+    def __init__(self, search: Search) -> None:
+        self._search = search
+        self.mean, self.sigma, self._told = search.mean, search.sigma0, 0
+
+    def ask(self) -> Any:
+        source = np.random.Generator(np.random.PCG64([self._search.seed, self._told]))
+        steps = source.standard_normal((self._search.population, self._search.dimension), dtype=np.float32)
+        self._asked = self.mean + self.sigma * steps
+        return self._asked
+
+    def tell(self, fitness: Any) -> None:
+        self.mean = fitness @ self._asked / fitness.sum()
+        self.sigma, self._told = self.sigma * 0.99, self._told + 1
+
+    def prepare(self) -> None:
+        pass
+
+    def state(self) -> dict[str, Any]:
+        return {"mean": self.mean, "sigma": np.array(self.sigma), "told": np.array(self._told)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.mean, self.sigma, self._told = state["mean"], float(state["sigma"]), int(state["told"])
+
+
+@lru_cache(4096)
+def settings_of(shape: Shape) -> RunSettings:
+    """The frozen settings of the run."""
+    temperature = 1.0 if shape.heat != 1.0 else None
+    return RunSettings(
+        task=TaskSpec(TASK, "", STEPS, 0, temperature=temperature),
+        controller=ControllerShape(shape.parameters // 2 - 1, 2),
+        population=shape.population,
+        episodes=shape.episodes,
+        sigma0=0.5,
+        covariance="diagonal",
+        seed=shape.run_seed,
+        evaluate_every=shape.evaluate_every,
+        evaluation_episodes=shape.evaluation_episodes,
+        racing=shape.racing,
+        collect_every=shape.collect_every,
+        heat=shape.heat,
+        optimiser=TASK,
+    )
+
+
+def fitness_of(vector: bytes, seed: int, temperature: float | None) -> float:
+    """What an episode gives: a function of the parameters' bytes, the seed and the temperature, and of nothing else."""
+    return _fitness(hashlib.sha256(vector).digest(), seed, temperature)
+
+
+def fitness_of_job(job: Job) -> float:
+    """What an episode of this job gives, if its vector is what it says."""
+    return _fitness(job.vector, job.seeds[0], job.temperature)
+
+
+def _fitness(identity: bytes, seed: int, temperature: float | None) -> float:
+    told = hashlib.blake2b(identity + repr((seed, temperature)).encode(), digest_size=4).digest()
+    return 1.0 + int.from_bytes(told, "little") / 2**32
+
+
+def rollout_of(vector: bytes, seed: int, size: int) -> bytes:
+    """The file that a collected episode leaves."""
+    return (hashlib.blake2b(vector + str(seed).encode()).digest() * (size // 64 + 1))[:size]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """An undisturbed run, generation by generation."""
+
+    vectors: list[tuple[bytes, ...]]
+    told: list[list[float]]
+    evaluations: dict[int, StoredEvaluation]
+    rollouts: dict[str, bytes]  # by the name of their file
+    jobs: int  # that are counted
+
+
+def truth_of(shape: Shape) -> Truth:
+    """What a run of this shape comes to; how many work on it does not matter."""
+    return _truth(replace(shape, workers=1, slots=1, width=1, turn=1.0, ends=True))
+
+
+@lru_cache(1024)
+def _truth(shape: Shape) -> Truth:
+    settings = settings_of(shape)
+    strategy = Strategy(Search(np.zeros(settings.controller.size), shape.population, settings.sigma0, shape.run_seed))
+    truth, counted = Truth([], [], {}, {}, 0), set()
+    for number in range(shape.generations):
+        spec = spec_at(number, settings, truth.evaluations.values())
+        temperature = None if spec.temperature == settings.task.temperature else spec.temperature
+        vectors = tuple(row.astype("<f4").tobytes() for row in strategy.ask())
+        seeds = [training_seed(shape.run_seed, number, episode) for episode in range(shape.episodes)]
+        scores = [[fitness_of(vector, seed, temperature) for seed in seeds] for vector in vectors]
+        told, driven = _told(scores, shape.racing)
+        truth.vectors.append(vectors)
+        truth.told.append(told)
+        counted |= {("score", vectors[candidate], seeds[episode]) for candidate, episode in driven}
+        strategy.tell(np.array(told))
+        last = number == shape.generations - 1
+        mean = strategy.mean.astype("<f4").tobytes()
+        if _due(shape.evaluate_every, number, last and shape.ends):
+            tracks = validation_seeds(shape.evaluation_episodes)
+            values = np.array([fitness_of(mean, seed, None) for seed in tracks])
+            truth.evaluations[number] = StoredEvaluation(number, len(tracks), float(values.mean()), float(values.std()))
+            counted |= {("evaluate", mean, seed) for seed in tracks}
+        if _due(shape.collect_every, number, last and shape.ends):
+            seed = collection_seed(shape.run_seed, number, 0)
+            truth.rollouts[f"{number:06d}-0000.npz"] = rollout_of(mean, seed, shape.rollout)
+            counted.add(("collect", mean, seed))
+    # One more is asked for when the last is told, so that a run with wider limits could go on from it.
+    truth.vectors.append(tuple(row.astype("<f4").tobytes() for row in strategy.ask()))
+    return replace(truth, jobs=len(counted))
+
+
+def _told(scores: list[list[float]], racing: bool) -> tuple[list[float], set[tuple[int, int]]]:
+    """The mean of each candidate's own episodes, and which those are."""
+    episodes = len(scores[0])
+    first = (episodes + 1) // 2 if racing else episodes
+    early = [float(np.mean(row[:first])) for row in scores]
+    order = sorted(range(len(scores)), key=lambda candidate: (-early[candidate], candidate))
+    further = set(order[: (len(scores) + 1) // 2])
+    own = [row if candidate in further else row[:first] for candidate, row in enumerate(scores)]
+    driven = {(candidate, episode) for candidate, row in enumerate(own) for episode in range(len(row))}
+    return [float(np.mean(row)) for row in own], driven
+
+
+def _due(every: int, number: int, last: bool) -> bool:
+    return every > 0 and (number % every == every - 1 or last)

@@ -1,0 +1,71 @@
+"""Watches what is written: each row is compared with the truth as it comes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dreamfleet.common.messages import Job, JobBatch, Result
+from tests.simulation.disk import Disk
+from tests.simulation.schedule import Shape
+from tests.simulation.truth import fitness_of_job, truth_of
+from tests.simulation.violation import Violation
+
+
+class Witness:
+    """Of one play, through all lives of its coordinator."""
+
+    def __init__(self, shape: Shape) -> None:
+        self.truth = truth_of(shape)
+        self._shape = shape
+
+    def opened(self, number: int, vectors: tuple[bytes, ...]) -> None:
+        """A population was asked for."""
+        if vectors != self.truth.vectors[number]:
+            raise Violation("fitness", f"generation {number} has other candidates than without faults")
+
+    def counted(self, job: Job, result: Result) -> None:
+        """A result was accepted."""
+        if result.fitness != fitness_of_job(job):
+            raise Violation("content", f"a {job.kind} of generation {job.generation} has a fitness of another content")
+
+    def told(self, number: int, fitness: list[float]) -> None:
+        """The strategy was told."""
+        if fitness != self.truth.told[number]:
+            raise Violation(
+                "fitness", f"generation {number} is told {fitness}, without faults {self.truth.told[number]}"
+            )
+
+    def evaluated(self, generation: int, mean: float, std: float) -> None:
+        """An evaluation was finished."""
+        expected = self.truth.evaluations[generation]
+        if (mean, std) != (expected.mean, expected.std):
+            raise Violation(
+                "fitness", f"the mean of generation {generation} is evaluated to {mean}, not {expected.mean}"
+            )
+
+    def promised(self, disk: Disk, batch: JobBatch) -> None:
+        """A batch leaves: what it says is counted must be on the disk, or a crash would take it back."""
+        for verdict in batch.verdicts:
+            counts = verdict.verdict in ("accepted", "duplicate")
+            if counts and verdict.digest not in disk.tables["result"]:
+                raise Violation("durability", f"a result was called {verdict.verdict} before it was on the disk")
+
+    def finished(self, disk: Disk) -> None:
+        """All that was wanted is there, once."""
+        closed = [number for number, row in disk.tables["generation"].items() if "closed" in row]
+        if closed != list(range(self._shape.generations)):
+            raise Violation("liveness", f"generations {closed} are closed, of {self._shape.generations}")
+        if not self._shape.ends:
+            return
+        counted = len(disk.tables["result"])
+        if counted != self.truth.jobs:
+            raise Violation("count", f"{counted} results are counted, of {self.truth.jobs} jobs")
+        evaluated = {number: done for number, (_, done) in disk.tables["evaluation"].items()}
+        if evaluated != self.truth.evaluations:
+            raise Violation("fitness", f"evaluations are {evaluated}, without faults {self.truth.evaluations}")
+        if disk.files != self.truth.rollouts:
+            raise Violation("content", f"kept rollouts are {_sizes(disk.files)}, not {_sizes(self.truth.rollouts)}")
+
+
+def _sizes(files: dict[str, Any]) -> dict[str, int]:
+    return {name: len(data) for name, data in files.items()}

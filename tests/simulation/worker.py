@@ -1,0 +1,299 @@
+"""One life of a worker: the product's `Membership`, `Backlog`, `Outbox` and `Uploads`, as `JoinedRun` turns them.
+
+The only module that knows how the worker's parts are driven. Its slots are simulated: a turn takes virtual time, and
+gives what `truth.py` says that its vectors and seeds give.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.messages import (
+    MAX_LEASES,
+    TAG_BYTES,
+    Beat,
+    HelloRequest,
+    Job,
+    JobBatch,
+    Result,
+    ResultBatch,
+    Running,
+    TaskSpec,
+    UploadPart,
+)
+from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.membership import Hands, Membership, Terms
+from dreamfleet.worker.service.outbox import Outbox
+from dreamfleet.worker.service.uploads import PACE, Uploads
+from tests.simulation.coordinator import BEAT, REPEAT
+from tests.simulation.schedule import Shape
+from tests.simulation.truth import STEPS, TASK, fitness_of, rollout_of
+from tests.simulation.violation import Violation
+
+UID = "0123456789abcdef" * 2
+HELLO_TIMEOUT = 2.0
+RETRY = 1.0
+
+
+@dataclass(frozen=True)
+class Welcome:
+    """The coordinator's answer to hello number `question`."""
+
+    nonce: str
+    question: int
+
+
+@dataclass(frozen=True)
+class Token:
+    """A coordinator came into sight, or went out of it."""
+
+    nonce: str
+    there: bool
+
+
+@dataclass
+class Turn:
+    """Jobs in a slot's hands."""
+
+    work: Sequence[tuple[Job, bytes]]
+    began: float
+    ends: float
+    unwanted: set[bytes] = field(default_factory=set)
+
+    def steps(self, now: float) -> int:
+        """Of each of its jobs so far."""
+        return int(STEPS * min((now - self.began) / (self.ends - self.began), 1.0))
+
+
+@dataclass
+class Scored:
+    """What everybody's slots did, for the reckoning at the end."""
+
+    steps: int = 0
+    errors: int = 0
+
+
+class Worker:
+    """`send` puts a message on the wire; `speed` says how many times slower than usual its slots are now."""
+
+    def __init__(
+        self, identity: str, shape: Shape, spec: TaskSpec, now: float, send: Callable[[Any], None], scored: Scored
+    ) -> None:
+        self.identity = identity
+        self.stopped = False
+        self.left = False
+        self.slowness = 1.0
+        self.failures = 0  # turns that are still to fail
+        self.nonce: str | None = None  # of the life that it has joined; `None` before the first
+        self.inbox: deque[Any] = deque()
+        self.membership = Membership(Terms(drain_timeout=20.0), now)
+        self._shape = shape
+        self._spec = spec
+        self._send = send
+        self._scored = scored
+        self.asked_at = self.awake_since = now
+        self._question = 0
+        self._waits_until: float | None = None  # for the answer to hello
+        self._retry_at = now
+        self._jitter = 0.7 + 0.1 * (sum(identity.encode()) % 7)
+        self._begin()
+
+    def _begin(self) -> None:
+        self.backlog, self.outbox, self.uploads = Backlog(self._spec), Outbox(REPEAT), Uploads(REPEAT)
+        self.turns: list[Turn | None] = [None] * self._shape.slots
+        self.told_at: dict[bytes, float] = {}  # when each result was last sent
+        self._given: Counter[bytes] = Counter()  # in how many batches each job came
+        self._begun: Counter[bytes] = Counter()
+        self._batches: set[tuple[int, int]] = set()  # that have come, by numbering
+        self._beat_at = 0.0
+
+    @property
+    def asking(self) -> bool:
+        """Whether it does nothing but wait for an answer to hello."""
+        return self._waits_until is not None
+
+    @property
+    def capacity(self) -> int:
+        """Jobs that it scores at once."""
+        return min(self._shape.slots * self._shape.width, MAX_LEASES // 2)
+
+    @property
+    def undelivered(self) -> int:
+        """What it holds in all: at rest nothing."""
+        return len(self.outbox) + len(self.uploads) + len(self.backlog.queued) + sum(map(bool, self.turns))
+
+    def wakes_at(self, now: float) -> float:
+        """When it does something next though nothing comes."""
+        if self._waits_until is not None:
+            return self._waits_until
+        if self.nonce is None:
+            return self._retry_at
+        at = self._beat_at
+        if len(self.outbox):
+            at = min(at, now + REPEAT / 4)
+        if len(self.uploads):
+            at = min(at, now + PACE)
+        return min([at, *(turn.ends for turn in self.turns if turn)])
+
+    def answer(self, welcome: Welcome, now: float) -> None:
+        """An answer to hello; one that comes too late is not listened to."""
+        if self._waits_until is None or welcome.question != self._question:
+            return
+        self._waits_until = None
+        if self.nonce is None:
+            self.nonce = welcome.nonce
+            self.membership.join(welcome.nonce, BEAT, now)
+            return
+        self.nonce = welcome.nonce
+        self.inbox = deque(event for event in self.inbox if not isinstance(event, JobBatch))
+        self.backlog.begin()
+        self.backlog.clear()
+        if self.backlog.seen:
+            raise Violation("books", f"a worker begins a new numbering with {self.backlog.seen} batches seen")
+        self.outbox.resend_all()
+        self.uploads.resend_all()
+        self._beat_at = 0.0
+        self.membership.rejoin(welcome.nonce, now)
+
+    def turn(self, now: float) -> None:
+        """A turn of its loop."""
+        if self._waits_until is not None:
+            if now < self._waits_until:
+                return
+            self._waits_until = None  # nobody answered
+            self._retry_at = now + RETRY * self._jitter
+        if self.nonce is None:
+            if self.membership.leaving(now):
+                self.left = True
+            elif now >= self._retry_at:
+                self._ask(now)
+            return
+        self._work(now)
+
+    def _work(self, now: float) -> None:
+        while self.inbox:
+            self._take(self.inbox.popleft(), now)
+        self._end_turns(now)
+        if self.membership.must_drain(now):
+            self.backlog.clear()
+        self._fill(now)
+        self._say(now)
+        hands = Hands(idle=not any(self.turns), owed=len(self.outbox) > 0, uploading=len(self.uploads) > 0)
+        if self.membership.must_rejoin(now, hands):
+            self.membership.ask(now, RETRY * self._jitter)
+            self._ask(now)
+        self.left = self.membership.over(now, busy=any(self.turns) or len(self.outbox) > 0)
+
+    def _ask(self, now: float) -> None:
+        self._question += 1
+        self.asked_at = now
+        self._waits_until = now + HELLO_TIMEOUT
+        request = HelloRequest(1, 1, "0", self.identity, (TASK,), "f", self._shape.slots, NUMERIC_PACKAGES)
+        self._send((request, self._question))
+
+    def _take(self, event: JobBatch | Token, now: float) -> None:
+        if isinstance(event, Token):
+            if event.there:
+                self.membership.appear(event.nonce)
+            else:
+                self.membership.vanish(event.nonce, now)
+            return
+        if event.nonce != self.nonce:
+            return
+        self.membership.hear(now)
+        self._note(event)
+        for job, why in self.backlog.take_in(event):
+            self.outbox.add(Result(job.digest, None, 0, 0.0, why, None))
+        judged = [verdict.digest for verdict in event.verdicts]
+        owed = self.outbox.digests
+        self.outbox.settle(judged)
+        if self.outbox.digests != [digest for digest in owed if digest not in judged]:
+            raise Violation("books", "a verdict does not end the repetition of its own result alone")
+        self.uploads.settle(judged)
+        for digest in event.cancels:
+            self._abandon(digest, now)
+        if self.membership.draining:
+            self.backlog.clear()
+
+    def _note(self, batch: JobBatch) -> None:
+        """A batch counts once in a numbering; so many times may each of its jobs be begun."""
+        name = self._question, batch.number
+        if name not in self._batches:
+            self._batches.add(name)
+            self._given.update(job.digest for job in batch.jobs)
+
+    def _abandon(self, digest: bytes, now: float) -> None:
+        """A turn without a wanted job ends at its next step."""
+        for number, turn in enumerate(self.turns):
+            if turn is not None and any(job.digest == digest for job, _ in turn.work):
+                turn.unwanted.add(digest)
+                if len(turn.unwanted) == len(turn.work):
+                    self._scored.steps += turn.steps(now) * len(turn.work)
+                    self.turns[number] = None
+
+    def _end_turns(self, now: float) -> None:
+        for number, turn in enumerate(self.turns):
+            if turn is not None and turn.ends <= now:
+                self.turns[number] = None
+                self.membership.hear(now)
+                self._end(turn)
+
+    def _end(self, turn: Turn) -> None:
+        fails = self.failures > 0
+        self.failures -= fails
+        self._scored.steps += STEPS * len(turn.work)
+        for job, vector in turn.work:
+            if fails:
+                self._scored.errors += 1
+                self.outbox.add(Result(job.digest, None, STEPS, 0.1, "boom", None))
+                continue
+            fitness, upload = fitness_of(vector, job.seeds[0], job.temperature), None
+            if job.kind == "collect":
+                data = rollout_of(vector, job.seeds[0], self._shape.rollout)
+                self.uploads.add(job.digest, data)
+                upload = hashlib.sha256(data).digest()
+            self.outbox.add(Result(job.digest, fitness, STEPS, 0.1, None, upload))
+
+    def _fill(self, now: float) -> None:
+        if self.membership.leaving(now):
+            return
+        room = 4 * self._shape.slots * self._shape.width - len(self.outbox)
+        for number, turn in enumerate(self.turns):
+            if turn is None and room >= 0 and (work := self.backlog.take(self._shape.width)):
+                self.turns[number] = Turn(work, now, now + self._shape.turn * self.slowness)
+                self._begun.update(job.digest for job, _ in work)
+                if any(self._begun[job.digest] > self._given[job.digest] for job, _ in work):
+                    raise Violation("waste", "a worker begins a job more often than it was given")
+
+    def _say(self, now: float) -> None:
+        head = {"run_uid": UID, "incarnation": 1}
+        for results in self.outbox.due(now):
+            self._send(ResultBatch(**head, fingerprint="f", results=results))
+            self.told_at.update((result.digest, now) for result in results)
+        if now >= self._beat_at:
+            self._beat_at = now + BEAT
+            self._send(self._beat(now))
+        for piece in self.uploads.due(now):
+            self._send(UploadPart(**head, **vars(piece)))
+
+    def _beat(self, now: float) -> Beat:
+        running = [(job.digest, turn.steps(now)) for turn in self.turns if turn for job, _ in turn.work]
+        return Beat(
+            run_uid=UID,
+            incarnation=1,
+            nonce=self.nonce or "",
+            seen=self.backlog.seen,
+            capacity=0 if self.membership.draining else self.capacity,
+            slots=self._shape.slots,
+            queued=tuple(digest[:TAG_BYTES] for digest in self.backlog.queued),
+            running=tuple(Running(digest[:TAG_BYTES], steps) for digest, steps in running),
+            unacked=tuple(digest[:TAG_BYTES] for digest in self.outbox.digests[:MAX_LEASES]),
+            load=0.0,
+            steps_per_second=STEPS / self._shape.turn / self.slowness * len(running),
+            drawn_by="-",
+        )

@@ -1,0 +1,408 @@
+"""A play: a coordinator, workers, what lies between them, and the faults of one schedule, by a virtual clock."""
+
+from __future__ import annotations
+
+import heapq
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from itertools import count
+from typing import Any
+
+from dreamfleet.common.messages import HelloRequest, JobBatch
+from dreamfleet.coordinator.fleet import Send
+from tests.simulation import books
+from tests.simulation.coordinator import COMMITTED, LINGER, OPENED, TICK, Coordinator, simulated_surroundings
+from tests.simulation.disk import Disk
+from tests.simulation.network import LATENCY, Link, Way
+from tests.simulation.schedule import Schedule
+from tests.simulation.truth import settings_of
+from tests.simulation.violation import Violation
+from tests.simulation.witness import Witness
+from tests.simulation.worker import Scored, Token, Welcome, Worker
+
+PATIENCE = 120.0  # virtual seconds after the last fault in which everything must be finished
+OPERATOR = 0.5  # virtual seconds after which somebody resumes a run that failing jobs have paused
+AUDIT = 4  # turns of the coordinator between two looks into the books
+MOST_EVENTS = 200_000  # of one play: more is a loop
+
+
+@dataclass
+class Outcome:
+    """What a play came to."""
+
+    schedule: Schedule
+    violation: Violation | None
+    now: float  # virtual seconds
+    events: int
+    happened: Counter[str]  # faults that found something to disturb
+    scored: int  # environment steps that slots made
+    counted: int  # of those, in results that count
+    trace: str = ""  # where the product raised, if it did
+
+
+@dataclass
+class Pending:
+    """A coordinator's end to come: so many steps of its turns from now, or from a generation's opening."""
+
+    steps: int
+    away: float
+    opening: bool
+
+
+@dataclass
+class World:
+    """`play` runs it to its end."""
+
+    schedule: Schedule
+    now: float = 0.0
+    happened: Counter[str] = field(default_factory=Counter)
+    coordinator: Coordinator | None = None
+    coordinator_stopped: bool = False
+    kill: Pending | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.shape = self.schedule.shape
+        self.disk, self.witness, self.scored = Disk(), Witness(shape), Scored()
+        self.links = [Link() for _ in range(shape.workers)]
+        self.workers: list[Worker | None] = [None] * shape.workers
+        self.events = 0
+        self._spec = settings_of(shape).task
+        self._heap: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
+        self._order = count()
+        self._sendings, self._turned_at = books.Sendings(), 0.0
+        self._sights = [0.0] * shape.workers  # since when each worker sees what it sees
+        self._lives, self._names = count(1), count(1)
+        self._inbox: list[tuple[str, Any]] = []  # of whichever coordinator lives
+        self._wakes: dict[int, float] = {}  # by host; the coordinator's is -1
+        self._turns = 0
+        self._final_pause = False
+        self._operator_called = False
+        self._done = False
+        self._calm_at = max((fault.at + fault.seconds + 5.0 for fault in self.schedule.faults), default=0.0)
+
+    def play(self) -> None:
+        """To the end of the run; `Violation` if a rule is broken on the way."""
+        from tests.simulation.faults import strike
+
+        self.start_coordinator()
+        for host in range(self.shape.workers):
+            self.later(0.01 * host, self.start_worker, host)
+        for fault in self.schedule.faults:
+            self.later(fault.at, strike, self, fault)
+        self.later(self._calm_at, self._calm)
+        while not self._done:
+            self.now, _, action, arguments = heapq.heappop(self._heap)
+            self.events += 1
+            if self.now > self._calm_at + PATIENCE or self.events > MOST_EVENTS:
+                self._give_up()
+            action(*arguments)
+        self.witness.finished(self.disk)
+        self._check_waste()
+
+    def later(self, seconds: float, action: Callable[..., None], *arguments: Any) -> None:
+        """Do something then."""
+        heapq.heappush(self._heap, (self.now + seconds, next(self._order), action, arguments))
+
+    # The coordinator's side.
+
+    def start_coordinator(self) -> None:
+        """A life from what is on the disk, unless one is there."""
+        if self.coordinator is not None or self._done:
+            return
+        life = self.coordinator = Coordinator(self.disk, self.witness, self.shape, next(self._lives), self.now)
+        self.coordinator_stopped = False
+        self._operator_called = False
+        self._sendings = books.Sendings()
+        self._inbox.clear()
+        self._pause_finally()
+        if life.over:
+            self._end_run()
+            return
+        for host in range(self.shape.workers):
+            self.later(0.03 + 0.01 * host, self.look, host)
+        self.wake_coordinator(TICK)
+
+    def end_coordinator(self, away: float) -> None:
+        """It is gone, with all that it did not commit."""
+        self.coordinator = self.kill = None
+        self._wakes.pop(-1, None)
+        for host in range(self.shape.workers):
+            self.later(LATENCY, self.look, host)
+        self.later(away, self.start_coordinator)
+
+    def wake_coordinator(self, seconds: float) -> None:
+        """It turns then, or earlier."""
+        at = self.now + seconds
+        if at < self._wakes.get(-1, at + 1):
+            self._wakes[-1] = at
+            self.later(seconds, self._turn_coordinator, at)
+
+    def _turn_coordinator(self, at: float) -> None:
+        life = self.coordinator
+        if life is None or self._wakes.get(-1) != at or self.coordinator_stopped:
+            return
+        del self._wakes[-1]
+        self._hear_all(life)
+        self._sendings.pass_by(min(self.now - self._turned_at, TICK))
+        self._turned_at = self.now
+        for step in life.turn(self.now):
+            if self._dies(step):
+                self.end_coordinator(self.kill.away if self.kill else 1.0)
+                return
+            if step == OPENED:
+                books.check_opening(life.fleet, life.run)
+            elif isinstance(step, Send):
+                books.check_credit(life.fleet, step)
+                self._sendings.sent(life.fleet, step)
+                self._send_down(life, step)
+        self._after_turn(life)
+
+    def _hear_all(self, life: Coordinator) -> None:
+        inbox, self._inbox = self._inbox, []
+        for worker, message in inbox:
+            life.hear(worker, message, self.now)
+
+    def _dies(self, step: Send | str | None) -> bool:
+        kill = self.kill
+        if kill is None:
+            return False
+        if kill.opening:
+            kill.opening = step != OPENED
+            return False
+        kill.steps -= 1
+        return kill.steps < 0 or (step == COMMITTED and kill.steps == 0)
+
+    def _after_turn(self, life: Coordinator) -> None:
+        self._turns += 1
+        if self._turns % AUDIT == 0:
+            books.check_coordinator(life.fleet)
+            self._sendings.check(life.fleet)
+            self._check_workers()
+        if life.run.ended is not None:
+            books.check_end(life.fleet, life.run)
+            self._end_run()
+            return
+        self._pause_finally()
+        if life.over:
+            self.end_coordinator(1.0)
+            return
+        if life.run.paused and not self._final_pause and not self._operator_called:
+            self._operator_called = True
+            self.later(OPERATOR, self.resume, life)
+        if self._final_pause and self.now >= self._calm_at and self._at_rest(life):
+            self._done = True
+        self.wake_coordinator(TICK)
+
+    def _check_workers(self) -> None:
+        for host, worker in enumerate(self.workers):
+            if worker is not None:
+                books.check_sight(worker, self.links[host].sees, self._sights[host], self.now)
+
+    def resume(self, life: Coordinator) -> None:
+        """Somebody says `dreamfleet resume`."""
+        if life is self.coordinator and not self._final_pause:
+            self._operator_called = life.draining = False
+            life.run.resume()
+
+    def _pause_finally(self) -> None:
+        """A run that shall fall silent is paused once its last generation is told."""
+        life = self.coordinator
+        if life is not None and not self.shape.ends and len(life.run.history) >= self.shape.generations:
+            self._final_pause = True
+            life.draining = False
+            if life.run.paused is None:
+                life.run.pause("the play is over")
+
+    def _at_rest(self, life: Coordinator) -> bool:
+        quiet = all(worker is not None and not worker.undelivered for worker in self.workers)
+        return quiet and books.at_rest(life.fleet, life.run)
+
+    def _end_run(self) -> None:
+        self._done = True
+
+    # The workers' side.
+
+    def start_worker(self, host: int) -> None:
+        """A process, under the name of the one before it."""
+        if self.workers[host] is not None:
+            return
+        identity = f"w{host}/{next(self._names):08x}"
+        worker = Worker(
+            identity,
+            self.shape,
+            self._spec,
+            self.now,
+            lambda message: self._send_up(host, identity, message),
+            self.scored,
+        )
+        self.workers[host] = worker
+        self.links[host].sees = None
+        self._turn_worker(host, worker)
+
+    def end_worker(self, host: int, noticed: float, away: float) -> None:
+        """A process is gone; its token vanishes so many seconds later, and another one is started."""
+        worker = self.workers[host]
+        if worker is None:
+            return
+        for turn in worker.turns:
+            if turn is not None:
+                self.scored.steps += turn.steps(self.now) * len(turn.work)
+        self.workers[host] = None
+        self._wakes.pop(host, None)
+        self.later(noticed, self.tell_coordinator, worker.identity, "gone")
+        self.later(away, self.start_worker, host)
+
+    def look(self, host: int, *, blink: bool = False) -> None:
+        """What a worker sees of coordinators now, told if it has changed, or after a `blink`."""
+        worker, link, life = self.workers[host], self.links[host], self.coordinator
+        if worker is None or worker.nonce is None:
+            return
+        sees = life.nonce if life is not None and not link.cuts else None
+        if sees == link.sees and not blink:
+            return
+        for nonce, there in ((link.sees, False), (sees, True)):
+            if nonce is not None:
+                worker.inbox.append(Token(nonce, there))
+        link.sees, self._sights[host] = sees, self.now
+        self.wake_worker(host, worker, self.now)
+
+    def lose_sight(self, host: int) -> None:
+        """The worker's side notices that its connection has ended."""
+        worker, link = self.workers[host], self.links[host]
+        if worker is not None and worker.nonce is not None and link.sees is not None:
+            worker.inbox.append(Token(link.sees, there=False))
+            link.sees = None
+            self.wake_worker(host, worker, self.now)
+            self.later(0.05, self.look, host)  # a short cut may be over by then
+
+    def wake_worker(self, host: int, worker: Worker, at: float) -> None:
+        """It turns then, or earlier."""
+        if worker.stopped or at >= self._wakes.get(host, at + 1):
+            return
+        self._wakes[host] = at
+        self.later(at - self.now, self._timed_turn, host, worker, at)
+
+    def _timed_turn(self, host: int, worker: Worker, at: float) -> None:
+        if self._wakes.get(host) == at and self.workers[host] is worker and not worker.stopped:
+            del self._wakes[host]
+            self._turn_worker(host, worker)
+
+    def _turn_worker(self, host: int, worker: Worker) -> None:
+        worker.turn(self.now)
+        books.check_worker(worker, self.now)
+        if worker.left:
+            self.end_worker(host, LATENCY, 1.0)
+            return
+        self.wake_worker(host, worker, max(worker.wakes_at(self.now), self.now + 0.001))
+
+    # Between them.
+
+    def tell_coordinator(self, identity: str, message: Any) -> None:
+        """A message has arrived at whichever life is there."""
+        if self.coordinator is not None:
+            self._inbox.append((identity, message))
+            if not self.coordinator_stopped:
+                self.wake_coordinator(LINGER)
+
+    def _send_up(self, host: int, identity: str, message: Any) -> None:
+        for delay in self.links[host].fates("up", self.now):
+            if isinstance(message, tuple):
+                self.later(delay, self._hello, host, *message)
+            else:
+                self.later(delay, self.tell_coordinator, identity, message)
+
+    def _hello(self, host: int, request: HelloRequest, question: int) -> None:
+        life = self.coordinator
+        if life is None:
+            return
+        if self.coordinator_stopped:  # it lies in the queue until it goes on
+            self.later(0.1, self._hello, host, request, question)
+            return
+        self._hear_all(life)
+        if life.welcome(request, self.now):
+            self._transmit_down(host, request.worker, Welcome(life.nonce, question))
+        self.wake_coordinator(LINGER)
+
+    def _send_down(self, life: Coordinator, send: Send) -> None:
+        host = int(send.identity.partition("/")[0][1:])
+        batch = life.batch(send)
+        self.witness.promised(self.disk, batch)
+        link = self.links[host]
+        if link.garbled and batch.jobs:
+            link.garbled = False
+            first, *others = batch.jobs
+            batch = replace(batch, jobs=(replace(first, seeds=(first.seeds[0] + 1,)), *others))
+        self._transmit_down(host, send.identity, batch)
+
+    def _transmit_down(self, host: int, identity: str, message: JobBatch | Welcome) -> None:
+        way: Way = "down"
+        for delay in self.links[host].fates(way, self.now):
+            self.later(delay, self._arrive, host, identity, message)
+
+    def _arrive(self, host: int, identity: str, message: JobBatch | Welcome) -> None:
+        worker = self.workers[host]
+        if worker is None or worker.identity != identity:
+            return
+        if worker.stopped:
+            self.later(0.1, self._arrive, host, identity, message)
+        elif isinstance(message, JobBatch):
+            worker.inbox.append(message)
+            if not worker.asking:
+                self.wake_worker(host, worker, self.now)
+        else:
+            worker.answer(message, self.now)
+            self.look(host)
+            self.wake_worker(host, worker, self.now)
+
+    # The end.
+
+    def _calm(self) -> None:
+        """From now on nothing is disturbed."""
+        self.kill = None
+
+    def _give_up(self) -> None:
+        life = self.coordinator
+        if life is not None and self._final_pause:
+            books.check_rest(life.fleet, life.run)
+            held = {worker.identity: worker.undelivered for worker in self.workers if worker is not None}
+            raise Violation("memory", f"workers of a paused run hold {held}")
+        state = (
+            "no coordinator" if life is None else f"generation {life.run.generation.number} is open, {life.run.state}"
+        )
+        raise Violation(
+            "liveness", f"{state}, {self.now - self._calm_at:.0f} s after the last fault, {self.events} events"
+        )
+
+    def _check_waste(self) -> None:
+        """What is scored beyond what counts was lost by a fault, one worker's hands at most each."""
+        slack = self.scored.steps / 100 - self.counted_jobs
+        hands = 3 * self.shape.slots * min(self.shape.width, self.shape.population * self.shape.episodes)
+        if slack > hands * (2 + len(self.schedule.faults)):
+            raise Violation("waste", f"{slack:.0f} jobs were scored in vain under {len(self.schedule.faults)} faults")
+
+    @property
+    def counted_jobs(self) -> int:
+        """Results on the disk."""
+        return len(self.disk.tables["result"])
+
+
+_playing: list[World] = []
+
+
+def play(schedule: Schedule) -> Outcome:
+    """Play one schedule; what the product raises is a broken rule too."""
+    world = World(schedule)
+    _playing[:] = [world]
+    violation, trace = None, ""
+    try:
+        with simulated_surroundings(lambda: _playing[0].disk):
+            world.play()
+    except Violation as found:
+        violation = found
+    except Exception as error:
+        violation = Violation("raised", f"{type(error).__name__}: {error}")
+        trace = traceback.format_exc()
+    counted = 100 * world.counted_jobs
+    return Outcome(schedule, violation, world.now, world.events, world.happened, world.scored.steps, counted, trace)
