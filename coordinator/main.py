@@ -80,10 +80,7 @@ def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle | No
         settings = stored.settings
     if not settings.task.bundle:
         return settings, None
-    bundle = Bundle.open(folder / BUNDLE)
-    if bundle.sha256 != settings.task.bundle:
-        raise JournalError(f"{bundle.path} is not the bundle that this run was started with; restore the folder")
-    return settings, bundle
+    return settings, Bundle.open(folder / BUNDLE, settings.task.bundle)
 
 
 def _settle_new(config: RunConfig, start: Start | None) -> tuple[RunSettings, Bundle | None]:
