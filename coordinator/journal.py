@@ -6,8 +6,8 @@ import json
 import secrets
 import shutil
 import sqlite3
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common import schema
 from dreamfleet.common.errors import DreamfleetError, JournalError
+from dreamfleet.common.files import sync_folder, write_aside
 from dreamfleet.common.messages import Job, Result
 from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.checkpoint import Checkpoint
@@ -57,25 +58,32 @@ class Journal:
                 raise
 
     @classmethod
-    def create(cls, folder: Path, settings: RunSettings, bundle: Path | None) -> Journal:
-        """A new run in `folder`, which holds its own copy of the bundle, if any; whole or not at all."""
+    def create(
+        cls, folder: Path, settings: RunSettings, bundle: Path | None, facts: Mapping[str, str] | None = None
+    ) -> Journal:
+        """A new run in `folder`, which holds its own copy of the bundle, if any; whole or not at all.
+
+        `facts` are what else the run must never be without: where it begins, and how it is served.
+        """
         path = folder / JOURNAL
         if path.exists():
             raise JournalError(f"run {folder.name} exists: choose another --run, or continue it with --resume")
         aside = path.with_suffix(".new")
-        aside.unlink(missing_ok=True)
+        created = datetime.now(UTC).isoformat(timespec="seconds")
+        own = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": created}
         try:
+            # What a journal that was removed left beside it would be taken for this one's, and damage it.
+            for left in (aside, *beside(aside), *beside(path)):
+                left.unlink(missing_ok=True)
             if bundle is not None:
-                shutil.copyfile(bundle, folder / BUNDLE)
-            with _translated(path):
-                connection = sqlite3.connect(aside)
+                with bundle.open("rb") as source, write_aside(folder / BUNDLE) as copy:
+                    shutil.copyfileobj(source, copy)
+            with _translated(path), closing(sqlite3.connect(aside)) as connection:
                 schema.migrate(connection, 0)
-                created = datetime.now(UTC).isoformat(timespec="seconds")
-                facts = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": created}
-                connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", facts.items())
+                connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", {**own, **(facts or {})}.items())
                 connection.commit()
-                connection.close()
             aside.replace(path)
+            sync_folder(folder)
         except OSError as error:
             raise JournalError(f"cannot write in {folder}: {error.strerror}; choose another --runs-dir") from error
         return cls(path)
@@ -231,6 +239,11 @@ class Journal:
         self._flush()
         with _translated(self.path):
             return self._connection.execute(query, values)
+
+
+def beside(path: Path) -> tuple[Path, ...]:
+    """What SQLite may keep beside a database: its write-ahead log, that log's index, or a rollback journal."""
+    return tuple(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))
 
 
 @contextmanager

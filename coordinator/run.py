@@ -21,7 +21,7 @@ from dreamfleet.coordinator.history import History
 from dreamfleet.coordinator.journal import Journal
 from dreamfleet.coordinator.limits import stop_reason
 from dreamfleet.coordinator.slack import Slack
-from dreamfleet.coordinator.start import Start
+from dreamfleet.coordinator.start import kept_start
 
 
 class Run:
@@ -34,7 +34,6 @@ class Run:
         limits: LimitsConfig,
         fleet: Fleet,
         now: float,
-        start: Start | None = None,
     ) -> None:
         self.settings = settings
         self.limits = limits
@@ -50,9 +49,7 @@ class Run:
         self.history = History(closed)
         self.slack = Slack(journal, settings, self.uid, self.history, evaluations)
         self.exchange = Exchange(journal, self.incarnation, fleet, self.slack, self._score)
-        self._evolution = Evolution(EvolutionConfig.of(settings), start.mean if start else None)
-        if start:
-            journal.set_fact("start", start.source)
+        self._evolution = Evolution(EvolutionConfig.of(settings), kept_start(journal))
         evaluated = self.slack.evaluations.finished
         self._generations = Generations(journal, settings, self._evolution, self.history, evaluated)
         self.opened = now
