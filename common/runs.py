@@ -157,7 +157,7 @@ class RunFolder:
 
     @property
     def fingerprint(self) -> str | None:
-        """The fingerprint that the run admits; `None` before its first worker."""
+        """The fingerprint that the run admits: its first accepted result's."""
         return self._fact("fingerprint")
 
     @property

@@ -7,11 +7,11 @@ from collections.abc import Callable, Collection
 
 from dreamfleet.common.messages import Beat, HelloRequest, Result, ResultBatch, UploadPart
 from dreamfleet.common.runs import RunSettings
-from dreamfleet.coordinator.admission import Refusals, refusal
+from dreamfleet.coordinator.admission import Refusals, differ, refusal
 from dreamfleet.coordinator.failure import Failure
 from dreamfleet.coordinator.fleet import Fleet, Send
 from dreamfleet.coordinator.jobs import Work
-from dreamfleet.coordinator.journal import Journal
+from dreamfleet.coordinator.journal import FINGERPRINT, Journal
 from dreamfleet.coordinator.member import Member
 from dreamfleet.coordinator.slack import Slack
 
@@ -20,10 +20,12 @@ class Exchange:
     """One incarnation's fleet as the service and the status see it; `score` takes accepted results of candidates."""
 
     def __init__(
-        self, journal: Journal, incarnation: int, fleet: Fleet, slack: Slack, score: Callable[[Result], None]
-    ) -> None:
+        self, journal: Journal, incarnation: int, fleet: Fleet, slack: Slack, score: Callable[[Result], None],
+        *, mixed: bool = False,
+    ) -> None:  # fmt: skip
         self.refusals = Refusals()
-        self.fingerprint = journal.fact("fingerprint")  # of the hosts that are admitted; `None` before the first
+        self.fingerprint = journal.fingerprint()  # of the first accepted result; `None` before it
+        self._mixed = mixed
         self._journal = journal
         self._incarnation = incarnation
         self._fleet = fleet
@@ -31,20 +33,18 @@ class Exchange:
         self._uploads = slack.collections.uploads
         self._score = score
 
-    def refusal(self, request: HelloRequest, settings: RunSettings, mixed: bool) -> tuple[str, str] | None:
+    def refusal(self, request: HelloRequest, settings: RunSettings) -> tuple[str, str] | None:
         """Why a worker cannot join and what to do about it; `None` if it may."""
-        found = refusal(request, settings.task.task, None if mixed else self.fingerprint, settings.packages)
+        admitted = None if self._mixed else self.fingerprint
+        found = refusal(request, settings.task.task, admitted, settings.packages)
         known = request.packages == settings.packages  # else it says hello again
         if found is not None and known and self.refusals.add(request.worker, found[0]):
             self._fleet.notes.append(f"refused worker {request.worker}: {found[0]}")
         return found
 
     def admit(self, request: HelloRequest, now: float) -> None:
-        """Welcome a worker; the first one's fingerprint becomes the run's."""
+        """Welcome a worker; what it computes is compared with the run's fingerprint once there is one."""
         self.refusals.admitted(request.worker)
-        if self.fingerprint is None:
-            self.fingerprint = request.fingerprint
-            self._journal.set_fact("fingerprint", request.fingerprint)
         self._fleet.welcome(request.worker, request.slots, request.fingerprint, now)
 
     def beat(self, worker: str, beat: Beat, now: float) -> None:
@@ -57,6 +57,9 @@ class Exchange:
 
     def results(self, worker: str, batch: ResultBatch, now: float) -> None:
         """Judge a worker's results; the first wanted ones are written and counted."""
+        if not self._equal(batch.fingerprint):
+            self._turn_away(worker, batch.fingerprint)
+            return
         for each in batch.results:
             result = self._slack.collections.receive(worker, each, self._fleet.wants(each.digest))
             if result is None:
@@ -65,6 +68,7 @@ class Exchange:
             _, work = self._fleet.result(worker, result, now)
             if work is not None:
                 self._journal.add_result(work.job, result, worker, batch.fingerprint, self._incarnation)
+                self._settle_fingerprint(batch.fingerprint)
                 self._count(work, result)
             self._uploads.forget(result.digest)
 
@@ -119,6 +123,30 @@ class Exchange:
     def dropped(self) -> Counter[str]:
         """Parts of uploads that were dropped, by reason."""
         return self._uploads.dropped
+
+    def _equal(self, fingerprint: str) -> bool:
+        """Whether a host of this fingerprint may add to the run."""
+        return self._mixed or self.fingerprint in (None, fingerprint)
+
+    def _settle_fingerprint(self, fingerprint: str) -> None:
+        """The first accepted result's fingerprint becomes the run's, in the transaction that writes the result."""
+        if self.fingerprint is not None:
+            return
+        self.fingerprint = fingerprint
+        self._journal.set_fact(FINGERPRINT, fingerprint)
+        for member in list(self._fleet.members.values()):
+            if not self._equal(member.fingerprint):
+                self._turn_away(member.identity, member.fingerprint)
+
+    def _turn_away(self, worker: str, fingerprint: str) -> None:
+        """Forget a worker of another fingerprint: it hears no more, says hello again, and is told why and what to do.
+
+        Nothing of what it has computed gets a verdict, so that it does not take silence for success.
+        """
+        why, _ = differ(self.fingerprint, fingerprint)
+        self._fleet.dismiss(worker)
+        if self.refusals.add(worker, why):
+            self._fleet.notes.append(f"worker {worker} must go: {why}")
 
     def _count(self, work: Work, result: Result) -> None:
         """What an accepted result, which is in the journal, means to whatever asked for it."""

@@ -29,6 +29,7 @@ from dreamfleet.coordinator.evaluation import Evaluation
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
 MOST_VARIABLES = 500  # of one SQL statement
+FINGERPRINT = "fingerprint"  # the fact's name
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,14 @@ class Journal:
         """One of the run's facts, such as `uid` or `fingerprint`."""
         row = self._read("SELECT value FROM run WHERE key = ?", key).fetchone()
         return None if row is None else str(row[0])
+
+    def fingerprint(self) -> str | None:
+        """That of the first accepted result; `None` before it.
+
+        Journals from before that was the rule name their first worker's, which means nothing without a result.
+        """
+        scored = self._read("SELECT 1 FROM result LIMIT 1").fetchone() is not None
+        return self.fact(FINGERPRINT) if scored else None
 
     def set_fact(self, key: str, value: str) -> None:
         """Write one of the run's facts."""

@@ -50,7 +50,8 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         on_stoppable(service.stop)
         try:
             fleet = Fleet(request.network.beat)
-            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic()))
+            mixed = request.network.mixed
+            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), mixed=mixed))
         finally:
             journal.close()
 
@@ -58,7 +59,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
 def _service(request: RunRequest, folder: Path) -> Service:
     network = request.network
     intervals = Intervals(network.beat, network.beat)
-    return Service(request.name, folder, Network(network.listen, network.connect), intervals, mixed=network.mixed)
+    return Service(request.name, folder, Network(network.listen, network.connect), intervals)
 
 
 def _open(request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None) -> Journal:

@@ -34,6 +34,8 @@ class Run:
         limits: LimitsConfig,
         fleet: Fleet,
         now: float,
+        *,
+        mixed: bool = False,
     ) -> None:
         self.settings = settings
         self.limits = limits
@@ -48,7 +50,7 @@ class Run:
         closed, evaluations = journal.closed()
         self.history = History(closed)
         self.slack = Slack(journal, settings, self.uid, self.history, evaluations)
-        self.exchange = Exchange(journal, self.incarnation, fleet, self.slack, self._score)
+        self.exchange = Exchange(journal, self.incarnation, fleet, self.slack, self._score, mixed=mixed)
         self._evolution = Evolution(EvolutionConfig.of(settings), kept_start(journal))
         evaluated = self.slack.evaluations.finished
         self._generations = Generations(journal, settings, self._evolution, self.history, evaluated)
