@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection
+from dataclasses import replace
 
-from dreamfleet.common.messages import Beat, HelloRequest, Result, ResultBatch, UploadPart
+from dreamfleet.common.bounds import LONGEST_EPISODE, excess, most_steps
+from dreamfleet.common.messages import MOST_SLOTS, Beat, HelloRequest, Kind, Result, ResultBatch, UploadPart
 from dreamfleet.common.runs import RunSettings
 from dreamfleet.coordinator.admission import Refusals, differ, refusal
 from dreamfleet.coordinator.failure import Failure
@@ -21,10 +23,11 @@ class Exchange:
 
     def __init__(
         self, journal: Journal, incarnation: int, fleet: Fleet, slack: Slack, score: Callable[[Result], None],
-        *, mixed: bool = False,
+        *, horizon: int, mixed: bool = False,
     ) -> None:  # fmt: skip
         self.refusals = Refusals()
         self.fingerprint = journal.fingerprint()  # of the first accepted result; `None` before it
+        self._horizon = horizon  # of a scored episode
         self._mixed = mixed
         self._journal = journal
         self._incarnation = incarnation
@@ -45,7 +48,7 @@ class Exchange:
     def admit(self, request: HelloRequest, now: float) -> None:
         """Welcome a worker; what it computes is compared with the run's fingerprint once there is one."""
         self.refusals.admitted(request.worker)
-        self._fleet.welcome(request.worker, request.slots, request.fingerprint, now)
+        self._fleet.welcome(request.worker, min(request.slots, MOST_SLOTS), request.fingerprint, now)
 
     def beat(self, worker: str, beat: Beat, now: float) -> None:
         """A worker says what it holds."""
@@ -60,8 +63,10 @@ class Exchange:
         if not self._equal(batch.fingerprint):
             self._turn_away(worker, batch.fingerprint)
             return
-        for each in batch.results:
-            result = self._slack.collections.receive(worker, each, self._fleet.wants(each.digest))
+        for said in batch.results:
+            work = self._fleet.wants(said.digest)
+            each = said if work is None else bounded(said, work.job.kind, self._horizon)
+            result = self._slack.collections.receive(worker, each, work)
             if result is None:
                 self._fleet.put_off(worker, each.digest, now)
                 continue
@@ -154,3 +159,17 @@ class Exchange:
             self._score(result)
         else:
             self._slack.count(work, result)
+
+
+def bounded(result: Result, kind: Kind, horizon: int) -> Result:
+    """The result as it may be judged: one whose numbers would spoil the run's is the job's failure.
+
+    `horizon` is of a scored or kept episode; an evaluation drives whole ones, whose length only the world knows.
+    """
+    if kind == "evaluate":
+        horizon = LONGEST_EPISODE
+    steps = min(result.steps, most_steps(horizon))
+    if result.fitness is None:
+        return replace(result, steps=steps)
+    why = excess(result.fitness, result.steps, result.seconds, horizon)
+    return result if why is None else replace(result, fitness=None, steps=steps, error=why, upload=None)

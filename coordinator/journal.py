@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common import schema
+from dreamfleet.common.bounds import LARGEST_FITNESS, LONGEST_EPISODE, finite, most_steps
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.files import sync_folder, write_aside
 from dreamfleet.common.messages import Job, Result
@@ -161,6 +162,19 @@ class Journal:
             result.steps, result.seconds, worker, fingerprint, incarnation,
         )  # fmt: skip
 
+    def drop_excessive(self, horizon: int) -> int:
+        """Forget what older versions took in and what would spoil what is still to be told; how many results that is.
+
+        Those of closed generations were told, and stay.
+        """
+        within = "abs(fitness) <= ? AND steps BETWEEN 0 AND CASE kind WHEN 'evaluate' THEN ? ELSE ? END"
+        still = "kind != 'score' OR generation IN (SELECT number FROM generation WHERE closed IS NULL)"
+        query = f"DELETE FROM result WHERE NOT ({within}) AND ({still})"  # noqa: S608
+        bounds = LARGEST_FITNESS, most_steps(LONGEST_EPISODE), most_steps(horizon)
+        dropped = self._read(query, *bounds).rowcount
+        self.commit()
+        return dropped
+
     def schedule_evaluation(self, evaluation: Evaluation) -> None:
         """Write that the mean of a generation is to be evaluated."""
         self._write(
@@ -207,7 +221,7 @@ class Journal:
     def results_of(self, kind: str, generation: int) -> dict[bytes, tuple[float, int]]:
         """Fitness and steps of a generation's accepted results, by digest."""
         query = "SELECT digest, fitness, steps FROM result WHERE kind = ? AND generation = ?"
-        return {digest: (fitness, steps) for digest, fitness, steps in self._read(query, kind, generation)}
+        return {digest: (finite(fitness), steps) for digest, fitness, steps in self._read(query, kind, generation)}
 
     def fitness_of(self, digests: Sequence[bytes]) -> dict[bytes, float]:
         """Fitness of those of these jobs that have an accepted result, whichever generation asked for it."""
@@ -226,8 +240,8 @@ class Journal:
     def best_evaluation(self) -> tuple[int, float, bytes] | None:
         """(generation, mean, vector) of the best evaluated mean."""
         query = "SELECT generation, mean, vector FROM evaluation WHERE mean IS NOT NULL ORDER BY mean DESC, generation"
-        row: tuple[int, float, bytes] | None = self._read(query).fetchone()
-        return row
+        row = self._read(query).fetchone()
+        return None if row is None else (row[0], finite(row[1]), row[2])
 
     def _write(self, statement: str, *values: Any) -> None:
         self._write_all(statement, [values])

@@ -46,11 +46,15 @@ class Run:
         self.incarnation = journal.begin_incarnation()
         self._journal = journal
         self._untold: list[StoredGeneration] = []
+        if dropped := journal.drop_excessive(settings.task.horizon):
+            fleet.notes.append(f"{dropped} results of an older version are too large to count: asked for again")
         self._ending = False  # a limit is reached: only evaluations and collected rollouts are waited for
         closed, evaluations = journal.closed()
         self.history = History(closed)
         self.slack = Slack(journal, settings, self.uid, self.history, evaluations)
-        self.exchange = Exchange(journal, self.incarnation, fleet, self.slack, self._score, mixed=mixed)
+        self.exchange = Exchange(
+            journal, self.incarnation, fleet, self.slack, self._score, horizon=settings.task.horizon, mixed=mixed
+        )
         self._evolution = Evolution(EvolutionConfig.of(settings), kept_start(journal))
         evaluated = self.slack.evaluations.finished
         self._generations = Generations(journal, settings, self._evolution, self.history, evaluated)
