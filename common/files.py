@@ -27,11 +27,7 @@ def write_aside(path: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         aside.replace(path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        sync_folder(path.parent)
     finally:
         aside.unlink(missing_ok=True)
 
@@ -100,3 +96,12 @@ def _check_regular(found: os.stat_result, most: int) -> None:
         raise OSError(errno.EINVAL, "it is no regular file")
     if found.st_size > most:
         raise OSError(errno.EFBIG, f"it is larger than {most} bytes")
+
+
+def sync_folder(path: Path) -> None:
+    """Make the names in a folder durable."""
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

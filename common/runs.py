@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common import schema
+from dreamfleet.common.bounds import finite, saturated
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
@@ -157,7 +158,7 @@ class RunFolder:
 
     @property
     def fingerprint(self) -> str | None:
-        """The fingerprint that the run admits; `None` before its first worker."""
+        """The fingerprint that the run admits: its first accepted result's."""
         return self._fact("fingerprint")
 
     @property
@@ -199,12 +200,13 @@ class RunFolder:
     def history(self) -> list[StoredGeneration]:
         """Every closed generation, oldest first."""
         query = "SELECT number, mean, std, best, worst, sigma, steps, seconds FROM generation WHERE closed IS NOT NULL"
-        return [StoredGeneration(*row) for row in self._all(query + " ORDER BY number")]
+        return [_generation(*row) for row in self._all(query + " ORDER BY number")]
 
     def evaluations(self) -> list[StoredEvaluation]:
         """Every finished evaluation of a mean, oldest first."""
         query = "SELECT generation, episodes, mean, std FROM evaluation WHERE mean IS NOT NULL ORDER BY generation"
-        return [StoredEvaluation(*row) for row in self._all(query)]
+        return [StoredEvaluation(generation, episodes, finite(mean), finite(std))
+                for generation, episodes, mean, std in self._all(query)]  # fmt: skip
 
     def rollouts(self) -> list[Path]:
         """Every collected drive that was accepted, oldest first."""
@@ -233,6 +235,14 @@ class RunFolder:
             return self._connection.execute(query, values).fetchall()
         except sqlite3.DatabaseError as error:
             raise JournalError(f"the journal of run {self.name} is damaged: {error}") from error
+
+
+def _generation(
+    first: int, mean: float, std: float, best: float, worst: float, sigma: float, steps: int, seconds: float
+) -> StoredGeneration:
+    """A row of the journal; older ones hold numbers that cannot be told."""
+    told = finite(mean), finite(std), finite(best), finite(worst), finite(sigma)
+    return StoredGeneration(first, *told, saturated(steps), finite(seconds))
 
 
 _RESULT = "kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint"

@@ -27,8 +27,14 @@ def refusal(
         )
     if fingerprint in (None, request.fingerprint):
         return None
-    return f"fingerprints differ: the run has [{fingerprint}], the worker [{printable(request.fingerprint)}]", (
-        "install the same package versions on a host of the same CPU features, or start the coordinator with --mixed"
+    return differ(fingerprint, request.fingerprint)
+
+
+def differ(run: str | None, worker: str) -> tuple[str, str]:
+    """Why a worker of another fingerprint than the run's cannot add to it, and what to do about it."""
+    return f"fingerprints differ: the run has [{printable(run or '')}], the worker [{printable(worker)}]", (
+        "install the same package versions on a host of the same CPU features; or continue the run with --mixed, which "
+        "takes results of any host, though their last bits may differ: the run then cannot be repeated to the bit"
     )
 
 

@@ -228,7 +228,11 @@ class NetworkConfig:
     listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
     connect: tuple[str, ...] = option((), "connect to these stand-alone routers, as well where --listen is given")
     beat: float = option(1.0, "seconds between a worker's beats")
-    mixed: bool = option(False, "admit workers of any fingerprint; gives up replay to the bit")
+    mixed: bool = option(
+        False,
+        "take results of hosts whose CPU features or package versions differ from those of the first accepted result; "
+        "last bits may then differ, so the run cannot be repeated to the bit",
+    )
 
     def __post_init__(self) -> None:
         if not 0.05 <= self.beat <= 60:

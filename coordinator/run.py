@@ -21,7 +21,7 @@ from dreamfleet.coordinator.history import History
 from dreamfleet.coordinator.journal import Journal
 from dreamfleet.coordinator.limits import stop_reason
 from dreamfleet.coordinator.slack import Slack
-from dreamfleet.coordinator.start import Start
+from dreamfleet.coordinator.start import kept_start
 
 
 class Run:
@@ -34,7 +34,8 @@ class Run:
         limits: LimitsConfig,
         fleet: Fleet,
         now: float,
-        start: Start | None = None,
+        *,
+        mixed: bool = False,
     ) -> None:
         self.settings = settings
         self.limits = limits
@@ -45,14 +46,16 @@ class Run:
         self.incarnation = journal.begin_incarnation()
         self._journal = journal
         self._untold: list[StoredGeneration] = []
+        if dropped := journal.drop_excessive(settings.task.horizon):
+            fleet.notes.append(f"{dropped} results of an older version are too large to count: asked for again")
         self._ending = False  # a limit is reached: only evaluations and collected rollouts are waited for
         closed, evaluations = journal.closed()
         self.history = History(closed)
         self.slack = Slack(journal, settings, self.uid, self.history, evaluations)
-        self.exchange = Exchange(journal, self.incarnation, fleet, self.slack, self._score)
-        self._evolution = Evolution(EvolutionConfig.of(settings), start.mean if start else None)
-        if start:
-            journal.set_fact("start", start.source)
+        self.exchange = Exchange(
+            journal, self.incarnation, fleet, self.slack, self._score, horizon=settings.task.horizon, mixed=mixed
+        )
+        self._evolution = Evolution(EvolutionConfig.of(settings), kept_start(journal))
         evaluated = self.slack.evaluations.finished
         self._generations = Generations(journal, settings, self._evolution, self.history, evaluated)
         self.opened = now

@@ -57,12 +57,11 @@ SNAPSHOT_INTERVAL = 0.2
 class Service:
     """Serves one run until it ends or `stop` is called."""
 
-    def __init__(self, name: str, folder: Path, network: Network, intervals: Intervals, *, mixed: bool = False) -> None:
+    def __init__(self, name: str, folder: Path, network: Network, intervals: Intervals) -> None:
         self._name = name
         self._bundle = folder / BUNDLE
         self._network = network
         self._intervals = intervals
-        self._mixed = mixed
         self._nonce = secrets.token_hex(8)
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._inbox = Inbox()
@@ -230,7 +229,7 @@ class Service:
                     f"{keys.PROTOCOL_VERSION}",
                     f"install dreamfleet {package_version('dreamfleet')} on the worker's host",
                 )
-            elif refusal := self._exchange.refusal(request, self._run.settings, self._mixed):
+            elif refusal := self._exchange.refusal(request, self._run.settings):
                 reply = self._hello_reply(*refusal)
             else:
                 self._exchange.admit(request, now)

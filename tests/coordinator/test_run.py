@@ -27,6 +27,8 @@ SETTINGS = RunSettings(
 class Bench:
     """A run in a folder, driven by hand; time stands still unless it is moved."""
 
+    mixed = False
+
     def __init__(self, path, bundle, settings=SETTINGS, generations=1):
         self.path, self.now = path, 0.0
         self.settings, self.limits = settings, LimitsConfig(generations=generations)
@@ -35,7 +37,7 @@ class Bench:
         self.begin()
 
     def begin(self):
-        self.run = Run(self.journal, self.settings, self.limits, Fleet(1.0), self.now)
+        self.run = Run(self.journal, self.settings, self.limits, Fleet(1.0), self.now, mixed=self.mixed)
         self.run.advance(self.now)
         self.run.commit()
         for name in (A, B):

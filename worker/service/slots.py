@@ -7,6 +7,7 @@ import queue
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.bounds import saturated
 from dreamfleet.common.messages import MAX_LEASES, TAG_BYTES, Job, Result, Running, TaskSpec
 from dreamfleet.worker.service.announced import check_announced
 from dreamfleet.worker.service.backlog import Backlog
@@ -63,7 +64,7 @@ class Slots:
     def running(self) -> list[Running]:
         """Each running job, with its share of its turn's steps."""
         return [
-            Running(job.digest[:TAG_BYTES], slot.steps // len(slot.running))
+            Running(job.digest[:TAG_BYTES], saturated(slot.steps // len(slot.running)))
             for slot in self._slots
             for job in slot.running
         ]
