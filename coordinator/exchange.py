@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection
 
+from dreamfleet.common.errors import DreamfleetError, InternalError
 from dreamfleet.common.messages import Beat, HelloRequest, Result, ResultBatch, UploadPart
+from dreamfleet.common.printable import shortened
 from dreamfleet.common.runs import RunSettings
 from dreamfleet.coordinator.admission import Refusals, refusal
-from dreamfleet.coordinator.failure import Failure
+from dreamfleet.coordinator.failure import LONGEST_ERROR, Failure
 from dreamfleet.coordinator.fleet import Fleet, Send
 from dreamfleet.coordinator.jobs import Work
 from dreamfleet.coordinator.journal import Journal
@@ -56,17 +58,34 @@ class Exchange:
         self._fleet.depart(worker, now)
 
     def results(self, worker: str, batch: ResultBatch, now: float) -> None:
-        """Judge a worker's results; the first wanted ones are written and counted."""
+        """Judge a worker's results; the first wanted ones are written and counted.
+
+        One that raises keeps none of the others from being counted; then the first such error is raised.
+        """
+        errors = []
         for each in batch.results:
-            result = self._slack.collections.receive(worker, each, self._fleet.wants(each.digest))
-            if result is None:
-                self._fleet.put_off(worker, each.digest, now)
-                continue
-            _, work = self._fleet.result(worker, result, now)
-            if work is not None:
-                self._journal.add_result(work.job, result, worker, batch.fingerprint, self._incarnation)
-                self._count(work, result)
-            self._uploads.forget(result.digest)
+            wanted = self._fleet.wants(each.digest)
+            try:
+                self._result(worker, each, batch.fingerprint, now)
+            except DreamfleetError:
+                raise
+            except Exception as error:
+                if wanted is not None and self._fleet.wants(each.digest) is None:
+                    raise _half_counted(error) from error
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def _result(self, worker: str, each: Result, fingerprint: str, now: float) -> None:
+        result = self._slack.collections.receive(worker, each, self._fleet.wants(each.digest))
+        if result is None:
+            self._fleet.put_off(worker, each.digest, now)
+            return
+        _, work = self._fleet.result(worker, result, now)
+        if work is not None:
+            self._journal.add_result(work.job, result, worker, fingerprint, self._incarnation)
+            self._count(work, result)
+        self._uploads.forget(result.digest)
 
     def upload(self, worker: str, part: UploadPart, now: float) -> None:
         """Take in part of a rollout, from a worker that was given the job and while it is wanted."""
@@ -126,3 +145,11 @@ class Exchange:
             self._score(result)
         else:
             self._slack.count(work, result)
+
+
+def _half_counted(error: Exception) -> InternalError:
+    """A job that nobody wants any more and that was not counted would be waited for without end."""
+    return InternalError(
+        f"a result could not be counted ({type(error).__name__}: {shortened(str(error), LONGEST_ERROR)}); nothing is "
+        "lost: what was committed is whole, and the run can be continued with --resume"
+    )
