@@ -22,6 +22,7 @@ MAX_UPLOAD = 32 << 20  # a rollout of 1000 steps is 12 MB (64x64) or 28 MB (96x9
 MAX_OPTIONS = 8_000  # characters: a status and a controller carry them too
 MAX_LEASES = 1024  # of one worker: so that a beat, which names them all, stays under MAX_MESSAGE
 MOST_SLOTS = 4096  # of one worker
+MAX_TEXT = 2000  # characters: of an error, of why a worker is refused, of a fingerprint
 TAG_BYTES = 8
 COLDEST, HOTTEST = 1e-3, 1e3  # of a dream
 
@@ -49,7 +50,7 @@ Tag = Annotated[
     bytes, Length(TAG_BYTES, TAG_BYTES)
 ]  # a digest's first bytes, where only a worker's own jobs are told apart
 Word = Annotated[str, Length(1, 128)]
-Text = Annotated[str, Length(0, 2000)]
+Text = Annotated[str, Length(0, MAX_TEXT)]
 Part = Annotated[bytes, Length(0, MAX_PART)]
 Temperature = Annotated[float, Between(COLDEST, HOTTEST)]
 Packages = Annotated[tuple[Word, ...], Length(0, 64)]

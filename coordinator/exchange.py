@@ -7,10 +7,12 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 
 from dreamfleet.common.bounds import LONGEST_EPISODE, excess, most_steps
+from dreamfleet.common.errors import DreamfleetError, InternalError
 from dreamfleet.common.messages import MOST_SLOTS, Beat, HelloRequest, Kind, Result, ResultBatch, UploadPart
+from dreamfleet.common.printable import shortened
 from dreamfleet.common.runs import RunSettings
 from dreamfleet.coordinator.admission import Refusals, differ, refusal
-from dreamfleet.coordinator.failure import Failure
+from dreamfleet.coordinator.failure import LONGEST_ERROR, Failure
 from dreamfleet.coordinator.fleet import Fleet, Send
 from dreamfleet.coordinator.jobs import Work
 from dreamfleet.coordinator.journal import FINGERPRINT, Journal
@@ -59,23 +61,40 @@ class Exchange:
         self._fleet.depart(worker, now)
 
     def results(self, worker: str, batch: ResultBatch, now: float) -> None:
-        """Judge a worker's results; the first wanted ones are written and counted."""
+        """Judge a worker's results; the first wanted ones are written and counted.
+
+        One that raises keeps none of the others from being counted; then the first such error is raised.
+        """
         if not self._equal(batch.fingerprint):
             self._turn_away(worker, batch.fingerprint)
             return
-        for said in batch.results:
-            work = self._fleet.wants(said.digest)
-            each = said if work is None else bounded(said, work.job.kind, self._horizon)
-            result = self._slack.collections.receive(worker, each, work)
-            if result is None:
-                self._fleet.put_off(worker, each.digest, now)
-                continue
-            _, work = self._fleet.result(worker, result, now)
-            if work is not None:
-                self._journal.add_result(work.job, result, worker, batch.fingerprint, self._incarnation)
-                self._settle_fingerprint(batch.fingerprint)
-                self._count(work, result)
-            self._uploads.forget(result.digest)
+        errors = []
+        for each in batch.results:
+            wanted = self._fleet.wants(each.digest)
+            try:
+                self._result(worker, each, batch.fingerprint, now)
+            except DreamfleetError:
+                raise
+            except Exception as error:
+                if wanted is not None and self._fleet.wants(each.digest) is None:
+                    raise _half_counted(error) from error
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def _result(self, worker: str, said: Result, fingerprint: str, now: float) -> None:
+        work = self._fleet.wants(said.digest)
+        each = said if work is None else bounded(said, work.job.kind, self._horizon)
+        result = self._slack.collections.receive(worker, each, work)
+        if result is None:
+            self._fleet.put_off(worker, each.digest, now)
+            return
+        _, work = self._fleet.result(worker, result, now)
+        if work is not None:
+            self._journal.add_result(work.job, result, worker, fingerprint, self._incarnation)
+            self._settle_fingerprint(fingerprint)
+            self._count(work, result)
+        self._uploads.forget(result.digest)
 
     def upload(self, worker: str, part: UploadPart, now: float) -> None:
         """Take in part of a rollout, from a worker that was given the job and while it is wanted."""
@@ -173,3 +192,11 @@ def bounded(result: Result, kind: Kind, horizon: int) -> Result:
         return replace(result, steps=steps)
     why = excess(result.fitness, result.steps, result.seconds, horizon)
     return result if why is None else replace(result, fitness=None, steps=steps, error=why, upload=None)
+
+
+def _half_counted(error: Exception) -> InternalError:
+    """A job that nobody wants any more and that was not counted would be waited for without end."""
+    return InternalError(
+        f"a result could not be counted ({type(error).__name__}: {shortened(str(error), LONGEST_ERROR)}); nothing is "
+        "lost: what was committed is whole, and the run can be continued with --resume"
+    )
