@@ -25,6 +25,7 @@ from dreamfleet.common.messages import Job, Result
 from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.collection import Collection
+from dreamfleet.coordinator.confirmation import Finalist
 from dreamfleet.coordinator.evaluation import Evaluation
 
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
@@ -237,11 +238,18 @@ class Journal:
         query = "SELECT generation, vector, episodes FROM evaluation WHERE mean IS NULL ORDER BY generation"
         return [Evaluation(*row) for row in self._read(query)]
 
-    def best_evaluation(self) -> tuple[int, float, bytes] | None:
-        """(generation, mean, vector) of the best evaluated mean."""
-        query = "SELECT generation, mean, vector FROM evaluation WHERE mean IS NOT NULL ORDER BY mean DESC, generation"
-        row = self._read(query).fetchone()
-        return None if row is None else (row[0], finite(row[1]), row[2])
+    def finalists(self, count: int) -> list[Finalist]:
+        """The best evaluated means, best first; of generations with one mean and of equals the earliest."""
+        query = (
+            "SELECT min(generation), vector, episodes, mean FROM evaluation WHERE mean IS NOT NULL GROUP BY vector "
+            "ORDER BY mean DESC, 1 LIMIT ?"
+        )
+        return [Finalist(*row[:3], finite(row[3])) for row in self._read(query, count)]
+
+    def evaluated_vector(self, generation: int) -> bytes:
+        """The mean after a generation that was scheduled to be evaluated."""
+        (vector,) = self._read("SELECT vector FROM evaluation WHERE generation = ?", generation).fetchone()
+        return bytes(vector)
 
     def _write(self, statement: str, *values: Any) -> None:
         self._write_all(statement, [values])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dreamfleet.common.heat import deciding_evaluation
 from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.exchange import Exchange
@@ -48,7 +48,7 @@ class Run:
         self._untold: list[StoredGeneration] = []
         if dropped := journal.drop_excessive(settings.task.horizon):
             fleet.notes.append(f"{dropped} results of an older version are too large to count: asked for again")
-        self._ending = False  # a limit is reached: only evaluations and collected rollouts are waited for
+        self._ending = False  # a limit is reached: only what is in the slack is waited for
         closed, evaluations = journal.closed()
         self.history = History(closed)
         self.slack = Slack(journal, settings, self.uid, self.history, evaluations)
@@ -82,6 +82,11 @@ class Run:
         return self.slack.evaluations.best
 
     @property
+    def confirmed(self) -> StoredConfirmation | None:
+        """The confirmed score of what is reported; `None` where what is reported is not confirmed."""
+        return self.slack.confirmed
+
+    @property
     def controller_path(self) -> Path | None:
         """Where the reported controller lies; `None` while there is none: no generation was ever closed."""
         return self.slack.report.path
@@ -106,8 +111,7 @@ class Run:
         if failure is not None and self.paused is None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
         self.fleet.hurry = self._waiting
-        if self._ending and not self.slack.in_progress and self.ended is None:
-            self._end()
+        self._finish()
         return len(self.history) > closed
 
     def commit(self) -> None:
@@ -154,12 +158,12 @@ class Run:
         if self._stop_reason() is None or generation.done:
             self._journal.drop_fact("ended")
             self.fleet.offer([*work, *generation.missing])
-        elif self.slack.in_progress:
+        else:
             self._ending = True
             self.fleet.offer(work)
-        else:
-            self._end()
-            self.commit()
+            self._finish()
+            if self.ended is not None:
+                self.commit()
         return generation
 
     def _close(self, now: float) -> None:
@@ -189,6 +193,15 @@ class Run:
 
     def _stop_reason(self) -> str | None:
         return stop_reason(self.limits, self.history, self.slack.evaluations)
+
+    def _finish(self) -> None:
+        """Where a limit is reached and its last evaluations are in: confirm what is reported, then end."""
+        if not self._ending or self.slack.in_progress or self.ended is not None:
+            return
+        if work := self.slack.confirm():
+            self.fleet.offer(work)
+        else:
+            self._end()
 
     def _end(self) -> None:
         self.ended = self._stop_reason() or "stopped"

@@ -90,6 +90,8 @@ def _status(run: Run, name: str, standing: Standing, now: float) -> Status:
         failures=tuple(_failure(each) for each in failures[:MOST_FAILURES]),
         dropped={},
         refused=_refused(run),
+        confirmed=run.confirmed,
+        confirming=Progress(*run.slack.confirming),
     )
 
 
