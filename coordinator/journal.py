@@ -244,7 +244,8 @@ class Journal:
             "SELECT min(generation), vector, episodes, mean FROM evaluation WHERE mean IS NOT NULL GROUP BY vector "
             "ORDER BY mean DESC, 1 LIMIT ?"
         )
-        return [Finalist(*row[:3], finite(row[3])) for row in self._read(query, count)]
+        rows = self._read(query, count).fetchall()
+        return [Finalist(generation, vector, episodes, finite(mean)) for generation, vector, episodes, mean in rows]
 
     def evaluated_vector(self, generation: int) -> bytes:
         """The mean after a generation that was scheduled to be evaluated."""
