@@ -37,6 +37,7 @@ class Generation:
     ) -> None:  # fmt: skip
         self.number = number
         self.spec = spec
+        self.is_one_point = len(set(vectors)) == 1 < len(vectors)  # as they travel: nothing can be learned from it
         self.work = [
             work
             for candidate, vector in enumerate(vectors)

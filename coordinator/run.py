@@ -59,7 +59,8 @@ class Run:
         evaluated = self.slack.evaluations.finished
         self._generations = Generations(journal, settings, self._evolution, self.history, evaluated)
         self.opened = now
-        self.generation = self._begin(now)
+        self.generation = self._generations.begin()
+        self._begin(now)
 
     @property
     def sigma(self) -> float:
@@ -151,11 +152,11 @@ class Run:
         deciding = deciding_evaluation(self.settings, self.generation.number + 1)
         return self._ending or (self.slack.evaluations.awaits(deciding) and self.generation.complete)
 
-    def _begin(self, now: float) -> Generation:
-        generation = self._generations.begin()
+    def _begin(self, now: float) -> None:
+        generation = self.generation
         self.fleet.begin(generation.number)
         work = self.slack.begin(self._generations.mean, now)
-        if self._stop_reason() is None or generation.done:
+        if self._stop_reason(generation) is None or generation.done:
             self._journal.drop_fact("ended")
             self.fleet.offer([*work, *generation.missing])
         else:
@@ -164,15 +165,15 @@ class Run:
             self._finish()
             if self.ended is not None:
                 self.commit()
-        return generation
 
     def _close(self, now: float) -> None:
         closed = self._generations.close(self.generation, now - self.opened)
         self._untold.append(closed)
-        reason = self._stop_reason()
-        self.fleet.offer(self.slack.schedule(closed.number, self._generations.mean, now, last=reason is not None))
+        mean = self._generations.mean
         # Opened also when the run ends here: a later life with wider limits then goes on from it.
         generation = self._generations.open(closed.number + 1)
+        reason = self._stop_reason(generation)
+        self.fleet.offer(self.slack.schedule(closed.number, mean, now, last=reason is not None))
         if generation.spec != self.generation.spec:
             self.fleet.notes.append(
                 f"generation {generation.number} dreams at temperature {generation.spec.temperature:g}: the evaluated "
@@ -191,7 +192,10 @@ class Run:
         if self.generation.record(result.digest, result.fitness, result.steps):
             self.fleet.offer(self.generation.missing)
 
-    def _stop_reason(self) -> str | None:
+    def _stop_reason(self, generation: Generation) -> str | None:
+        """Why the run ends before `generation` is scored; `None` if it goes on."""
+        if generation.is_one_point:
+            return f"converged: generation {generation.number} is one point; fork the run with a larger --sigma0"
         return stop_reason(self.limits, self.history, self.slack.evaluations)
 
     def _finish(self) -> None:
@@ -204,6 +208,6 @@ class Run:
             self._end()
 
     def _end(self) -> None:
-        self.ended = self._stop_reason() or "stopped"
+        self.ended = self._stop_reason(self.generation) or "stopped"
         self._journal.set_fact("ended", self.ended)
         self.slack.report.finish()
