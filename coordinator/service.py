@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
-from pathlib import Path
 from time import monotonic
 from typing import Any
 
@@ -22,7 +21,6 @@ import zenoh
 
 from dreamfleet.common import keys
 from dreamfleet.common.codec import Inbox, encode, encode_json, encoding
-from dreamfleet.common.errors import RefusedError
 from dreamfleet.common.fields import written
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.common.messages import (
@@ -38,12 +36,14 @@ from dreamfleet.common.messages import (
     ResultBatch,
     UploadPart,
 )
-from dreamfleet.common.runs import BUNDLE
-from dreamfleet.common.session import LEASE_MS, Network, enqueue_into, open_session
+from dreamfleet.common.session import Network, enqueue_into, open_session
 from dreamfleet.common.status import PARTS
 from dreamfleet.coordinator import answers
+from dreamfleet.coordinator.claim import Claim
+from dreamfleet.coordinator.custody import Custody
 from dreamfleet.coordinator.fleet import Send
 from dreamfleet.coordinator.run import Run
+from dreamfleet.coordinator.served import ServedBundle
 from dreamfleet.coordinator.status import Snapshot, as_left, take_snapshot
 
 log = logging.getLogger(__name__)
@@ -57,9 +57,12 @@ SNAPSHOT_INTERVAL = 0.2
 class Service:
     """Serves one run until it ends or `stop` is called."""
 
-    def __init__(self, name: str, folder: Path, network: Network, intervals: Intervals) -> None:
+    def __init__(
+        self, name: str, network: Network, intervals: Intervals, custody: Custody, bundle: ServedBundle | None
+    ) -> None:
         self._name = name
-        self._bundle = folder / BUNDLE
+        self._custody = custody
+        self._bundle = bundle
         self._network = network
         self._intervals = intervals
         self._nonce = secrets.token_hex(8)
@@ -78,9 +81,10 @@ class Service:
     def serve(self, run_maker: Callable[[], Run], on_ready: Callable[[Run], None] = lambda _run: None) -> Run:
         """Claim the name on the wire, make the run, serve it; the run as it was when the service left."""
         with open_session(self._network) as session, ExitStack() as stack:
-            token = self._claim(session, stack)
-            stack.callback(token.undeclare)
+            self._claim = Claim(session, self._name, self._nonce, stack)
+            self._claim.take()
             self._run = run_maker()
+            self._claim.announce(self._run.uid, self._run.incarnation)
             self._exchange = self._run.exchange
             self._started = monotonic()
             self._snapshot = self._take_snapshot()
@@ -92,6 +96,7 @@ class Service:
             self._evaluations_told = len(self._run.slack.evaluations)
             on_ready(self._run)
             self._loop(session)
+            self._custody.look(monotonic(), at_once=True)
             self._run.leave()
             self._snapshot = as_left(self._take_snapshot())
             for each in declared:
@@ -99,33 +104,6 @@ class Service:
             farewell = answers.status(self._snapshot)
             session.put(keys.event_status(self._name), farewell, encoding="application/json")
         return self._run
-
-    def _claim(self, session: zenoh.Session, stack: ExitStack) -> Any:
-        """Refuse to be a second coordinator; a foreign token that outlives a lease is a live one."""
-        mine = keys.live_coordinator(self._name, self._nonce)
-        foreign: set[str] = set()
-        changes: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
-        watcher = session.liveliness().declare_subscriber(
-            keys.live_coordinator(self._name, "*"), enqueue_into(changes, "token"), history=True
-        )
-        stack.callback(watcher.undeclare)
-        deadline = monotonic() + 0.3
-        while (left := deadline - monotonic()) > 0:
-            try:
-                _, sample = changes.get(timeout=left)
-            except queue.Empty:
-                break
-            if sample.kind == zenoh.SampleKind.DELETE:
-                foreign.discard(str(sample.key_expr))
-            elif str(sample.key_expr) != mine:
-                if not foreign:
-                    deadline = monotonic() + LEASE_MS / 1000 + 1
-                foreign.add(str(sample.key_expr))
-            if not foreign and deadline - monotonic() > 1:
-                break
-        if foreign:
-            raise RefusedError(f"run {self._name} has a live coordinator already: stop it, or choose another --run")
-        return session.liveliness().declare_token(mine)
 
     def _declare(self, session: zenoh.Session) -> list[Any]:
         name, events = self._name, self._events
@@ -168,6 +146,8 @@ class Service:
             self._write_notes()
             if self._draining and not self._exchange.leased:
                 self.stop()
+            self._custody.look(now)
+            self._claim.look(now)
             if now - taken >= SNAPSHOT_INTERVAL:
                 self._snapshot, taken = self._take_snapshot(), now
 
@@ -347,15 +327,13 @@ class Service:
             except ValueError:
                 query.reply_err(json.dumps({"why": "offset and length must be whole numbers"}).encode())
                 return
-            total = self._bundle.stat().st_size
-            with self._bundle.open("rb") as file:
-                file.seek(min(max(offset, 0), total))
-                data = file.read(min(max(length, 0), MAX_PART))
+            assert self._bundle is not None, "only what is served is asked for"
+            offset, total, data = self._bundle.part(offset, length)
             part = BundlePart(
                 run_uid=self._run.uid,
                 incarnation=self._run.incarnation,
                 sha256=bytes.fromhex(sha256),
-                offset=min(max(offset, 0), total),
+                offset=offset,
                 total=total,
                 data=data,
             )
