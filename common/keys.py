@@ -83,6 +83,11 @@ def live_coordinator(run: str, nonce: str) -> str:
     return f"{_PREFIX}/{run}/live/coordinator/{nonce}"
 
 
+def claim(run: str, nonce: str) -> str:
+    """Where coordinators of one name ask each other who they are."""
+    return f"{_PREFIX}/{run}/claim/{nonce}"
+
+
 def status(run: str, part: str = "") -> str:
     """Read-only JSON for people and tools; `part` is one of `dreamfleet.common.status.PARTS`."""
     return f"{_PREFIX}/{run}/status/{part}" if part else f"{_PREFIX}/{run}/status"

@@ -278,6 +278,18 @@ class HelloReply:
     )  # whose versions the run's fingerprint names
 
 
+@dataclass(frozen=True, kw_only=True)
+class ClaimNote:
+    """Who a coordinator is, to another one of its name (JSON): the question as well as the answer."""
+
+    SCHEMA: ClassVar[str] = "claim"
+
+    run_uid: Word
+    incarnation: Count
+    nonce: Word
+    began: Annotated[float, Between(0.0, 1e12)]  # seconds since 1970, by its own clock
+
+
 @dataclass(frozen=True)
 class Intervals:
     """How often a worker beats and repeats, in seconds; part of the accepting answer."""

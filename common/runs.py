@@ -7,7 +7,7 @@ import math
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -348,16 +348,30 @@ def _connect_read_only(path: Path) -> sqlite3.Connection:
 
 @contextmanager
 def run_lock(path: Path) -> Iterator[None]:
-    """Hold a run's folder: whoever writes in it, moves it or deletes it does so alone."""
+    """Hold a run's folder: whoever writes in it, moves it or deletes it does so alone.
+
+    The folder itself is locked beside the file that earlier versions lock: a file can be removed by hand. The journal
+    is not, for to close another descriptor of it would end SQLite's own locks.
+    """
+    try:
+        with ExitStack() as stack:
+            file = stack.enter_context((path / "lock").open("w"))
+            folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+            stack.callback(os.close, folder)
+            _flock(file.fileno(), path)
+            with suppress(OSError):  # a network's file system may lock files alone
+                _flock(folder, path)
+            held = stack.pop_all()
+    except OSError as error:
+        raise JournalError(f"cannot write in {path}: {error.strerror}; choose another --runs-dir") from error
+    with held:
+        yield
+
+
+def _flock(descriptor: int, path: Path) -> None:
     import fcntl
 
     try:
-        file = (path / "lock").open("w")
-    except OSError as error:
-        raise JournalError(f"cannot write in {path}: {error.strerror}; choose another --runs-dir") from error
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UsageError(f"run {path.name} is held by a live coordinator; stop it first") from None
-        yield
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UsageError(f"run {path.name} is held by a live coordinator; stop it first") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import secrets
 import shutil
 import sqlite3
@@ -49,6 +50,7 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._incarnation = 0
         self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
         with _translated(path):
             self._connection = sqlite3.connect(path, timeout=5)
@@ -95,6 +97,33 @@ class Journal:
         """Fold the write-ahead log into the journal and release it."""
         self._connection.close()
 
+    def save_copy(self, path: Path) -> None:
+        """Write all that is committed into a new file, checked, whole or not at all."""
+        aside = path.with_name(f".{path.name}.part")
+        try:
+            with _translated(path), closing(sqlite3.connect(aside)) as copy:
+                self._connection.backup(copy)
+                copy.execute("PRAGMA journal_mode = DELETE")  # one file, without a log beside it
+                found = copy.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if found != "ok":
+                raise JournalError(f"what {self.path} held is damaged: {found}")
+            with aside.open("rb") as file:
+                os.fsync(file.fileno())
+            aside.replace(path)
+            sync_folder(path.parent)
+        finally:
+            for left in (aside, *beside(aside)):
+                left.unlink(missing_ok=True)
+
+    def check_incarnation(self) -> None:
+        """`JournalError` if another coordinator began a life in this journal: a lock held neither of them back."""
+        found = int(self.fact("incarnation") or 0)
+        if found != self._incarnation:
+            raise JournalError(
+                f"another coordinator serves {self.path} too (incarnation {found}, this one is {self._incarnation}): "
+                "this one leaves; what it committed is whole, and the other one goes on with it"
+            )
+
     def commit(self) -> None:
         """Make everything written so far durable."""
         self._flush()
@@ -127,6 +156,7 @@ class Journal:
         number = int(self.fact("incarnation") or 0) + 1
         self.set_fact("incarnation", str(number))
         self.commit()
+        self._incarnation = number
         return number
 
     def open_generation(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -14,10 +15,12 @@ from dreamfleet.common.messages import Intervals
 from dreamfleet.common.runs import BUNDLE, JOURNAL, RunSettings, open_run, run_lock
 from dreamfleet.common.session import Network
 from dreamfleet.coordinator.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.custody import Custody
 from dreamfleet.coordinator.fleet import Fleet
 from dreamfleet.coordinator.journal import Journal
 from dreamfleet.coordinator.kept import facts_of
 from dreamfleet.coordinator.run import Run
+from dreamfleet.coordinator.served import ServedBundle
 from dreamfleet.coordinator.service import Service
 from dreamfleet.coordinator.start import Start
 
@@ -44,22 +47,20 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         raise JournalError(
             f"cannot write in {request.runs_dir}: {error.strerror}; choose another --runs-dir"
         ) from error
-    with run_lock(folder):
-        journal = _open(request, folder, settings, bundle)
-        service = _service(request, folder)
+    with run_lock(folder), ExitStack() as stack:
+        journal = stack.enter_context(closing(_open(request, folder, settings, bundle)))
+        served = stack.enter_context(closing(ServedBundle(folder / BUNDLE))) if bundle else None
+        custody = stack.enter_context(closing(Custody(journal, served)))
+        service = _service(request, custody, served)
         on_stoppable(service.stop)
-        try:
-            fleet = Fleet(request.network.beat)
-            mixed = request.network.mixed
-            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), mixed=mixed))
-        finally:
-            journal.close()
+        fleet, mixed = Fleet(request.network.beat), request.network.mixed
+        return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), mixed=mixed))
 
 
-def _service(request: RunRequest, folder: Path) -> Service:
+def _service(request: RunRequest, custody: Custody, bundle: ServedBundle | None) -> Service:
     network = request.network
     intervals = Intervals(network.beat, network.beat)
-    return Service(request.name, folder, Network(network.listen, network.connect), intervals)
+    return Service(request.name, Network(network.listen, network.connect), intervals, custody, bundle)
 
 
 def _open(request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None) -> Journal:

@@ -6,10 +6,8 @@ Whatever a question is, it ends neither its thread nor the run: what raises is c
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -20,6 +18,7 @@ from dreamfleet.common.messages import MAX_PART, BundlePart
 from dreamfleet.common.mishaps import Mishaps
 from dreamfleet.common.status import PARTS
 from dreamfleet.coordinator import answers
+from dreamfleet.coordinator.served import ServedBundle
 from dreamfleet.coordinator.status import Snapshot
 
 Answer = Callable[[zenoh.Query], None]
@@ -39,22 +38,17 @@ def answer_status(session: zenoh.Session, name: str, latest: Callable[[], Snapsh
 
 
 class BundleServer:
-    """Serves one world model in parts. Its file stays open: nobody who asks can take the last descriptor."""
+    """Serves one world model in parts."""
 
-    def __init__(self, path: Path, key: str, head: dict[str, Any]) -> None:
+    def __init__(self, bundle: ServedBundle, key: str, head: dict[str, Any]) -> None:
         """`head` is what every part says: of which run, in which life, and the bundle's hash."""
-        self._file = path.open("rb")
-        self._total = path.stat().st_size
+        self._bundle = bundle
         self._key = key
         self._head = head
 
     def declare(self, session: zenoh.Session, mishaps: Mishaps) -> Any:
         """Answer from now on, until what comes back is undeclared."""
         return session.declare_queryable(self._key, guarded(self._answer, mishaps))
-
-    def close(self) -> None:
-        """Answer no more."""
-        self._file.close()
 
     def _answer(self, query: zenoh.Query) -> None:
         asked = query.parameters
@@ -63,9 +57,8 @@ class BundleServer:
         except ValueError:
             query.reply_err(_why("offset and length must be whole numbers"))
             return
-        offset, length = min(max(offset, 0), self._total), min(max(length, 0), MAX_PART)
-        data = os.pread(self._file.fileno(), length, offset)
-        part = BundlePart(**self._head, offset=offset, total=self._total, data=data)
+        offset, total, data = self._bundle.part(offset, length)
+        part = BundlePart(**self._head, offset=offset, total=total, data=data)
         query.reply(self._key, encode(part), encoding=encoding(BundlePart))
 
 

@@ -10,7 +10,6 @@ import queue
 import secrets
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 from time import monotonic
 from typing import Any
 
@@ -18,7 +17,7 @@ import zenoh
 
 from dreamfleet.common import keys
 from dreamfleet.common.codec import Inbox, MalformedError, encode, encode_json, encoding
-from dreamfleet.common.errors import DreamfleetError, RefusedError
+from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.messages import (
     Beat,
     GenerationEvent,
@@ -30,14 +29,16 @@ from dreamfleet.common.messages import (
     UploadPart,
 )
 from dreamfleet.common.mishaps import Mishaps
-from dreamfleet.common.runs import BUNDLE
-from dreamfleet.common.session import LEASE_MS, Network, enqueue_into, open_session
+from dreamfleet.common.session import Network, open_session
 from dreamfleet.coordinator import answers
 from dreamfleet.coordinator.arrivals import Arrivals
+from dreamfleet.coordinator.claim import Claim
+from dreamfleet.coordinator.custody import Custody
 from dreamfleet.coordinator.fleet import Send
 from dreamfleet.coordinator.queryables import BundleServer, answer_status
 from dreamfleet.coordinator.replies import control_reply, hello_reply, misunderstanding
 from dreamfleet.coordinator.run import Run
+from dreamfleet.coordinator.served import ServedBundle
 from dreamfleet.coordinator.status import Snapshot, as_left, take_snapshot
 
 log = logging.getLogger(__name__)
@@ -51,9 +52,12 @@ _REPEATED: dict[str, type[Message]] = {"result": ResultBatch, "beat": Beat, "upl
 class Service:
     """Serves one run until it ends or `stop` is called."""
 
-    def __init__(self, name: str, folder: Path, network: Network, intervals: Intervals) -> None:
+    def __init__(
+        self, name: str, network: Network, intervals: Intervals, custody: Custody, bundle: ServedBundle | None
+    ) -> None:
         self._name = name
-        self._bundle = folder / BUNDLE
+        self._custody = custody
+        self._bundle = bundle
         self._network = network
         self._intervals = intervals
         self._nonce = secrets.token_hex(8)
@@ -71,13 +75,14 @@ class Service:
     def serve(self, run_maker: Callable[[], Run], on_ready: Callable[[Run], None] = lambda _run: None) -> Run:
         """Claim the name on the wire, make the run, serve it; the run as it was when the service left."""
         with open_session(self._network) as session, ExitStack() as stack:
-            token = self._claim(session, stack)
-            stack.callback(token.undeclare)
+            self._claim = Claim(session, self._name, self._nonce, stack)
+            self._claim.take()
             self._run = run_maker()
+            self._claim.announce(self._run.uid, self._run.incarnation)
             self._exchange = self._run.exchange
             self._started = monotonic()
             self._snapshot = self._take_snapshot()
-            declared = self._declare(session, stack)
+            declared = self._declare(session)
             log.info("run %s, incarnation %d, generation %d", self._name, self._run.incarnation,
                      self._run.generation.number)  # fmt: skip
             if self._network.listen:
@@ -85,6 +90,7 @@ class Service:
             self._evaluations_told = len(self._run.slack.evaluations)
             on_ready(self._run)
             self._loop(session)
+            self._custody.look(monotonic(), at_once=True)
             self._run.leave()
             self._snapshot = as_left(self._take_snapshot())
             for each in declared:
@@ -93,34 +99,7 @@ class Service:
             session.put(keys.event_status(self._name), farewell, encoding="application/json")
         return self._run
 
-    def _claim(self, session: zenoh.Session, stack: ExitStack) -> Any:
-        """Refuse to be a second coordinator; a foreign token that outlives a lease is a live one."""
-        mine = keys.live_coordinator(self._name, self._nonce)
-        foreign: set[str] = set()
-        changes: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
-        watcher = session.liveliness().declare_subscriber(
-            keys.live_coordinator(self._name, "*"), enqueue_into(changes, "token"), history=True
-        )
-        stack.callback(watcher.undeclare)
-        deadline = monotonic() + 0.3
-        while (left := deadline - monotonic()) > 0:
-            try:
-                _, sample = changes.get(timeout=left)
-            except queue.Empty:
-                break
-            if sample.kind == zenoh.SampleKind.DELETE:
-                foreign.discard(str(sample.key_expr))
-            elif str(sample.key_expr) != mine:
-                if not foreign:
-                    deadline = monotonic() + LEASE_MS / 1000 + 1
-                foreign.add(str(sample.key_expr))
-            if not foreign and deadline - monotonic() > 1:
-                break
-        if foreign:
-            raise RefusedError(f"run {self._name} has a live coordinator already: stop it, or choose another --run")
-        return session.liveliness().declare_token(mine)
-
-    def _declare(self, session: zenoh.Session, stack: ExitStack) -> list[Any]:
+    def _declare(self, session: zenoh.Session) -> list[Any]:
         name = self._name
         subscribe, answer = session.declare_subscriber, session.declare_queryable
         return [
@@ -131,7 +110,7 @@ class Service:
             answer(keys.hello(name), self._enqueue("hello")),
             answer(keys.control(name, "*"), self._enqueue("control")),
             *answer_status(session, name, lambda: self._snapshot, self._mishaps),
-            *self._serve_bundle(session, stack),
+            *self._serve_bundle(session),
         ]
 
     def _enqueue(self, kind: str) -> Any:
@@ -159,6 +138,8 @@ class Service:
             self._write_notes()
             if self._draining and not self._exchange.leased:
                 self.stop()
+            self._custody.look(now)
+            self._claim.look(now)
             if now - taken >= SNAPSHOT_INTERVAL:
                 self._snapshot, taken = self._take_snapshot(), now
 
@@ -301,12 +282,11 @@ class Service:
         dropped = self._inbox.dropped + self._exchange.dropped + self._events.dropped + self._mishaps.counts
         return take_snapshot(self._run, self._name, dropped, now - self._started, now)
 
-    def _serve_bundle(self, session: zenoh.Session, stack: ExitStack) -> list[Any]:
+    def _serve_bundle(self, session: zenoh.Session) -> list[Any]:
         """Serve the run's world model, if its task needs one."""
         sha256 = self._run.settings.task.bundle
-        if not sha256:
+        if self._bundle is None:
             return []
         head = {"run_uid": self._run.uid, "incarnation": self._run.incarnation, "sha256": bytes.fromhex(sha256)}
         server = BundleServer(self._bundle, keys.bundle(self._name, sha256), head)
-        stack.callback(server.close)
         return [server.declare(session, self._mishaps)]

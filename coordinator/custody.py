@@ -1,0 +1,168 @@
+"""Whether a live run's files are still its own: what was removed or replaced under it is rescued, and it leaves.
+
+SQLite goes on writing into a file that has lost its name, and nobody would notice before the process is gone and the
+file with it. So names are compared with what was opened, about once a second and before the run ends.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from tempfile import gettempdir
+
+from dreamfleet.common.errors import DreamfleetError, JournalError
+from dreamfleet.common.processes import spoken
+from dreamfleet.common.runs import JOURNAL
+from dreamfleet.coordinator.journal import Journal, beside
+from dreamfleet.coordinator.served import ServedBundle
+
+log = logging.getLogger(__name__)
+PACE = 1.0  # seconds between two looks
+SETTLE = 0.3  # seconds in which whoever removes a folder is done with it
+RESCUED = "rescued"
+
+Identity = tuple[int, int]
+
+
+class Custody:
+    """The files of one coordinator's life: its folder, its journal and that one's log, its bundle. Close it."""
+
+    def __init__(self, journal: Journal, bundle: ServedBundle | None) -> None:
+        self._journal = journal
+        self._bundle = bundle
+        self._folder = journal.path.parent
+        self._held = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
+        self._of_folder = identity(self._folder)
+        self._own: dict[str, Identity | None] = {JOURNAL: identity(journal.path)}
+        self._next = float("-inf")
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        os.close(self._held)
+
+    def look(self, now: float, *, at_once: bool = False) -> None:
+        """Compare; `JournalError` says what was rescued, and how to go on."""
+        if now < self._next and not at_once:
+            return
+        self._next = now + PACE
+        for path in beside(self._journal.path)[:2]:  # they come with the first write
+            if self._own.get(path.name) is None:
+                self._own[path.name] = identity(path)
+        if identity(self._folder) != self._of_folder or not self._whole(self._folder):
+            self._leave()
+        self._journal.check_incarnation()
+        self._restore_bundle()
+
+    def _whole(self, folder: Path) -> bool:
+        """Whether the names in a folder are those of the files that are open."""
+        return all(own is None or identity(folder / name) == own for name, own in self._own.items())
+
+    def _leave(self) -> None:
+        time.sleep(SETTLE)
+        self._journal.commit()
+        folder = self._found()
+        if folder is not None and self._whole(folder):
+            raise JournalError(
+                f"the run's folder was moved to {folder} while it was served: nothing is lost; go on with: "
+                f"{_again(folder)}"
+            )
+        raise JournalError(self._rescue(folder))
+
+    def _found(self) -> Path | None:
+        """Where the folder is now; `None` if it is gone."""
+        with suppress(OSError):
+            for path in (self._folder, Path(f"/proc/self/fd/{self._held}").readlink()):
+                if identity(path) == self._of_folder:
+                    return path
+        return None
+
+    def _rescue(self, folder: Path | None) -> str:
+        """Copy what the open connection holds to the first place that takes it; what to tell people."""
+        failures = []
+        for place in self._places(folder):
+            try:
+                return place()
+            except (OSError, DreamfleetError) as error:
+                failures.append(str(error))
+        return (
+            f"{self._journal.path} was removed or replaced while it was served, and what it held could not be rescued: "
+            f"{'; '.join(failures)}"
+        )
+
+    def _places(self, folder: Path | None) -> Iterator[Callable[[], str]]:
+        if folder is not None:
+            yield lambda: self._rescue_into(folder)
+        for parent in (self._folder.parent, Path(gettempdir())):
+            yield lambda parent=parent: self._rescue_beside(parent)  # type: ignore[misc]
+
+    def _rescue_into(self, folder: Path) -> str:
+        """Into the run's own folder, under the journal's own name if that is free."""
+        target = folder / JOURNAL
+        copy = free(folder / f"journal-{RESCUED}.sqlite")
+        self._journal.save_copy(copy)
+        foreign = identity(target) not in (None, self._own[JOURNAL])
+        for each in beside(target):  # a log without its own journal would damage whatever has the journal's name
+            if each.exists() and identity(each) == self._own.get(each.name):
+                each.unlink()
+            elif each.exists() and not foreign:
+                each.replace(free(each.with_name(f"{each.name}.other")))
+        if foreign:
+            left = " ".join(str(each) for each in beside(target) if each.exists())
+            clear = f"rm {left} && " if left else ""
+            return (
+                f"{target} was replaced while it was served: what lies there now is left as it is, what the run had "
+                f"written is in {copy}; go on with: {clear}mv {copy} {target} && {_again(folder)}"
+            )
+        copy.replace(target)
+        return (
+            f"{target} or its write-ahead log was removed while it was served: rescued to the last result as {target}; "
+            f"go on with: {_again(folder)}"
+        )
+
+    def _rescue_beside(self, parent: Path) -> str:
+        """Into a folder of its own, as another run: its own is gone."""
+        folder = free(parent / f"{self._folder.name[:50]}-{RESCUED}")
+        folder.mkdir(parents=True)
+        self._journal.save_copy(folder / JOURNAL)
+        if self._bundle is not None:
+            self._bundle.put_back(folder)
+        return (
+            f"{self._folder} was removed while it was served: rescued to the last result as {folder / JOURNAL}; go on "
+            f"with: {_again(folder)}"
+        )
+
+    def _restore_bundle(self) -> None:
+        """A run without its world model could not be continued."""
+        try:
+            if self._bundle is not None and self._bundle.put_back(self._folder):
+                log.warning("the run's copy of its world model was removed while it was served: written again")
+        except OSError as error:
+            log.warning(
+                "the run's copy of its world model was removed, and cannot be written again: %s", error.strerror
+            )
+
+
+def identity(path: Path) -> Identity | None:
+    """Which file or folder a name stands for; `None`: there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def free(path: Path) -> Path:
+    """A name like this one that nothing has."""
+    number, found = 1, path
+    while found.exists():
+        number += 1
+        found = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return found
+
+
+def _again(folder: Path) -> str:
+    return spoken("coordinator", "--resume", folder.name, "--runs-dir", folder.parent)

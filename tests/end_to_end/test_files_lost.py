@@ -1,0 +1,136 @@
+"""A live run whose files are removed, replaced or moved: nothing is lost, it says so soon, and it can be continued."""
+
+import shutil
+import signal
+import subprocess
+import time
+
+import pytest
+
+from dreamfleet.common.runs import open_run
+from tests.support import tasks
+from tests.support.processes import environment, free_port
+
+pytestmark = pytest.mark.timeout(180)
+SOON = 5  # seconds; a look is made each second, and this machine may be busy
+
+
+@pytest.fixture
+def settings(random_bundle):
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+            "--task", tasks.SLOW_TOY, "--generations", 100_000)  # fmt: skip
+
+
+@pytest.fixture
+def live(processes, settings):
+    """A run in its third generation, and its folder."""
+    coordinator = processes.coordinator(*settings)
+    processes.worker("--task", tasks.SLOW_TOY)
+    coordinator.wait_for("generation 1: mean")
+    return coordinator, processes.runs / "test"
+
+
+def said_of(coordinator):
+    """How it ended, which is not as if nothing had happened."""
+    began = time.monotonic()
+    code, _ = coordinator.finish(60)
+    assert time.monotonic() - began < SOON
+    assert code == 1
+    assert "Traceback" not in "".join(coordinator.lines)
+    return coordinator.lines[-1]
+
+
+def closed(coordinator):
+    """Generations that it told of."""
+    return sum(": mean" in line for line in coordinator.lines)
+
+
+def goes_on(processes, coordinator, said, name="test"):
+    """By the very words that were said, with every generation that was told."""
+    told = closed(coordinator)
+    command = said.split("go on with: ")[1].strip()
+    with subprocess.Popen(
+        f"{command} --generations {told + 1} --listen {processes.endpoint}", shell=True, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env=environment(processes.cache),
+    ) as again:  # fmt: skip
+        processes.worker("--task", tasks.SLOW_TOY, "--run", name)
+        _, err = again.communicate(timeout=90)
+        assert again.returncode == 0, err
+    with open_run(processes.runs, name) as run:
+        history = [(each.number, f"{each.mean:.1f}") for each in run.history()]
+    lines = [line for line in coordinator.lines if ": mean" in line]
+    for line, (number, mean) in zip(lines, history, strict=False):
+        assert f"generation {number}: mean {mean}," in line
+    assert len(history) == told + 1
+
+
+@pytest.mark.parametrize("lost", [("journal.sqlite",), ("journal.sqlite-wal",), ("journal.sqlite", "journal.sqlite-wal",
+                                  "journal.sqlite-shm")], ids=["journal", "log", "all"])  # fmt: skip
+def test_a_journal_that_is_removed_is_rescued_under_its_own_name(processes, live, lost):
+    coordinator, folder = live
+    for name in lost:
+        (folder / name).unlink()
+    said = said_of(coordinator)
+    assert f"rescued to the last result as {folder / 'journal.sqlite'}" in said
+    goes_on(processes, coordinator, said)
+
+
+def test_a_folder_that_is_removed_is_rescued_beside_it(processes, live):
+    coordinator, folder = live
+    shutil.rmtree(folder)
+    said = said_of(coordinator)
+    assert f"rescued to the last result as {processes.runs / 'test-rescued' / 'journal.sqlite'}" in said
+    goes_on(processes, coordinator, said, "test-rescued")
+
+
+def test_a_journal_that_is_replaced_by_a_copy_is_rescued_and_the_copy_stays(processes, live):
+    coordinator, folder = live
+    copy = folder / "copy"
+    shutil.copyfile(folder / "journal.sqlite", copy)
+    data = copy.read_bytes()
+    copy.replace(folder / "journal.sqlite")
+    said = said_of(coordinator)
+    assert (folder / "journal.sqlite").read_bytes() == data
+    goes_on(processes, coordinator, said)
+
+
+def test_a_folder_that_is_moved_goes_on_where_it_lies(processes, live):
+    coordinator, folder = live
+    folder.rename(processes.runs / "elsewhere")
+    said = said_of(coordinator)
+    assert "nothing is lost" in said
+    goes_on(processes, coordinator, said, "elsewhere")
+
+
+def test_a_bundle_that_is_removed_is_served_on_and_written_again(processes, live):
+    coordinator, folder = live
+    (folder / "bundle.zip").unlink()
+    coordinator.wait_for("written again")
+    worker = processes.start("worker", "--connect", processes.endpoint, "--slots", "1", "--task", tasks.SLOW_TOY)
+    worker.wait_for("joined run")
+    assert coordinator.popen.poll() is None
+    assert (folder / "bundle.zip").exists()
+
+
+def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
+    coordinator, folder = live
+    (folder / "controller.npz").unlink(missing_ok=True)
+    (folder / "controller.npz").mkdir()
+    coordinator.popen.send_signal(signal.SIGTERM)
+    assert coordinator.finish(60)[0] == 1
+    assert "controller.npz" in coordinator.lines[-1]
+    assert "Traceback" not in "".join(coordinator.lines)
+    (folder / "controller.npz").rmdir()
+    told = closed(coordinator)
+    again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--generations", told)
+    assert again.finish(60)[0] == 0
+
+
+def test_a_lock_that_is_removed_by_hand_lets_nobody_in(processes, live):
+    coordinator, folder = live
+    (folder / "lock").unlink()
+    code, _, err = processes.call("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen",
+                                  f"tcp/127.0.0.1:{free_port()}")  # fmt: skip
+    assert code != 0
+    assert "held by a live coordinator" in err
+    coordinator.wait_for("generation")
