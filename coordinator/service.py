@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
+from io import SEEK_END
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -21,9 +22,11 @@ from typing import Any
 import zenoh
 
 from dreamfleet.common import keys
+from dreamfleet.common.bundle import MAX_BUNDLE
 from dreamfleet.common.codec import Inbox, encode, encode_json, encoding
 from dreamfleet.common.errors import RefusedError
 from dreamfleet.common.fields import written
+from dreamfleet.common.files import open_regular
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.common.messages import (
     MAX_PART,
@@ -348,10 +351,14 @@ class Service:
             except ValueError:
                 query.reply_err(json.dumps({"why": "offset and length must be whole numbers"}).encode())
                 return
-            total = self._bundle.stat().st_size
-            with self._bundle.open("rb") as file:
-                file.seek(min(max(offset, 0), total))
-                data = file.read(min(max(length, 0), MAX_PART))
+            try:
+                with open_regular(self._bundle, MAX_BUNDLE) as file:
+                    total = file.seek(0, SEEK_END)
+                    file.seek(min(max(offset, 0), total))
+                    data = file.read(min(max(length, 0), MAX_PART))
+            except OSError as error:
+                query.reply_err(json.dumps({"why": f"the coordinator's bundle cannot be read: {error}"}).encode())
+                return
             part = BundlePart(
                 run_uid=self._run.uid,
                 incarnation=self._run.incarnation,

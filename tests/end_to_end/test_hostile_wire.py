@@ -10,6 +10,7 @@ from dreamfleet.common import keys
 from dreamfleet.common.codec import encode
 from dreamfleet.common.messages import MAX_MESSAGE
 from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.status import PARTS
 from tests.support import tasks
 from tests.support.mutations import mutations
 from tests.support.samples import MSGPACK
@@ -88,3 +89,19 @@ def test_a_hundred_thousand_damaged_messages_leave_no_trace_but_their_count(proc
     (_, before), (dropped, after) = flood(processes, random_bundle, 10_000, 100_000)
     assert dropped == 110_000
     assert after - before < 20e6
+
+
+STRANGE = ["9" * 5000, "9" * 18, "-1", "-" + "9" * 5000, "1.5", "", "1e3", "²", "%00", "[bold]", "NaN"]
+
+
+def test_every_query_is_answered_whatever_it_asks_for(processes, random_bundle):
+    processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY)
+    with open_session(Network(connect=(processes.endpoint,))) as session:
+        for text in STRANGE:
+            asked = f"?offset={text};limit={text};length={text};generation={text}"
+            for part in PARTS:
+                (reply,) = session.get(keys.status("test", part) + asked, timeout=5)
+                assert b'"run": "test"' in reply.ok.payload.to_bytes(), (part, text[:20])
+            (reply,) = session.get(keys.bundle("test", random_bundle.sha256) + asked, timeout=5)
+            assert reply.ok is not None or b"whole numbers" in reply.err.payload.to_bytes(), text[:20]
+    assert processes.status()["state"] == "waiting for workers"
