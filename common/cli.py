@@ -16,6 +16,7 @@ from importlib.metadata import EntryPoint, entry_points, version
 from typing import NoReturn, Protocol
 
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
+from dreamfleet.common.printable import PrintableFormatter, one_line
 
 GROUP = "dreamfleet.verbs"
 INTERRUPTED = 130
@@ -58,12 +59,14 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; an expected error is one line on stderr and an exit code that is not 0."""
-    logging.basicConfig(format="%(asctime)s %(levelname)s %(name)s: %(message)s", level=logging.WARNING)
+    handler = logging.StreamHandler()
+    handler.setFormatter(PrintableFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         return run_verb({point.name: point for point in entry_points(group=GROUP)}, words)
     except DreamfleetError as error:
-        print(f"dreamfleet: {error}", file=sys.stderr)
+        print(f"dreamfleet: {one_line(str(error))}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("dreamfleet: interrupted", file=sys.stderr)

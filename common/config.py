@@ -17,9 +17,11 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files import read_text
 
 T = TypeVar("T")
 Table = Mapping[str, Any]
+MOST_BYTES = 1_000_000  # of a configuration file
 
 
 def option(default: Any, text: str) -> Any:
@@ -97,10 +99,10 @@ def read_toml(path: Path | None, tables: Iterable[str], top: Iterable[str] = ())
     if path is None:
         return {}
     try:
-        table = tomllib.loads(path.read_text())
+        table = tomllib.loads(read_text(path, MOST_BYTES))
     except FileNotFoundError:
         raise UsageError(f"no configuration file at {path}") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # a number of 5,000 digits is no `TOMLDecodeError`
         raise UsageError(f"{path} cannot be read as TOML: {error}") from error
     known, keys = sorted(tables), sorted(top)
     for name, value in table.items():

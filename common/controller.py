@@ -8,21 +8,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.actions import Actions
+from dreamfleet.common.archives import Limits, read_arrays
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.fields import OPTIONAL, written
 from dreamfleet.common.files import write_aside
 
 FORMAT = 1
+_LIMITS = Limits(64 << 20, members=8)  # 16 million parameters: no search goes as far
 _PLAIN: dict[str, Any] = {"options": "", "version": 1}  # of tasks; written only where they differ
 
 
@@ -122,18 +122,29 @@ class Controller:
     def load(cls, path: Path) -> Controller:
         """Read a controller file; `ControllerError` says what is wrong with it."""
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                about = json.loads(str(archive["about"]))
-                parameters = archive["parameters"]
-            if about["format"] != FORMAT:
-                raise ControllerError(f"{path} has controller format {about['format']}; this version reads {FORMAT}")
-            shape = ControllerShape(**about["shape"])
-            details = {name: type(value)(about.get(name, value)) for name, value in _PLAIN.items()}
-            if details["options"] and not isinstance(json.loads(details["options"]), dict):
-                raise ControllerError(f"{path} is not a controller file: its task's options are no JSON object")
-            task, bundle = str(about["task"]), str(about["bundle"])
-            return cls(shape, parameters, task, bundle, dict(about["provenance"]), **details)
+            arrays = read_arrays(path, _LIMITS, ("about", "parameters"))
+            return cls._of(arrays["parameters"], json.loads(str(arrays["about"])))
         except FileNotFoundError:
             raise ControllerError(f"no controller at {path}") from None
-        except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error) as error:
+        except OSError as error:
+            raise ControllerError(f"{path} is not a controller file: {error.strerror}") from error
+        except ControllerError as error:
+            raise ControllerError(f"{path}: {error}") from error
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ControllerError(f"{path} is not a controller file: {error}") from error
+
+    @classmethod
+    def _of(cls, parameters: NDArray[Any], about: dict[str, Any]) -> Controller:
+        """What a file's two arrays tell; whatever they are, each field is of its own type."""
+        if about["format"] != FORMAT:
+            raise ControllerError(f"it is of controller format {about['format']!r:.20}; this version reads {FORMAT}")
+        shape = ControllerShape(**about["shape"])
+        details = {name: about.get(name, value) for name, value in _PLAIN.items()}
+        numbers = (*vars(shape).values(), details["version"])
+        if not all(type(each) is int and 0 <= each < 2**31 for each in numbers):
+            raise ValueError("its shape or version is no number of them")
+        if not all(isinstance(each, str) for each in (about["task"], about["bundle"], details["options"])):
+            raise ValueError("its task, bundle or options are no text")
+        if details["options"] and not isinstance(json.loads(details["options"]), dict):
+            raise ValueError("its task's options are no JSON object")
+        return cls(shape, parameters, about["task"], about["bundle"], dict(about["provenance"]), **details)

@@ -89,6 +89,11 @@ def is_file(path: Path) -> bool:
     return os.path.exists(path) and not os.path.isdir(path)  # noqa: PTH110, PTH112 - `Path` raises for some names
 
 
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder; a name that no folder can have is no error."""
+    return os.path.isdir(path)  # noqa: PTH112 - as above
+
+
 def _check_regular(found: os.stat_result, most: int) -> None:
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, "it is a folder")

@@ -7,6 +7,8 @@ import json
 import sys
 from collections.abc import Collection, Mapping, Sequence
 
+from dreamfleet.common.printable import one_line, printable, printable_lines
+
 WIDEST = 10_000  # columns: where nothing is cut any more
 
 
@@ -17,7 +19,7 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 def answer(args: argparse.Namespace, text: str, **facts: object) -> None:
     """Print `text`, or with `--json` the facts as one line."""
-    print(json.dumps(facts, default=str) if args.json else text, flush=True)  # noqa: T201 - what a verb answers
+    print(json.dumps(facts, default=str) if args.json else printable_lines(text), flush=True)  # noqa: T201 - what a verb answers
 
 
 def print_rows(rows: Sequence[Mapping[str, object]], right: Collection[str] = ()) -> None:
@@ -31,7 +33,7 @@ def print_rows(rows: Sequence[Mapping[str, object]], right: Collection[str] = ()
         _print_table(rows, right)
         return
     for line in (list(rows[0]), *(row.values() for row in rows)):
-        print("\t".join(" ".join(str(value).split()) for value in line))  # noqa: T201
+        print("\t".join(one_line(str(value)) for value in line))  # noqa: T201
 
 
 def _print_table(rows: Sequence[Mapping[str, object]], right: Collection[str]) -> None:
@@ -44,7 +46,7 @@ def _print_table(rows: Sequence[Mapping[str, object]], right: Collection[str]) -
     for name in rows[0]:
         table.add_column(name, justify="right" if name in right else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*(Text(str(value)) for value in row.values()))  # no markup: the words may come from outside
+        table.add_row(*(Text(printable(str(value))) for value in row.values()))  # no markup: they may come from outside
     console = Console()
     needed = Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum
     Console(width=max(console.width, needed)).print(table)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 
 def printable(text: str) -> str:
     """The text with control characters, which a terminal would obey, as what they are written like."""
@@ -12,3 +14,21 @@ def shortened(text: str, longest: int) -> str:
     """The text, printable and cut to `longest` characters, whatever its length and content."""
     text = printable(text[: longest + 1])  # what is cut off need not be looked at
     return text if len(text) <= longest else text[: longest - 3] + "..."
+
+
+def one_line(text: str) -> str:
+    """The text on one line, and printable: what came over the wire cannot begin a line of its own."""
+    return printable(" ".join(text.split()))
+
+
+def printable_lines(text: str) -> str:
+    """Each line printable, of a text whose lines are our own."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
+class PrintableFormatter(logging.Formatter):
+    """Log lines in which no text of others is obeyed by a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The lines of one record."""
+        return printable_lines(super().format(record))

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import NoneType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -21,9 +22,11 @@ from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.fields import OPTIONAL, written
+from dreamfleet.common.files import is_file, is_folder, open_regular
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import Between, Count, Packages, TaskSpec
+from dreamfleet.common.printable import one_line
 
 JOURNAL = "journal.sqlite"
 BUNDLE = "bundle.zip"
@@ -68,7 +71,7 @@ class RunSettings:
         """Read what `to_json` wrote; `JournalError` if it is damaged."""
         try:
             return from_plain(cls, json.loads(text))
-        except (ValueError, TypeError, MalformedError) as error:
+        except (ValueError, TypeError, MalformedError, RecursionError) as error:
             raise JournalError(f"the journal's settings are damaged: {error}") from error
 
 
@@ -235,17 +238,19 @@ class RunFolder:
         row = self._one("SELECT vector FROM candidate WHERE generation = ? AND number = ?", generation, number)
         if row is None:
             raise JournalError(f"run {self.name} has no candidate {generation}/{number}")
+        if not isinstance(row[0], bytes) or len(row[0]) % 4:
+            raise self._damaged("a candidate is no vector")
         return np.frombuffer(row[0], dtype="<f4").astype(np.float32)
 
     def fitness(self, generation: int, number: int) -> float | None:
         """What the strategy was told of a candidate; `None` while its generation is open."""
         row = self._one("SELECT fitness FROM candidate WHERE generation = ? AND number = ?", generation, number)
-        return None if row is None else row[0]
+        return None if row is None else self._typed([row], "F")[0][0]
 
     def results(self, generation: int, number: int, kind: str = "score") -> list[StoredResult]:
         """A candidate's accepted results, by episode."""
         query = f"SELECT {_RESULT} FROM result WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"  # noqa: S608
-        return [StoredResult(*row) for row in self._all(query, kind, generation, number)]
+        return [StoredResult(*row) for row in self._typed(self._all(query, kind, generation, number), "siiiififss")]
 
     def result_count(self) -> int:
         """Accepted results of every kind."""
@@ -254,13 +259,16 @@ class RunFolder:
     def history(self) -> list[StoredGeneration]:
         """Every closed generation, oldest first."""
         query = "SELECT number, mean, std, best, worst, sigma, steps, seconds FROM generation WHERE closed IS NOT NULL"
-        return [_generation(*row) for row in self._all(query + " ORDER BY number")]
+        return [_generation(*row) for row in self._typed(self._all(query + " ORDER BY number"), "ifffffif")]
 
     def evaluations(self) -> list[StoredEvaluation]:
         """Every finished evaluation of a mean, oldest first."""
         query = "SELECT generation, episodes, mean, std FROM evaluation WHERE mean IS NOT NULL ORDER BY generation"
+        rows = self._typed(self._all(query), "iiff")
+        if any(episodes < 1 for _, episodes, _, _ in rows):
+            raise self._damaged("an evaluation is of no episodes")
         return [StoredEvaluation(generation, episodes, finite(mean), finite(std))
-                for generation, episodes, mean, std in self._all(query)]  # fmt: skip
+                for generation, episodes, mean, std in rows]  # fmt: skip
 
     def confirmation(self) -> StoredConfirmation | None:
         """The confirmed score of what is reported; `None` where what is reported is not confirmed."""
@@ -273,12 +281,12 @@ class RunFolder:
     def rollouts(self) -> list[Path]:
         """Every collected drive that was accepted, oldest first."""
         query = "SELECT generation, episode FROM result WHERE kind = 'collect' ORDER BY generation, episode"
-        return [rollout_path(self.path, *row) for row in self._all(query)]
+        return [rollout_path(self.path, *row) for row in self._typed(self._all(query), "ii")]
 
     def strategy_state(self) -> bytes | None:
         """The strategy as it was before its latest generation was asked; `None` before the first."""
         row = self._one("SELECT state FROM strategy ORDER BY generation DESC LIMIT 1")
-        return None if row is None else bytes(row[0])
+        return None if row is None else bytes(self._typed([row], "b")[0][0])
 
     def fact(self, key: str) -> str | None:
         """One of the run's facts, such as the limits that it was last served with; `None` if it has no such fact."""
@@ -295,8 +303,19 @@ class RunFolder:
     def _all(self, query: str, *values: Any) -> list[Any]:
         try:
             return self._connection.execute(query, values).fetchall()
-        except sqlite3.DatabaseError as error:
-            raise JournalError(f"the journal of run {self.name} is damaged: {error}") from error
+        except (sqlite3.Error, OverflowError, UnicodeError) as error:
+            raise self._damaged(one_line(str(error))) from error
+
+    def _typed(self, rows: list[Any], kinds: str) -> list[Any]:
+        """The rows, whose values are of these kinds: a damaged page, or another program, leaves others."""
+        types = [_TYPES[each] for each in kinds]
+        for row in rows:
+            if not all(map(isinstance, row, types)):
+                raise self._damaged("a row holds values of another type")
+        return rows
+
+    def _damaged(self, what: str) -> JournalError:
+        return JournalError(f"the journal of run {self.name} is damaged: {what}; restore it from a copy")
 
 
 def _generation(
@@ -307,6 +326,9 @@ def _generation(
     return StoredGeneration(first, *told, saturated(steps), finite(seconds))
 
 
+_TYPES: dict[str, tuple[type, ...]] = {
+    "i": (int,), "f": (int, float), "F": (int, float, NoneType), "s": (str,), "b": (bytes,),
+}  # fmt: skip
 _RESULT = "kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint"
 
 
@@ -323,7 +345,7 @@ def default_runs_dir() -> Path:
 def open_run(runs_dir: Path, name: str) -> RunFolder:
     """A run by name; `JournalError` names those that exist."""
     path = runs_dir / check_run_name(name)
-    if not (path / JOURNAL).exists():
+    if not is_file(path / JOURNAL):
         names = ", ".join(each.name for each in run_paths(runs_dir)) or "none yet"
         raise JournalError(f"no run {name!r} in {runs_dir}; there are: {names}")
     return RunFolder(path)
@@ -331,6 +353,8 @@ def open_run(runs_dir: Path, name: str) -> RunFolder:
 
 def run_paths(runs_dir: Path) -> Iterator[Path]:
     """The folders of all runs, by name."""
+    if not is_folder(runs_dir):
+        return
     for journal in sorted(runs_dir.glob(f"*/{JOURNAL}")):
         yield journal.parent
 
@@ -339,10 +363,18 @@ def _connect_read_only(path: Path) -> sqlite3.Connection:
     # A finished journal on a read-only disk has no shared-memory file to map; nobody writes it either.
     immutable = "" if os.access(path.parent, os.W_OK) else "&immutable=1"
     try:
-        connection = sqlite3.connect(f"file:{path.absolute()}?mode=ro{immutable}", uri=True)
-        schema.check(connection, path)
-    except sqlite3.Error as error:
+        with open_regular(path):  # SQLite would wait for what a pipe says
+            connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{immutable}", uri=True)
+    except (sqlite3.Error, OSError) as error:
         raise JournalError(f"{path} cannot be read: {error}") from error
+    try:
+        schema.check(connection, path)
+    except (sqlite3.Error, UnicodeError) as error:
+        connection.close()
+        raise JournalError(f"{path} cannot be read: {one_line(str(error))}; restore it from a copy") from error
+    except JournalError:
+        connection.close()
+        raise
     return connection
 
 

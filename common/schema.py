@@ -39,10 +39,20 @@ MIGRATIONS = (
 VERSION = len(MIGRATIONS)
 
 
+# What would run as a table is read: somebody's own query, which need not end.
+_FOREIGN = (
+    "SELECT count(*) FROM sqlite_master WHERE type NOT IN ('table', 'index') "
+    "OR sql LIKE 'CREATE VIRTUAL%' OR sql LIKE '%GENERATED%'"
+)
+
+
 def check(connection: sqlite3.Connection, path: object) -> int:
     """The schema version of an open journal; `JournalError` if it is foreign or newer than this program."""
     (mark,) = connection.execute("PRAGMA application_id").fetchone()
     (version,) = connection.execute("PRAGMA user_version").fetchone()
+    (foreign,) = connection.execute(_FOREIGN).fetchone()
+    if foreign:
+        raise JournalError(f"{path} holds views, triggers or virtual tables, which no journal of dreamfleet has")
     if mark != APPLICATION_ID:
         raise JournalError(f"{path} is not a journal of dreamfleet; nothing was changed")
     if version > VERSION:

@@ -7,19 +7,20 @@ from pathlib import Path
 from dreamfleet.common.bundle import pretrained
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError
+from dreamfleet.common.files import is_file
 from dreamfleet.common.runs import BUNDLE, CONTROLLER, JOURNAL
 
 
 def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]:
     """The controller, and the bundle that lies beside it if one does."""
     path, run, shipped = Path(name), runs_dir / name, pretrained() / f"{name}.npz"
-    if path.is_file():
+    if is_file(path):
         return Controller.load(path), path.parent / BUNDLE
-    if (run / CONTROLLER).is_file():
+    if is_file(run / CONTROLLER):
         return Controller.load(run / CONTROLLER), run / BUNDLE
-    if shipped.is_file():
+    if is_file(shipped):
         return Controller.load(shipped), None
-    if (run / JOURNAL).is_file():
+    if is_file(run / JOURNAL):
         raise ControllerError(
             f"run {name} has no controller yet: it is written as the first generation is closed; an older run's is "
             f"written once it is continued: dreamfleet coordinator --resume {name}"

@@ -43,7 +43,8 @@ LEFT = ("worker", "state", "picture")
 
 def run_panel(status: Status) -> RenderableType:
     """The whole picture: state, generation, fitness, fleet."""
-    title = f"[bold]{status.run}[/] · [{STATE_STYLES.get(status.state, '')}]{status.state}[/]"
+    state = printable(status.state), STATE_STYLES.get(status.state, "")
+    title = Text.assemble((printable(status.run), "bold"), " · ", state)
     parts: list[RenderableType] = [_facts(status)]
     if status.why:
         parts.append(Text(printable(status.why), style="bold red" if status.state == "paused" else ""))
@@ -67,11 +68,11 @@ def _facts(status: Status) -> Table:
     warm = "" if temperature is None else f", temperature {temperature:g}"
 
     def row(*cells: str) -> None:
-        grid.add_row(*map(Text, cells))  # texts of others are no markup
+        grid.add_row(*(Text(printable(each)) for each in cells))  # texts of others are no markup
 
     row(
         "task",
-        f"{printable(task.task)}, {task.horizon} steps{warm}",
+        f"{task.task}, {task.horizon} steps{warm}",
         "population",
         f"{settings.population} x {settings.episodes}",
     )
@@ -112,7 +113,7 @@ def _reported(status: Status) -> str:
 
 
 def _failure(failure: FailureStatus) -> str:
-    worker, error = next(iter(failure.errors.items()))
+    worker, error = next(iter(failure.errors.items()), ("a worker", "no reason was given"))
     return f"candidate {failure.candidate} failed on {worker}: {error}; another worker will try"
 
 
@@ -134,8 +135,8 @@ def _progress(status: Status) -> Table:
 def _sparkline(history: Sequence[StoredGeneration]) -> Text:
     means = [each.mean for each in history][-SPARK_WIDTH:]
     low, high = min(means), max(means)
-    scale = (len(SPARKS) - 1) / (high - low) if high > low else 0.0
-    bars = "".join(SPARKS[round((mean - low) * scale)] for mean in means)
+    span = high / 2 - low / 2  # halves, so that no difference overflows
+    bars = "".join(SPARKS[round((mean / 2 - low / 2) / span * (len(SPARKS) - 1)) if span > 0 else 0] for mean in means)
     return Text.assemble(f"{low:.0f} ", (bars, "green"), f" {high:.0f}")
 
 
@@ -156,7 +157,7 @@ class WorkerTable:
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
         """As many columns as fit, in their order."""
-        cells = {name: [tell(each) for each in self._workers] for name, tell in COLUMNS.items()}
+        cells = {name: [printable(tell(each)) for each in self._workers] for name, tell in COLUMNS.items()}
         widths = {name: max(map(cell_len, (name, *column))) + 2 * PAD for name, column in cells.items()}
         kept = list(COLUMNS)
         for name in LEAST_FIRST:
@@ -167,7 +168,7 @@ class WorkerTable:
             justify = "left" if name in LEFT else "right"
             table.add_column(name, justify=justify, overflow="fold")  # type: ignore[arg-type]
         for row, each in enumerate(self._workers):
-            table.add_row(*(cells[name][row] for name in kept), style="" if each.state == "present" else "red")
+            table.add_row(*(Text(cells[name][row]) for name in kept), style="" if each.state == "present" else "red")
         if self._known > len(self._workers):
             table.add_row(f"and {self._known - len(self._workers)} more")
         yield table

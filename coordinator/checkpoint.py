@@ -9,11 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.archives import Limits, read_arrays
 from dreamfleet.common.errors import JournalError
 from dreamfleet.coordinator.optimisers.api import State
 from dreamfleet.coordinator.optimisers.scalars import untag
 
 PREFIX = "optimiser."
+_LIMITS = Limits(1 << 30, members=4096)  # bytes: more than SQLite keeps in one place
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,13 @@ class Checkpoint:
     @classmethod
     def unpack(cls, data: bytes) -> Checkpoint:
         """Read what `packed` wrote, also of version 0.1; never pickle."""
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            arrays = dict(archive)
+        try:
+            return cls._of(read_arrays(data, _LIMITS))
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise JournalError(f"the journal's last state is damaged ({error}): restore it from a copy") from error
+
+    @classmethod
+    def _of(cls, arrays: State) -> Checkpoint:
         head = {name: arrays.pop(name) for name in [*arrays] if name.startswith(PREFIX)}
         if not head:
             return cls(_first_head(arrays), arrays)

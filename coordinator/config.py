@@ -167,7 +167,7 @@ class RunConfig:
             try:
                 frozen = json.loads(self.task_options or "{}")
                 return {"environment": dict(frozen.get("environment", {}))}
-            except (ValueError, AttributeError, TypeError) as error:
+            except (ValueError, AttributeError, TypeError, RecursionError) as error:
                 raise UsageError(f"--task-options must be a JSON object, not {self.task_options!r}") from error
         arguments = list(map(_argument, self.environment))
         if len(dict(arguments)) < len(arguments):
@@ -178,14 +178,14 @@ class RunConfig:
 
 def _check_normal(options: str, observations: int) -> None:
     """`UsageError` if a normalisation that was given by hand cannot be one of so many observations."""
-    normal = json.loads(options or "{}").get("normal")
-    if normal is None:
-        return
     try:
+        normal = json.loads(options or "{}").get("normal")
+        if normal is None:
+            return
         mean, deviation = normal["mean"], normal["deviation"]
         whole = len(mean) == len(deviation) == observations and all(map(math.isfinite, (*mean, *deviation)))
         fits = whole and min(deviation) > 0
-    except (TypeError, KeyError, ValueError):
+    except (TypeError, KeyError, ValueError, AttributeError, OverflowError, RecursionError):
         fits = False
     if not fits:
         raise UsageError(f"--task-options: normal must have a mean and a positive deviation of {observations} numbers")
@@ -199,7 +199,7 @@ def _argument(text: str) -> tuple[str, Any]:
         return name, PYTHONS[value]
     try:
         return name, json.loads(value)
-    except ValueError:
+    except (ValueError, RecursionError):
         return name, value
 
 

@@ -242,7 +242,10 @@ class Journal:
         if row is None:
             return None
         vectors = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number).fetchall()
-        return OpenGeneration(number, row[0], tuple(json.loads(row[1])), tuple(vector for (vector,) in vectors))
+        try:
+            return OpenGeneration(number, row[0], tuple(json.loads(row[1])), tuple(vector for (vector,) in vectors))
+        except (ValueError, TypeError) as error:
+            raise JournalError(f"{self.path} is damaged: {error}; restore it from a copy") from error
 
     def closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
         """Every closed generation and finished evaluation, oldest first."""
@@ -297,10 +300,22 @@ class Journal:
             for statement, rows in writes:
                 self._connection.executemany(statement, rows)
 
-    def _read(self, query: str, *values: Any) -> sqlite3.Cursor:
+    def _read(self, query: str, *values: Any) -> _Rows:
         self._flush()
         with _translated(self.path):
-            return self._connection.execute(query, values)
+            return _Rows(self._connection.execute(query, values).fetchall())
+
+
+class _Rows(list[Any]):
+    """What was read, to its end: a damaged page shows while it is read, and not in whoever goes through the rows."""
+
+    def fetchone(self) -> Any:
+        """The first row, if there is one."""
+        return self[0] if self else None
+
+    def fetchall(self) -> list[Any]:
+        """All of them."""
+        return self
 
 
 def beside(path: Path) -> tuple[Path, ...]:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
-from dreamfleet.common.runs import RunFolder, RunSettings, open_run
+from dreamfleet.common.files import is_file, is_there
+from dreamfleet.common.runs import JOURNAL, RunFolder, RunSettings, open_run
 from dreamfleet.common.shelf import find_controller
 from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.config import RunConfig
@@ -65,7 +66,7 @@ def _told(bundle: str) -> str:
 
 def find_start(name: str, runs_dir: Path) -> Start:
     """A controller's file, a run (its reported controller, or its mean while it is open), or what ships."""
-    if not Path(name).is_file() and (runs_dir / name).is_dir():
+    if not is_file(Path(name)) and is_there(runs_dir / name / JOURNAL):
         with open_run(runs_dir, name) as stored:
             if stored.ended is None:  # what it reports so far is an older mean than the one that it stands at
                 return start_of(stored)

@@ -53,3 +53,13 @@ def test_an_answer_is_a_sentence_or_json(capsys, tmp_path):
     first, second = capsys.readouterr().out.splitlines()
     assert first == "archived"
     assert json.loads(second) == {"archived": str(tmp_path)}
+
+
+def test_no_word_of_others_is_an_order_to_a_terminal():
+    rows = [{"run": "night\x1b[2J", "state": "ended: \x1b]0;owned\x07\u202e"}]
+    show = f"from dreamfleet.common.listing import print_rows; print_rows({rows!r})"
+    told = in_terminal(show, 80)
+    piped = subprocess.run([sys.executable, "-c", show], check=True, capture_output=True, text=True).stdout
+    for text in (told, piped):
+        assert "night\\x1b[2J" in text
+        assert "owned\\x07\\u202e" in text

@@ -12,6 +12,7 @@ from dreamfleet.common import keys
 from dreamfleet.common.codec import decode_json, encode
 from dreamfleet.common.messages import MAX_MESSAGE, ControlReply, HelloReply
 from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.status import PARTS
 from tests.support import tasks
 from tests.support.mutations import mutations
 from tests.support.samples import JSON, MSGPACK
@@ -128,3 +129,19 @@ def test_no_hello_and_no_control_verb_is_too_long_to_be_answered(processes, rand
         assert not reply.accepted
         assert "no control verb" in reply.why
     assert coordinator.finish()[0] == 0
+
+
+STRANGE = ["9" * 5000, "9" * 18, "-1", "-" + "9" * 5000, "1.5", "", "1e3", "²", "%00", "[bold]", "NaN"]
+
+
+def test_every_query_is_answered_whatever_it_asks_for(processes, random_bundle):
+    processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY)
+    with open_session(Network(connect=(processes.endpoint,))) as session:
+        for text in STRANGE:
+            asked = f"?offset={text};limit={text};length={text};generation={text}"
+            for part in PARTS:
+                (reply,) = session.get(keys.status("test", part) + asked, timeout=5)
+                assert b'"run": "test"' in reply.ok.payload.to_bytes(), (part, text[:20])
+            (reply,) = session.get(keys.bundle("test", random_bundle.sha256) + asked, timeout=5)
+            assert reply.ok is not None or b"whole numbers" in reply.err.payload.to_bytes(), text[:20]
+    assert processes.status()["state"] == "waiting for workers"

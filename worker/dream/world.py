@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from typing import NamedTuple
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.bundle import DREAM, INITIAL, Bundle
 from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.tensors import read_array
 from dreamfleet.worker.dream.noise import Draw
 from dreamfleet.worker.tasks.api import Assignment, DreamReward, World
 from dreamfleet.worker.tasks.registry import find_task
@@ -91,5 +91,4 @@ def check_temperature(temperature: float) -> None:
 
 def read_initial(bundle: Bundle) -> Floats:
     """First latents of recorded rollouts `(N, 2, latent)`, mu and logvar; an opened bundle has at least one."""
-    initial: Floats = np.load(io.BytesIO(bundle.read(INITIAL)), allow_pickle=False).astype(np.float32)
-    return initial
+    return read_array(bundle.read(INITIAL))

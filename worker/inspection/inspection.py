@@ -10,6 +10,7 @@ from pathlib import Path
 from dreamfleet.common.bundle import Bundle, find_bundle, shipped_bundles
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, DatasetError, JournalError
+from dreamfleet.common.files import is_file
 from dreamfleet.common.runs import RunFolder, open_run
 from dreamfleet.worker.dream.daydream import can_dream
 from dreamfleet.worker.inspection import curves, memory, vision
@@ -34,7 +35,7 @@ class Subject:
 @contextmanager
 def find_subject(name: str, runs_dir: Path) -> Iterator[Subject]:
     """A bundle by file or shipped name, else a run by name."""
-    if Path(name).is_file() or name in shipped_bundles():
+    if is_file(Path(name)) or name in shipped_bundles():
         yield Subject(find_bundle(name))
         return
     try:

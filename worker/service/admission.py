@@ -15,6 +15,7 @@ from dreamfleet.common.codec import Inbox, MalformedError, encode_json, from_pla
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, fingerprint, package_version
 from dreamfleet.common.messages import HelloReply, HelloRequest, Intervals, TaskSpec
+from dreamfleet.common.printable import one_line
 from dreamfleet.worker.service.announced import check_announced
 
 HELLO_TIMEOUT = 2.0
@@ -87,7 +88,7 @@ def make_request(worker: str, tasks: tuple[str, ...], slots: int) -> HelloReques
 
 def _admission(reply: HelloReply) -> Admission:
     if not reply.accepted:
-        raise RefusedError(f"run {reply.run} refused this worker: {reply.why}; {reply.remedy}")
+        raise RefusedError(one_line(f"run {reply.run} refused this worker: {reply.why}; {reply.remedy}"))
     try:
         spec, intervals = from_plain(TaskSpec, reply.spec), from_plain(Intervals, reply.intervals)
     except MalformedError as error:

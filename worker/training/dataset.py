@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.archives import Arrays, DamagedError, Limits, open_archive, read_arrays
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.files import open_regular
 from dreamfleet.worker.training.world import find_world, preprocessing_to
 
 POOL_EPISODES = 48  # whose frames are shuffled together
 POOL_FRAMES = 16_000  # of them at most, or one episode: 200 MB of 64x64, 440 MB of 96x96
 VALIDATION_EVERY = 20  # every 20th episode is held out, whole
-
-Arrays = dict[str, NDArray[Any]]
+LIMITS = Limits(512 << 20)  # bytes of an episode: 19,000 pictures of 96x96
 
 
 def episodes(folder: Path, kind: str = "episodes") -> list[Path]:
@@ -39,22 +37,23 @@ def split(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 def load(path: Path, *names: str) -> Arrays:
     """The named arrays of one episode; `DatasetError` if the file is damaged or lacks one."""
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in names}
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error, RuntimeError) as error:
-        raise DatasetError(f"{path} is damaged ({error}); delete it and run the verb that wrote it again") from error
+        return read_arrays(path, LIMITS, names)
+    except (OSError, DamagedError) as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> DatasetError:
+    return DatasetError(f"{path} is damaged ({error}); delete it and run the verb that wrote it again")
 
 
 def check_whole(paths: Sequence[Path], *names: str) -> None:
     """`DatasetError` names the first episode that is damaged or lacks an array; reads the archives' directories."""
     for path in paths:
         try:
-            with ZipFile(path) as archive:
-                missing = {f"{name}.npy" for name in names} - set(archive.namelist())
-        except (OSError, BadZipFile) as error:
-            raise DatasetError(
-                f"{path} is damaged ({error}); delete it and run the verb that wrote it again"
-            ) from error
+            with open_regular(path, LIMITS.size) as file, open_archive(file, LIMITS) as archive:
+                missing = {f"{name}.npy" for name in names} - archive.names
+        except (OSError, DamagedError) as error:
+            raise _damaged(path, error) from error
         if missing:
             raise DatasetError(
                 f"{path} lacks {', '.join(sorted(missing))}; delete it and run the verb that wrote it again"
@@ -82,9 +81,26 @@ def load_pictures(path: Path) -> NDArray[np.uint8]:
     arrays = load(path, "picture", "preprocessing")
     pictures: NDArray[np.uint8] = arrays["picture"]
     known = find_world().preprocessings.get(str(arrays["preprocessing"]))
-    if known is None or pictures.shape[1:] != known.shape or not len(pictures):
+    fits = known is not None and pictures.ndim == 4 and pictures.shape[1:] == known.shape
+    if not fits or not len(pictures) or pictures.dtype != np.uint8:
         raise DatasetError(f"{path} holds pictures of another preprocessing or shape; collect into an empty folder")
     return pictures
+
+
+def load_steps(path: Path, *latents: str) -> Arrays:
+    """`action` (T, actions), `reward` (T,), `ended` and these `latents` (T, n) of an episode; all floats are float32.
+
+    `DatasetError` if they are not of one drive: other types, other lengths, or none.
+    """
+    arrays = load(path, "action", "reward", "ended", *latents)
+    ended, steps = arrays["ended"], len(arrays["reward"]) if arrays["reward"].ndim else 0
+    ranks = {"reward": 1, "action": 2, **dict.fromkeys(latents, 2)}
+    fits = all(arrays[name].ndim == rank and len(arrays[name]) == steps for name, rank in ranks.items())
+    if not (steps and fits and ended.shape == () and ended.dtype.kind in "bu"):
+        raise _damaged(path, DatasetError("its arrays are not of one drive"))
+    if not all(arrays[name].dtype.kind == "f" for name in ranks):
+        raise _damaged(path, DatasetError("its actions, rewards or latents are no floats"))
+    return {**arrays, **{name: arrays[name].astype(np.float32, copy=False) for name in ranks}}
 
 
 def picture_batches(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files import write_aside
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
-from dreamfleet.worker.training.dataset import check_pictures, check_whole, episodes, load, load_pictures
+from dreamfleet.worker.training.dataset import check_pictures, check_whole, episodes, load, load_pictures, load_steps
 from dreamfleet.worker.training.train_vae import CHECKPOINT
 from dreamfleet.worker.worldmodel.export import export_encoder
 from dreamfleet.worker.worldmodel.inference import open_graph
@@ -43,7 +43,9 @@ def encode(folder: Path) -> Iterator[int]:
         if target.exists() and _is_of(target, vae):
             continue
         pictures = load_pictures(path)
-        drive = load(path, "action", "reward", "ended")
+        drive = load_steps(path)
+        if len(drive["action"]) != len(pictures):
+            raise DatasetError(f"{path} holds {len(pictures)} pictures and another number of actions; delete it")
         mu, logvar = look(pictures)
         mirrored_mu, mirrored_logvar = look(np.ascontiguousarray(pictures[:, :, ::-1]))
         with write_aside(target) as file:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from dreamfleet.worker.training.dataset import load, pad
+from dreamfleet.worker.training.dataset import load_steps, pad
 from dreamfleet.worker.worldmodel.mdnrnn import reward_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
@@ -47,7 +47,7 @@ def load_rollouts(paths: Sequence[Path], mirrored: NDArray[np.bool_] | None = No
     columns: dict[str, list[NDArray[np.float32]]] = {each.name: [] for each in fields(Rollouts)}
     for path, flip in zip(paths, np.zeros(len(paths), np.bool_) if mirrored is None else mirrored, strict=True):
         prefix = "mirrored_" if flip else ""
-        arrays = load(path, f"{prefix}mu", f"{prefix}logvar", "action", "reward", "ended")
+        arrays = load_steps(path, f"{prefix}mu", f"{prefix}logvar")
         columns["mu"].append(arrays[f"{prefix}mu"])
         columns["logvar"].append(arrays[f"{prefix}logvar"])
         columns["action"].append(arrays["action"] * (FLIP if flip else FLIP**2))

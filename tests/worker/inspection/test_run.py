@@ -1,5 +1,7 @@
 """A run's page: its own world model under its own controller."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,7 @@ def runs_dir(tmp_path, random_bundle):
     path = tmp_path / "runs" / "night"
     path.mkdir(parents=True)
     shape = random_bundle.controller_shape
-    settings = RunSettings(SPEC, shape, 2, 1, 0.1, "diagonal", 1, 1, 2)
+    settings = RunSettings(replace(SPEC, bundle=random_bundle.sha256), shape, 2, 1, 0.1, "diagonal", 1, 1, 2)
     journal = Journal.create(path, settings, random_bundle.path)
     vectors = [travelling(np.full(shape.size, value)) for value in (0.5, 1.5)]
     for number in range(3):

@@ -1,0 +1,124 @@
+"""Journals that people pass around, damaged: what can be read is told, what cannot is one line."""
+
+import os
+import random
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.runs import RunFolder, open_run
+from dreamfleet.common.schema import APPLICATION_ID, VERSION
+from tests.support.mutations import Watched, mutate
+
+RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
+VALUES = [None, "x", b"x", -1, 2**62, 1e308, "1e5", "[" * 3000, "9" * 5000, "\ud7ff"]
+
+
+@pytest.fixture
+def watched():
+    made = Watched()
+    yield made
+    made.check()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return shutil.copytree(RUNS / "dream", tmp_path / "night")
+
+
+def look(folder):
+    """Everything that a journal tells."""
+    with RunFolder(folder) as run:
+        assert run.settings.population > 1
+        run.history(), run.evaluations(), run.rollouts(), run.strategy_state(), run.result_count()
+        run.uid, run.created, run.ended, run.fingerprint  # noqa: B018
+        run.candidate(0, 0), run.fitness(0, 0), run.results(0, 0)
+
+
+def test_damaged_pages(folder, watched):
+    path = folder / "journal.sqlite"
+    whole, source, read = path.read_bytes(), random.Random(5), 0
+    for _ in range(1000):
+        path.write_bytes(mutate(source, whole, [whole]))
+        read += watched.read(JournalError, look, folder)
+    assert 0 < read < 1000
+
+
+def loose(path):
+    """The same rows in tables that take anything, as another program might have written them."""
+    with sqlite3.connect(path) as old:
+        names = [name for (name,) in old.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        tables = {name: [each[1] for each in old.execute(f"PRAGMA table_info({name})")] for name in names}
+        rows = {name: old.execute(f"SELECT * FROM {name}").fetchall() for name in names}
+    old.close()
+    path.unlink()
+    new = sqlite3.connect(path)
+    for name, columns in tables.items():
+        new.execute(f"CREATE TABLE {name} ({', '.join(columns)})")
+        new.executemany(f"INSERT INTO {name} VALUES ({', '.join('?' * len(columns))})", rows[name])
+    new.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    new.execute(f"PRAGMA user_version = {VERSION}")
+    new.commit()
+    new.close()
+    return tables
+
+
+def test_values_of_other_types(folder, watched):
+    path = folder / "journal.sqlite"
+    tables = loose(path)
+    look(folder)
+    whole = path.read_bytes()
+    for table, columns in tables.items():
+        for column in columns:
+            for value in VALUES:
+                path.write_bytes(whole)
+                connection = sqlite3.connect(path)
+                connection.execute(f"UPDATE {table} SET {column} = ?", (value,))
+                connection.commit()
+                connection.close()
+                watched.read(JournalError, look, folder)
+
+
+@pytest.mark.parametrize("table", ["run", "generation", "candidate", "evaluation", "result", "strategy"])
+def test_missing_tables(folder, watched, table):
+    connection = sqlite3.connect(folder / "journal.sqlite")
+    connection.execute(f"DROP TABLE {table}")
+    connection.commit()
+    connection.close()
+    assert not watched.read(JournalError, look, folder)
+
+
+@pytest.mark.timeout(30)
+def test_a_query_that_never_ends_is_not_run(folder):
+    connection = sqlite3.connect(folder / "journal.sqlite")
+    connection.executescript(
+        "DROP TABLE run; CREATE VIEW run AS WITH RECURSIVE n(key, value) AS "
+        "(SELECT 1, 1 UNION ALL SELECT key + 1, 2 FROM n) SELECT * FROM n;"
+    )
+    connection.close()
+    with pytest.raises(JournalError, match="holds views"):
+        look(folder)
+
+
+@pytest.mark.timeout(30)
+def test_a_journal_that_is_no_file_is_one_line(tmp_path, watched):
+    folder = tmp_path / "night"
+    folder.mkdir()
+    journal = folder / "journal.sqlite"
+    os.mkfifo(journal)
+    assert not watched.read(JournalError, open_run, tmp_path, "night")
+    journal.unlink()
+    journal.mkdir()
+    assert not watched.read(JournalError, open_run, tmp_path, "night")
+    journal.rmdir()
+    journal.symlink_to("/dev/zero")
+    assert not watched.read(JournalError, open_run, tmp_path, "night")
+    assert not watched.read(JournalError, open_run, tmp_path / ("x" * 5000), "night")
+
+
+def test_a_folder_whose_name_is_part_of_an_address_is_read(folder):
+    strange = folder.rename(folder.with_name("50%20 #1 ?mode=rwc"))
+    look(strange)
