@@ -11,6 +11,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.config import Table, add_flags, given, load
+from dreamfleet.common.descriptors import raise_limit
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.site import offer
@@ -100,6 +101,7 @@ def _serve(args: argparse.Namespace, request: RunRequest, before: int | None = N
     from dreamfleet.coordinator.main import serve_run
 
     unblock_stderr()
+    raise_limit()
     run = serve_run(request, _stop_on_signals)
     _end_on_signals()  # its last word may wait for a reader of stdout
     _report(args, run, request, nothing_new=len(run.history) == before)

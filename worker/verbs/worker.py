@@ -6,6 +6,7 @@ import argparse
 import signal
 
 from dreamfleet.common.config import add_flags, load
+from dreamfleet.common.descriptors import raise_limit
 from dreamfleet.common.network import Network
 from dreamfleet.common.site import offer
 from dreamfleet.common.unblocked import unblock_stderr
@@ -27,6 +28,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.worker.service.worker import Worker
 
     unblock_stderr()
+    raise_limit()
     config = load(WorkerConfig, "worker", **args.sources)
     worker = Worker(config, Network(connect=args.connect), tuple(args.task))
     for number in (signal.SIGINT, signal.SIGTERM):
