@@ -13,13 +13,16 @@ from typing import Any
 
 import zenoh
 
-from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.descriptors import room_for_connections
+from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
 from dreamfleet.common.network import Network, check_endpoint
 
 LEASE_MS = 4000  # announced by each side: after so long without a sign the other side drops its token
+MOST_SESSIONS = 10_000
 MAX_RECEIVED = (
     128 * 1024
 )  # bytes of a message: above it Zenoh itself lets go; the largest of the protocol is MAX_MESSAGE
+_NO_ROOM = "no network session can be opened: {}; give this host more room (ulimit -n, ulimit -u)"
 __all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_session"]  # an endpoint is of both
 
 
@@ -33,13 +36,21 @@ def open_session(network: Network, *, timeout: float = 3.0) -> zenoh.Session:
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
     except zenoh.ZError as error:
+        if "os error 24" in str(error):
+            raise DreamfleetError(_NO_ROOM.format(_first_line(error))) from error
         raise ConnectionFailedError(_explain(network, error)) from error
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":  # Zenoh's own threads or descriptors, of which there are none left
+            raise
+        raise DreamfleetError(_NO_ROOM.format(_first_line(error))) from error
 
 
 def _settings(network: Network, timeout_ms: int) -> dict[str, Any]:
     router = bool(network.listen)
+    room = room_for_connections()  # else strangers who connect could keep a coordinator from writing a file
+    bounds = {"max_sessions": min(MOST_SESSIONS, room * 3 // 4), "accept_pending": min(MOST_SESSIONS, room // 4)}
     transport = {
-        "unicast": {"max_sessions": 10_000, "accept_pending": 10_000} if router else {},
+        "unicast": bounds if router else {},
         "shared_memory": {"enabled": False},
         "link": {
             "rx": {"max_message_size": MAX_RECEIVED},
@@ -77,7 +88,7 @@ def _explain(network: Network, error: zenoh.ZError) -> str:
     )
 
 
-def _first_line(error: Exception) -> str:
+def _first_line(error: BaseException) -> str:
     return str(error).splitlines()[0][:200]
 
 

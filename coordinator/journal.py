@@ -200,9 +200,9 @@ class Journal:
         """
         within = "abs(fitness) <= ? AND steps BETWEEN 0 AND CASE kind WHEN 'evaluate' THEN ? ELSE ? END"
         still = "kind != 'score' OR generation IN (SELECT number FROM generation WHERE closed IS NULL)"
-        query = f"DELETE FROM result WHERE NOT ({within}) AND ({still})"  # noqa: S608
+        query = f"DELETE FROM result WHERE NOT ({within}) AND ({still}) RETURNING digest"  # noqa: S608
         bounds = LARGEST_FITNESS, most_steps(LONGEST_EPISODE), most_steps(horizon)
-        dropped = self._read(query, *bounds).rowcount
+        dropped = len(self._read(query, *bounds))
         self.commit()
         return dropped
 

@@ -11,9 +11,11 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.config import Table, add_flags, given, load
+from dreamfleet.common.descriptors import raise_limit
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.site import offer
+from dreamfleet.common.unblocked import unblock_stderr
 from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig, RunConfig, find_preset
 
 if TYPE_CHECKING:
@@ -98,7 +100,10 @@ def _request(
 def _serve(args: argparse.Namespace, request: RunRequest, before: int | None = None) -> int:
     from dreamfleet.coordinator.main import serve_run
 
+    unblock_stderr()
+    raise_limit()
     run = serve_run(request, _stop_on_signals)
+    _end_on_signals()  # its last word may wait for a reader of stdout
     _report(args, run, request, nothing_new=len(run.history) == before)
     return 0 if run.ended is not None else LEFT_OPEN
 
@@ -132,6 +137,11 @@ def _tell_frozen(args: argparse.Namespace, stored: RunFolder) -> None:
 def _stop_on_signals(stop: Callable[[], None]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop())
+
+
+def _end_on_signals() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def _report(args: argparse.Namespace, run: Run, request: RunRequest, *, nothing_new: bool) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -12,11 +13,11 @@ from gymnasium import spaces
 from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 
 MODULE = "tests.support.tasks"
-TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, EXPLODING, ENDLESS = (
+TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, EXPLODING, ENDLESS, CHATTY = (
     f"{MODULE}:{name}"
     for name in (
         "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Optimistic",
-        "Exploding", "Endless",
+        "Exploding", "Endless", "Chatty",
     )
 )  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC
@@ -134,6 +135,22 @@ class SilentPolicy(ToyPolicy):
     def act(self, observation):
         os.closerange(3, 1024)
         time.sleep(3600)
+
+
+class Chatty(Toy):
+    """Prints more than a pipe holds, on both streams."""
+
+    name = CHATTY
+
+    def make_policy(self, assignment):
+        return ChattyPolicy()
+
+
+class ChattyPolicy(ToyPolicy):
+    def act(self, observation):
+        for stream in (sys.stdout, sys.stderr):
+            print("look, " * 10_000, file=stream, flush=True)
+        return super().act(observation)
 
 
 class Judged(Toy):

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.children import die_with
+from dreamfleet.common.unblocked import unblock_stderr, unblock_stdout
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -42,6 +43,8 @@ def serve_jobs(
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     with suppress(OSError, AttributeError, ValueError, RuntimeError):  # no stderr: no traceback of a crash
         faulthandler.enable()
+    unblock_stderr()  # whose reader is the worker's, and may be gone to sleep
+    unblock_stdout()
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     scorer = _make_scorer(pipe, spec, bundle, announced)
     pipe.send(Ready(scorer.drawn_by))

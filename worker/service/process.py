@@ -46,7 +46,12 @@ class ChildProcess:
             self._process.start()
         theirs.close()
         self._reader = threading.Thread(target=self._read, args=(hear,), daemon=True)
-        self._reader.start()
+        try:
+            self._reader.start()
+        except RuntimeError:  # no thread can be had: nobody would hear it
+            self._process.kill()
+            self._process.join()
+            raise
 
     @property
     def pid(self) -> int:

@@ -19,6 +19,9 @@ from dreamfleet.worker.service.turn import Done, Failure, Turn, Work
 
 log = logging.getLogger(__name__)
 FAILED_STARTS = 3
+RESPITE = 2.0  # seconds until a host that had no room for a child is asked again
+REMEDY = "give it fewer --slots, or this host more room (ulimit -n, ulimit -u, memory, the disk of temporary files)"
+LONGEST_PAUSE = 30.0  # seconds before another child, where one after another ends without having done anything
 START_LIMIT = 120.0  # seconds that a child may take to load task and world model; doubled with each that took longer
 SHORT = 0.25  # seconds: after turns below it the next one already waits in the child
 SMALL = 64 * 1024  # bytes of vectors that a pipe takes while its child is busy
@@ -71,6 +74,11 @@ class Slot:
         self._progress = (0, 0.0)  # steps, and when they were last seen to grow; while it starts, when that began
         self._life = 0
         self._failed_starts = 0
+        self._fruitless = 0  # children in a row that ended without a finished turn
+        self._start_at = 0.0
+        self._child: ChildProcess | None = None  # `None` while it must wait for the next one
+        self._ended_for, self._last_word = "", ""
+        self._sent = 0  # turns given to this child
         self._start()
 
     @property
@@ -96,15 +104,16 @@ class Slot:
     @property
     def steps(self) -> int:
         """Environment steps of the running turn so far, over all of its jobs."""
-        return self._child.steps if self._turns else 0
+        return self._child.steps if self._turns and self._child else 0
 
     @property
     def pid(self) -> int:
         """The child's process id."""
-        return self._child.pid
+        return self._child.pid if self._child else 0
 
     def submit(self, work: Sequence[Work]) -> None:
         """Give the child a turn."""
+        assert self._child is not None  # it is idle, or takes more
         self._sent += 1
         turn = Turn(self._sent, work)
         self._turns.append(turn)
@@ -113,7 +122,14 @@ class Slot:
         self._child.send(turn.number, turn.work)
 
     def check(self, now: float, gap: float) -> None:
-        """Kill a child that hangs in a turn or as it starts; `gap` is how long this host itself stood still."""
+        """Kill a child that hangs in a turn or as it starts; `gap` is how long this host itself stood still.
+
+        Where there is none, start one when its time has come.
+        """
+        if self._child is None:
+            if now >= self._start_at:
+                self._start()
+            return
         steps, since = self._progress
         since += gap
         if not self.ready:
@@ -131,7 +147,7 @@ class Slot:
         for turn in self._turns:
             digests = {job.digest for job in turn.jobs}
             turn.unwanted |= {digest} & digests
-            if turn.unwanted == digests:
+            if turn.unwanted == digests and self._child:
                 self._child.give_up(turn.number)
 
     def handle(self, event: SlotEvent) -> tuple[Result, ...]:
@@ -153,7 +169,8 @@ class Slot:
     def stop(self) -> None:
         """End the child."""
         self._life += 1
-        self._child.close()
+        if self._child is not None:
+            self._child.close()
 
     def _watch_anew(self) -> None:
         self._progress = (0, monotonic())
@@ -162,13 +179,15 @@ class Slot:
         """Kill a child that has been quiet for longer than `limit` seconds; 0: never."""
         if quiet > limit > 0:
             self._ended_for = why
-            self._child.kill()
+            if self._child is not None:
+                self._child.kill()
 
     def _end_turn(self, done: Done) -> tuple[Result, ...]:
         turn = self._turns.popleft()
+        self._fruitless = 0
         self._short = turn.size <= SMALL and bool(done.results) and sum(each.seconds for each in done.results) < SHORT
         self._watch_anew()
-        if not self._turns and 0 < self._memory_limit < (held := self._child.memory):
+        if self._child and not self._turns and 0 < self._memory_limit < (held := self._child.memory):
             log.warning("slot %d holds %d MiB; starting another", self.number, held >> 20)
             self.stop()
             self._start()
@@ -176,34 +195,57 @@ class Slot:
 
     def _replace(self) -> tuple[Result, ...]:
         """Another child in the place of one that is gone; errors for the jobs that it had in its hands."""
+        assert self._child is not None  # it was heard
         if not self._child.wait():
             self._ended_for = self._ended_for or self._last_word
         steps = self.steps
         ended_by = self._child.close()
         reason = self._ended_for or ended_by or self._last_word
-        self._failed_starts += not self.ready
-        if self._failed_starts >= FAILED_STARTS:
-            raise DreamfleetError(f"a slot cannot start: {reason}; `dreamfleet doctor` looks for the cause")
+        if not self.ready:
+            self._count_failed_start(reason)
         lost = self._turns.popleft().jobs if self.ready and self._turns else []  # one that starts has begun nothing
         log.warning("slot %d ended (%s)%s; starting another", self.number, reason, _among(lost))
-        self._start()
+        self._start_after_pause()
         return tuple(
             Result(job.digest, None, steps // len(lost), 0.0, f"slot crashed ({reason})", None) for job in lost
         )
 
+    def _count_failed_start(self, reason: str) -> None:
+        self._failed_starts += 1
+        if self._failed_starts >= FAILED_STARTS:
+            raise DreamfleetError(f"a slot cannot start: {reason}; `dreamfleet doctor` looks for the cause")
+
+    def _start_after_pause(self) -> None:
+        """At once after a child that did something, ever later after those that did not: no host is kept busy so."""
+        self._fruitless += 1
+        self._vacate(0.0 if self._fruitless < 2 else min(2.0 ** (self._fruitless - 3), LONGEST_PAUSE))
+        if self._fruitless < 2:
+            self._start()
+
+    def _vacate(self, pause: float) -> None:
+        self.ready = self._short = False
+        self._life += 1
+        self._child = None
+        self._start_at = monotonic() + pause
+
     def _start(self) -> None:
         """A new child; what waited for the last one goes to it."""
-        self.ready = self._short = False
+        self._vacate(0.0)
         self._ended_for, self._last_word = "", "the child ended"
-        self._sent = 0  # turns given to this child
-        self._life += 1
+        self._sent = 0
         number, life, events = self.number, self._life, self._events
-        self._child = ChildProcess(
-            self._spec,
-            self._bundle,
-            self._announced,
-            lambda word: events.put(("slot", SlotEvent(number, life, word))),
-        )
+        try:
+            self._child = ChildProcess(
+                self._spec,
+                self._bundle,
+                self._announced,
+                lambda word: events.put(("slot", SlotEvent(number, life, word))),
+            )
+        except (OSError, RuntimeError) as error:  # no descriptor, process, thread or memory left, no place for a file
+            self._count_failed_start(f"{error}; {REMEDY}")
+            log.warning("slot %d cannot start a process yet: %s", number, error)
+            self._vacate(RESPITE)
+            return
         self._watch_anew()
         waiting, self._turns = self._turns, deque()
         for turn in waiting:

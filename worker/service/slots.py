@@ -35,7 +35,13 @@ class Slots:
         self._task = spec.task
         self._width = find_task(spec.task).width
         self._failures = Failures()
-        self._slots = [Slot(number, spec, bundle, events, announced, memory_limit) for number in range(count)]
+        self._slots: list[Slot] = []
+        try:
+            for number in range(count):
+                self._slots.append(Slot(number, spec, bundle, events, announced, memory_limit))
+        except BaseException:
+            self.stop()  # children that outlived us here would be waited for at the interpreter's end, and wait too
+            raise
 
     def __len__(self) -> int:
         return len(self._slots)

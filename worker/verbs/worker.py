@@ -6,8 +6,10 @@ import argparse
 import signal
 
 from dreamfleet.common.config import add_flags, load
+from dreamfleet.common.descriptors import raise_limit
 from dreamfleet.common.network import Network
 from dreamfleet.common.site import offer
+from dreamfleet.common.unblocked import unblock_stderr
 from dreamfleet.worker.service.config import WorkerConfig
 
 SUMMARY = "score candidates for a run; needs no files and no display, and may start before its coordinator"
@@ -25,6 +27,8 @@ def run(args: argparse.Namespace) -> int:
     """Serve until stopped; the first Ctrl-C drains, the second leaves at once."""
     from dreamfleet.worker.service.worker import Worker
 
+    unblock_stderr()
+    raise_limit()
     config = load(WorkerConfig, "worker", **args.sources)
     worker = Worker(config, Network(connect=args.connect), tuple(args.task))
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -2,6 +2,7 @@ import hashlib
 import io
 import os
 import queue
+import resource
 import select
 import shutil
 import signal
@@ -17,7 +18,7 @@ import pytest
 from dreamfleet.common.bundle import hash_file
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.messages import TaskSpec
-from dreamfleet.worker.service.slot import FAILED_STARTS, START_LIMIT, Slot
+from dreamfleet.worker.service.slot import FAILED_STARTS, LONGEST_PAUSE, RESPITE, START_LIMIT, Slot
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
 from tests.support.processes import environment
@@ -40,11 +41,18 @@ class Harness:
 
     def wait_ready(self):
         while not self.slot.ready:
-            self.slot.handle(self.events.get(timeout=TIMEOUT)[1])
+            self.take()
+
+    def take(self):
+        """The slot's next event, handled; a child that waits to be started is."""
+        self.slot.check(monotonic(), 0.0)
+        while self.slot.pid == 0:
+            self.slot.check(monotonic(), 0.0)
+        return self.slot.handle(self.events.get(timeout=TIMEOUT)[1])
 
     def result(self):
         while True:
-            if results := self.slot.handle(self.events.get(timeout=TIMEOUT)[1]):
+            if results := self.take():
                 (result,) = results
                 return result
 
@@ -241,6 +249,7 @@ def test_a_child_that_cannot_start_ends_with_its_reason(harness, tmp_path):
     slot = harness(tasks.TOY, broken)
     for _ in range(FAILED_STARTS - 1):
         slot.slot.handle(slot.gone())
+        slot.slot.check(monotonic() + LONGEST_PAUSE, 0.0)
     last = slot.gone()
     with pytest.raises(DreamfleetError, match=r"cannot start: BundleError.*not a whole bundle"):
         slot.slot.handle(last)
@@ -256,6 +265,43 @@ def test_a_child_that_is_stopped_as_it_starts_is_replaced_after_a_generous_while
     slot.slot.handle(slot.gone())
     assert slot.score().fitness is not None
     assert slot.slot.pid != pid
+
+
+def test_a_slot_waits_a_while_for_descriptors_and_then_says_what_is_lacking(harness):
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+    try:
+        slot = harness(tasks.TOY)
+        now = monotonic()
+        slot.slot.check(now + RESPITE / 2, 0.0)
+        slot.slot.check(now + 2 * RESPITE, 0.0)
+        assert slot.slot.pid == 0
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    slot.slot.check(now + 4 * RESPITE, 0.0)
+    assert slot.score().fitness is not None
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+    try:
+        os.kill(slot.slot.pid, signal.SIGKILL)
+        slot.slot.handle(slot.gone())
+        slot.slot.check(monotonic() + 2 * RESPITE, 0.0)
+        with pytest.raises(DreamfleetError, match=r"cannot start: .*Too many open files; .*--slots"):
+            slot.slot.check(monotonic() + 4 * RESPITE, 0.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_a_child_that_is_killed_again_and_again_before_it_did_anything_keeps_no_host_busy(harness):
+    slot = harness(tasks.TOY)
+    for number in range(4):
+        slot.wait_ready()
+        os.kill(slot.slot.pid, signal.SIGKILL)
+        slot.slot.handle(slot.gone())
+        assert (slot.slot.pid == 0) == (number > 0)
+        slot.slot.check(monotonic() + 0.4 * 2 ** (number - 1), 0.0)
+        assert (slot.slot.pid == 0) == (number > 0)
+        slot.slot.check(monotonic() + LONGEST_PAUSE, 0.0)
+    assert slot.score().fitness is not None
 
 
 def test_a_child_that_needs_longer_to_start_is_given_longer_the_next_time(harness):
