@@ -8,21 +8,25 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from dreamfleet.common.messages import TAG_BYTES, Beat, Kind, Result, Verdict, VerdictWord
+from dreamfleet.coordinator.choice import Choice
 from dreamfleet.coordinator.failure import Failure
 from dreamfleet.coordinator.jobs import Work
-from dreamfleet.coordinator.member import Lease, Member, Sent
+from dreamfleet.coordinator.member import Handful, Lease, Member, Sent
 from dreamfleet.coordinator.packing import Content, pack
+from dreamfleet.coordinator.record import HostRecord
 from dreamfleet.coordinator.tail import Move, Tail
 
 DEPARTURE_GRACE = 0.05  # seconds: a token's end overtakes results that are still on their way
 CLOCK_GAP = 2.0  # seconds between ticks that mean a suspended host
 SILENT_BEATS = 5
 ABSENT_BEATS = 2
+ANSWER_BEATS = 2  # after which a worker that was sent nothing hears that it is known
 ATTEMPTS = 3  # of a failing job on one worker, where there is no other
+MOST_RECORDS = 4096  # of hosts, those that joined last
 
 
 @dataclass
@@ -44,7 +48,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Send:
-    """A numbered batch for one worker."""
+    """A numbered batch for one worker; 0 is an empty one that only says that the worker is known."""
 
     identity: str
     number: int
@@ -65,6 +69,8 @@ class Fleet:
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this one and the last
         self._tail = Tail(beat)
         self._ticked: float | None = None
+        self._now = 0.0  # of what is being handled
+        self._records: dict[str, HostRecord] = {}  # by name of a host, the one that joined last at the end
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
         self.notes: list[str] = []  # what happened, for whoever writes it down and clears it
@@ -105,7 +111,8 @@ class Fleet:
         old = self.members.get(identity)
         if old is not None:
             self._release(old)
-        self.members[identity] = Member(identity, slots, fingerprint, heard=now)
+        born = now if old is None else old.born
+        self.members[identity] = Member(identity, slots, fingerprint, now, born, self._recall_record(identity, old))
 
     def depart(self, identity: str, now: float) -> None:
         """A worker's token vanished."""
@@ -124,7 +131,9 @@ class Fleet:
         if member is None:
             return
         self._hear(member, now)
-        member.observe(beat)
+        if beat.seen > member.number:
+            self._count_on(member, beat.seen)
+        member.observe(beat, now)
         running = {self._tags.get(run.tag): run.steps for run in beat.running}
         shown = {self._tags.get(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
         for digest, lease in list(member.leases.items()):
@@ -132,15 +141,18 @@ class Fleet:
             lease.steps = running.get(digest)
             if lease.absent >= ABSENT_BEATS:
                 self._drop_lease(member, digest)
+        held = Handful(now, len(member.leases), alone=False)
         for found in shown - member.leases.keys():
             if found in self._wanted and len(self._wanted[found].holders) < 2:
-                self._take(member, found, Lease(beat.seen, steps=running.get(found)))
+                self._take(member, found, Lease(beat.seen, held, steps=running.get(found)))
+        member.lose_before(max((lease.batch for each, lease in member.leases.items() if each in shown), default=0))
 
     def result(self, identity: str, result: Result, now: float) -> tuple[VerdictWord, Work | None]:
         """Judge one result; the work comes back when it is the first wanted one, for the journal."""
-        member = self.members.get(identity)
+        member, self._now = self.members.get(identity), now
         if member is not None:
             self._hear(member, now)
+            member.take_back(result)
         verdict, work = self._judge(identity, result)
         if member is not None:
             member.leases.pop(result.digest, None)
@@ -180,43 +192,35 @@ class Fleet:
                 self._extend(member, gap)
             if member.lost is not None:
                 if now - max(member.lost, member.heard) >= DEPARTURE_GRACE:
-                    self._note(member, "left")
-                    self._release(member)
+                    self._lose(member, now, "left")
                     del self.members[member.identity]
             elif not member.silent and now - member.heard > SILENT_BEATS * self._beat:
                 member.silent = True
-                self._note(member, "is silent")
+                self._lose(member, now, "is silent")
                 self.counts["silences"] += 1
-                self._release(member)
 
     def dispatch(self, now: float, *, durable: bool = True) -> list[Send]:
         """Batches to send now: verdicts, cancellations, jobs to credit, and what was not seen in time.
 
         Verdicts stay until everything so far is `durable`.
         """
-        given = self._assign()
+        for member in self.members.values():
+            member.learn(now)
+        given = self._assign(now)
         if not self._queue and not self.paused:
             for move in self._tail.plan(self._wanted, self.members, given, now):
-                self._apply(move, given)
-        sends = []
+                self._apply(move, given, now)
+        if not self.paused:
+            for move in list(self._tail.trials(self._wanted, self.members, given.keys(), now)):
+                self._apply(move, given, now)
+        sends: list[Send] = []
         for member in self.members.values():
-            if member.lost is not None:
-                continue
-            for number, sent in member.unseen.items():
-                if now - sent.at > 2 * self._beat and not member.silent:
-                    sent.at = now
-                    self.counts["resent_batches"] += 1
-                    sends.append(Send(member.identity, number, sent.content))
-            verdicts = member.verdicts if durable else []
-            for content in pack(given.get(member.identity, []), member.cancels, verdicts):
-                member.number += 1
-                member.unseen[member.number] = Sent(content, now)
-                for work in content.work:
-                    self._take(member, work.job.digest, Lease(member.number))
-                sends.append(Send(member.identity, member.number, content))
-            member.cancels = []
-            if durable:
-                member.verdicts = []
+            if member.lost is None:
+                said = [*self._again(member, now), *self._news(member, given.get(member.identity, ()), durable, now)]
+                if not said and member.awaits_word(now, ANSWER_BEATS * self._beat):
+                    said = [Send(member.identity, 0, Content())]
+                member.spoken = now if said else member.spoken
+                sends += said
         return sends
 
     @property
@@ -248,6 +252,27 @@ class Fleet:
             wanted.attempts.clear()
         self._failing.clear()
 
+    def _again(self, member: Member, now: float) -> Iterator[Send]:
+        """Batches that were not seen in time."""
+        for number in [] if member.silent else member.overdue(now, 2 * self._beat):
+            sent = member.unseen[number]
+            sent.at, sent.times = now, sent.times + 1
+            self.counts["resent_batches"] += 1
+            yield Send(member.identity, number, sent.content)
+
+    def _news(self, member: Member, given: Sequence[Work], durable: bool, now: float) -> Iterator[Send]:
+        """Batches that it was not sent yet."""
+        handful = member.give(now)
+        for content in pack(given, member.cancels, member.verdicts if durable else []):
+            member.number += 1
+            member.unseen[member.number] = Sent(content, now, now)
+            for work in content.work:
+                self._take(member, work.job.digest, Lease(member.number, handful))
+            yield Send(member.identity, member.number, content)
+        member.cancels = []
+        if durable:
+            member.verdicts = []
+
     def _judge(self, identity: str, result: Result) -> tuple[VerdictWord, Work | None]:
         wanted = self._wanted.get(result.digest)
         if wanted is None:
@@ -270,9 +295,13 @@ class Fleet:
         self._failing.pop(digest, None)
         self._tags.pop(digest[:TAG_BYTES], None)
         for holder in list(wanted.holders):
-            lease = self.members[holder].leases.pop(digest, None)
+            member = self.members[holder]
+            lease = member.leases.pop(digest, None)
             self._unhold(wanted, holder)
-            self.members[holder].cancels.append(digest)
+            if lease is not None:
+                member.overtaken(lease, self._now)
+            if digest not in member.trials:  # which is worth its end
+                member.cancels.append(digest)
             self.counts["discarded_steps"] += (lease and lease.steps) or 0
 
     def _hear(self, member: Member, now: float) -> None:
@@ -284,8 +313,32 @@ class Fleet:
         member.heard += gap
         for sent in member.unseen.values():
             sent.at += gap
+        member.put_off(gap)
+
+    def _count_on(self, member: Member, seen: int) -> None:
+        """It counts batches as of before its last hello, whose answer it did not hear: what it is given follows on."""
+        self._release(member)
+        member.number = seen
+
+    def _recall_record(self, identity: str, old: Member | None) -> HostRecord:
+        """What is known of this worker's host, which every life of it goes on from."""
+        name = identity.partition("/")[0]
+        last = self._records.pop(name, None)
+        record = old.record if old else last.inherit() if last else HostRecord()
+        self._records[name] = record
+        while len(self._records) > MOST_RECORDS:
+            del self._records[next(iter(self._records))]
+        return record
+
+    def _lose(self, member: Member, now: float, what: str) -> None:
+        self.notes.append(f"worker {member.identity} {what}: {len(member.leases)} jobs are free again")
+        if member.leases:
+            last = self._records.get(member.identity.partition("/")[0], member.record)
+            last.die(now - member.born)
+        self._release(member)
 
     def _take(self, member: Member, digest: bytes, lease: Lease) -> None:
+        lease.in_slack = self._wanted[digest].in_slack
         member.leases[digest] = lease
         self._hold(self._wanted[digest], member.identity)
 
@@ -298,7 +351,7 @@ class Fleet:
             wanted.holders.discard(identity)
             self._in_slack -= wanted.in_slack and not wanted.holders
 
-    def _apply(self, move: Move, given: dict[str, list[Work]]) -> None:
+    def _apply(self, move: Move, given: dict[str, list[Work]], now: float) -> None:
         """Give a job to an idle slot too, or instead of to a worker that has not begun it."""
         wanted = self._wanted[move.digest]
         if move.instead_of:
@@ -306,6 +359,8 @@ class Fleet:
             donor.leases.pop(move.digest)
             donor.cancels.append(move.digest)
             self._unhold(wanted, donor.identity)
+        if move.trial:
+            self.members[move.to].trials[move.digest] = Handful(now, 0)
         self.counts["recalled" if move.instead_of else "copied"] += 1
         self._hold(wanted, move.to)
         given.setdefault(move.to, []).append(wanted.work)
@@ -321,13 +376,11 @@ class Fleet:
             self.counts["reissued"] += 1
             self._enqueue(digest)
 
-    def _note(self, member: Member, what: str) -> None:
-        self.notes.append(f"worker {member.identity} {what}: {len(member.leases)} jobs are free again")
-
     def _release(self, member: Member) -> None:
         for digest in list(member.leases):
             self._drop_lease(member, digest)
         member.unseen.clear()
+        member.trials.clear()
 
     def _enqueue(self, digest: bytes) -> None:
         wanted = self._wanted[digest]
@@ -335,12 +388,13 @@ class Fleet:
             wanted.queued = True
             heapq.heappush(self._queue, (wanted.in_slack, wanted.order, digest))
 
-    def _assign(self) -> dict[str, list[Work]]:
-        """One job at a time to the least loaded worker with credit, so that a generation's tail is spread evenly."""
+    def _assign(self, now: float) -> dict[str, list[Work]]:
+        """One job at a time to the least loaded worker with credit that helps, so that a tail is spread evenly."""
         given: dict[str, list[Work]] = {}
         if self.paused:
             return given
         loads = {name: len(member.leases) for name, member in self.members.items() if member.credit > 0}
+        choice = Choice(self.members, loads, sum(not in_slack for in_slack, *_ in self._queue), now)
         passed_over = []
         while self._queue and loads:
             entry = heapq.heappop(self._queue)
@@ -359,7 +413,12 @@ class Fleet:
             if not able:
                 passed_over.append(entry)
                 continue
-            name = min(able, key=lambda name: loads[name] / self.members[name].capacity)
+            name = choice.pick(able)
+            if name is None and not wanted.failed:
+                passed_over.append(entry)
+                break  # nor the jobs after it: they had better wait for whoever is sooner
+            name = name or min(able, key=lambda name: loads[name])
+            choice.take(name)
             given.setdefault(name, []).append(wanted.work)
             self._hold(wanted, name)
             loads[name] += 1

@@ -1,0 +1,37 @@
+"""Adding a bad worker never makes a run slower by more than 5 %: hosts that take as long as each test says."""
+
+import statistics
+
+import pytest
+
+from tests.support.fleets import Host, Played
+
+GENERATIONS, FIRST = 60, 10  # the first few find out how bad it is
+FAST = {"narrow": {"row": 0.02}, "wide": {"width": 256, "turn": 0.4, "row": 0.005}}
+BAD = {
+    "slow link": {"bandwidth": 32_000, "delay": 2.0},
+    "thin link": {"bandwidth": 8_000, "delay": 0.05},
+    "long link": {"delay": 1.0},
+    "slow core": {"slower": 100},
+    "rather slow core": {"slower": 3},
+    "flapping host": {"lives": 1.5},
+    "flapping slow host": {"lives": 2.5, "slower": 10},
+    "flapping host behind a slow link": {"lives": 4.0, "bandwidth": 32_000, "delay": 1.0},
+}
+
+
+def made(name, fast, slower=1, **bad):
+    return Host(name, **{**fast, "turn": fast.get("turn", 0.0) * slower, "row": fast["row"] * slower, **bad})
+
+
+def mean_seconds(*hosts, size):
+    return statistics.mean(Played(*hosts, size=size).play(GENERATIONS)[FIRST:])
+
+
+@pytest.mark.parametrize("size", [64, 900])
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("fast", FAST)
+def test_a_bad_worker_makes_no_run_slower(fast, bad, size):
+    alone = mean_seconds(made("good", FAST[fast]), size=size)
+    both = mean_seconds(made("good", FAST[fast]), made("bad", FAST[fast], **BAD[bad]), size=size)
+    assert both / alone < 1.05
