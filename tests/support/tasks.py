@@ -13,7 +13,10 @@ from gymnasium import spaces
 from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 
 MODULE = "tests.support.tasks"
-TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, EXPLODING, ENDLESS, CHATTY = (
+(
+    TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, EXPLODING, ENDLESS,
+    CHATTY,
+) = (
     f"{MODULE}:{name}"
     for name in (
         "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Optimistic",
