@@ -259,12 +259,12 @@ class RunFolder:
     def history(self) -> list[StoredGeneration]:
         """Every closed generation, oldest first."""
         query = "SELECT number, mean, std, best, worst, sigma, steps, seconds FROM generation WHERE closed IS NOT NULL"
-        return [_generation(*row) for row in self._typed(self._all(query + " ORDER BY number"), "ifffffif")]
+        return [_generation(*row) for row in self._typed(self._all(query + " ORDER BY number"), "iFFFFfiF")]
 
     def evaluations(self) -> list[StoredEvaluation]:
         """Every finished evaluation of a mean, oldest first."""
         query = "SELECT generation, episodes, mean, std FROM evaluation WHERE mean IS NOT NULL ORDER BY generation"
-        rows = self._typed(self._all(query), "iiff")
+        rows = self._typed(self._all(query), "iiFF")
         if any(episodes < 1 for _, episodes, _, _ in rows):
             raise self._damaged("an evaluation is of no episodes")
         return [StoredEvaluation(generation, episodes, finite(mean), finite(std))

@@ -167,7 +167,7 @@ def touched(bench, generations):
     Rows.touched = 0
     snapshot = snapshot_of(bench)
     answers.status(snapshot)
-    assert bench.run._stop_reason() is None
+    assert bench.run._stop_reason(bench.run.generation) is None
     return Rows.touched
 
 
