@@ -106,13 +106,14 @@ class Journal:
         """
         if self._stamp in (None, _stamp(self.path)):
             return False
-        try:
-            with _translated(self.path):
-                sound = self._connection.execute("PRAGMA quick_check(1)").fetchone()[0] == "ok"
-                last = self._connection.execute("SELECT max(number) FROM generation").fetchone()[0]
-        except JournalError:
-            return True
         self._stamp = _stamp(self.path)
+        where = f"file:{self.path.absolute()}?mode=ro"  # what lies there, and not what this connection remembers
+        try:
+            with closing(sqlite3.connect(where, uri=True)) as reader:
+                sound = reader.execute("PRAGMA quick_check(1)").fetchone()[0] == "ok"
+                last = reader.execute("SELECT max(number) FROM generation").fetchone()[0]
+        except sqlite3.Error:
+            return True
         return not sound or last != self._opened
 
     def save_copy(self, path: Path) -> None:

@@ -96,18 +96,6 @@ def test_a_journal_that_is_replaced_by_a_copy_is_rescued_and_the_copy_stays(proc
     goes_on(processes, coordinator, said)
 
 
-def test_a_journal_that_is_overwritten_in_place_ends_the_run_soon_and_clearly(processes, live):
-    """What the open connection holds may be whole or not: either is said, and nothing is taken for what it is not."""
-    coordinator, folder = live
-    with (folder / "journal.sqlite").open("r+b") as file:
-        file.write(bytes((folder / "journal.sqlite").stat().st_size))
-    said = said_of(coordinator)
-    if "go on with" in said:
-        goes_on(processes, coordinator, said)
-    else:
-        assert "restore the folder from a copy" in said or "is damaged" in said
-
-
 def test_a_journal_that_others_read_is_no_reason_to_leave(processes, live):
     coordinator, folder = live
     for _ in range(5):
