@@ -52,7 +52,7 @@ class Custody:
         for path in beside(self._journal.path)[:2]:  # they come with the first write
             if self._own.get(path.name) is None:
                 self._own[path.name] = identity(path)
-        if identity(self._folder) != self._of_folder or not self._whole(self._folder):
+        if identity(self._folder) != self._of_folder or not self._whole(self._folder) or self._journal.overwritten:
             self._leave()
         self._journal.check_incarnation()
         self._restore_bundle()
@@ -65,7 +65,7 @@ class Custody:
         time.sleep(SETTLE)
         self._journal.commit()
         folder = self._found()
-        if folder is not None and self._whole(folder):
+        if folder is not None and folder != self._folder and self._whole(folder):
             raise JournalError(
                 f"the run's folder was moved to {folder} while it was served: nothing is lost; go on with: "
                 f"{_again(folder)}"
@@ -119,8 +119,8 @@ class Custody:
             )
         copy.replace(target)
         return (
-            f"{target} or its write-ahead log was removed while it was served: rescued to the last result as {target}; "
-            f"go on with: {_again(folder)}"
+            f"{target} or its write-ahead log was removed or overwritten while it was served: rescued to the last "
+            f"result as {target}; go on with: {_again(folder)}"
         )
 
     def _rescue_beside(self, parent: Path) -> str:

@@ -51,6 +51,8 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._incarnation = 0
+        self._stamp: tuple[int, int] | None = None  # of the file, as the last commit left it
+        self._opened: int | None = None  # the latest generation
         self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
         with _translated(path):
             self._connection = sqlite3.connect(path, timeout=5)
@@ -97,6 +99,24 @@ class Journal:
         """Fold the write-ahead log into the journal and release it."""
         self._connection.close()
 
+    @property
+    def overwritten(self) -> bool:
+        """Whether somebody else wrote into the journal's own file, and what it holds now is not what was committed.
+
+        Only a commit of this connection writes there, so the file is looked into where its time or size is another's.
+        """
+        if self._stamp in (None, _stamp(self.path)):
+            return False
+        self._stamp = _stamp(self.path)
+        where = f"file:{self.path.absolute()}?mode=ro"  # what lies there, and not what this connection remembers
+        try:
+            with closing(sqlite3.connect(where, uri=True)) as reader:
+                sound = reader.execute("PRAGMA quick_check(1)").fetchone()[0] == "ok"
+                last = reader.execute("SELECT max(number) FROM generation").fetchone()[0]
+        except sqlite3.Error:
+            return True
+        return not sound or last != self._opened
+
     def save_copy(self, path: Path) -> None:
         """Write all that is committed into a new file, checked, whole or not at all."""
         aside = path.with_name(f".{path.name}.part")
@@ -105,8 +125,9 @@ class Journal:
                 self._connection.backup(copy)
                 copy.execute("PRAGMA journal_mode = DELETE")  # one file, without a log beside it
                 found = copy.execute("PRAGMA quick_check(1)").fetchone()[0]
-            if found != "ok":
-                raise JournalError(f"what {self.path} held is damaged: {found}")
+                last = copy.execute("SELECT max(number) FROM generation").fetchone()[0]
+            if found != "ok" or last != self._opened:
+                raise JournalError("what the open connection still holds is not whole: restore the folder from a copy")
             with aside.open("rb") as file:
                 os.fsync(file.fileno())
             aside.replace(path)
@@ -127,8 +148,11 @@ class Journal:
     def commit(self) -> None:
         """Make everything written so far durable."""
         self._flush()
+        own = self._stamp in (None, _stamp(self.path))
         with _translated(self.path):
             self._connection.commit()
+        if own:  # else somebody wrote there since the last commit, which `overwritten` looks into
+            self._stamp = _stamp(self.path)
 
     def fact(self, key: str) -> str | None:
         """One of the run's facts, such as `uid` or `fingerprint`."""
@@ -157,6 +181,7 @@ class Journal:
         self.set_fact("incarnation", str(number))
         self.commit()
         self._incarnation = number
+        self._opened = self._read("SELECT max(number) FROM generation").fetchone()[0]
         return number
 
     def open_generation(
@@ -171,6 +196,7 @@ class Journal:
         self._write_all("INSERT INTO candidate (generation, number, vector) VALUES (?, ?, ?)", rows)
         self._write("INSERT INTO strategy (generation, state) VALUES (?, ?)", number, state)
         self._write("DELETE FROM strategy WHERE generation < ?", number - 1)
+        self._opened = number
 
     def close_generation(self, closed: StoredGeneration, fitness: NDArray[np.float64]) -> None:
         """Write what the strategy is told."""
@@ -316,6 +342,15 @@ class _Rows(list[Any]):
     def fetchall(self) -> list[Any]:
         """All of them."""
         return self
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """When a file was written last, and how long it is; `None`: it is not there."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
 
 
 def beside(path: Path) -> tuple[Path, ...]:

@@ -17,7 +17,7 @@ import zenoh
 
 from dreamfleet.common import keys
 from dreamfleet.common.codec import Inbox, MalformedError, encode, encode_json, encoding
-from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.errors import DreamfleetError, RefusedError
 from dreamfleet.common.messages import (
     Beat,
     GenerationEvent,
@@ -89,7 +89,11 @@ class Service:
                 log.info("listening on %s", ", ".join(self._network.listen))
             self._evaluations_told = len(self._run.slack.evaluations)
             on_ready(self._run)
-            self._loop(session)
+            try:
+                self._loop(session)
+            except RefusedError:  # another coordinator of this name goes on; the run is whole
+                self._run.leave()
+                raise
             self._custody.look(monotonic(), at_once=True)
             self._run.leave()
             self._snapshot = as_left(self._take_snapshot())

@@ -146,3 +146,28 @@ def test_an_unknown_run_names_those_that_exist(folder):
 def test_a_folder_is_held_by_one(folder):
     with run_lock(folder), pytest.raises(UsageError, match="held by a live coordinator"), run_lock(folder):
         pass
+
+
+def test_a_journal_that_is_overwritten_in_place_is_noticed_and_readers_are_not(journal, folder):
+    fill(journal)
+    journal.begin_incarnation()
+    journal._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    with RunFolder(folder) as run:
+        assert run.history()
+    assert not journal.overwritten
+    journal.commit()
+    path = folder / "journal.sqlite"
+    with path.open("r+b") as file:
+        file.write(bytes(path.stat().st_size))
+    journal.commit()
+    assert journal.overwritten
+
+
+def test_a_second_life_in_one_journal_is_noticed_by_the_first(journal, folder):
+    journal.begin_incarnation()
+    journal.check_incarnation()
+    other = Journal(folder / "journal.sqlite")
+    other.begin_incarnation()
+    other.close()
+    with pytest.raises(JournalError, match="another coordinator serves"):
+        journal.check_incarnation()
