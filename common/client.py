@@ -25,6 +25,7 @@ from dreamfleet.common.status import OVER, Population, Status, WorkerStatus, rea
 
 QUERY_TIMEOUT = 3.0
 PATIENCE = 1.0  # seconds without an answer after which a watched run counts as left
+MOST_PARAMETERS = 16 << 20  # of a controller, as its file may have them
 CHANGES = 5  # controllers that may replace one another while one is fetched in parts
 
 
@@ -126,9 +127,9 @@ class Client:
         """What `run` reports now: its best evaluated mean, else its last one; `ControllerError` before the first."""
         for _ in range(CHANGES):
             data, about = b"", self._controller_part(run, 0)
-            sha256, total = about["sha256"], 4 * int(about["total"])
+            sha256, total = about["sha256"], 4 * _total(about)
             while about["sha256"] == sha256:
-                part = base64.b64decode(about["parameters"])
+                part = _part(about)
                 data += part
                 if len(data) >= total or not part:
                     return _controller(about, data)
@@ -172,6 +173,22 @@ class Client:
         return [read_document(payload) for payload in ask_all(self.session, [selector], QUERY_TIMEOUT)]
 
 
+def _total(about: dict[str, Any]) -> int:
+    """How many parameters there are; `ControllerError` before more is fetched than a controller may have."""
+    total = about["total"]
+    if type(total) is not int or not 0 < total <= MOST_PARAMETERS:
+        raise ControllerError("the run says that its controller has no such number of parameters as one may have")
+    return total
+
+
+def _part(about: dict[str, Any]) -> bytes:
+    """The parameters of one answer."""
+    try:
+        return base64.b64decode(about["parameters"], validate=True)
+    except (ValueError, TypeError) as error:
+        raise ControllerError("the controller arrived damaged; ask again") from error
+
+
 def _controller(about: dict[str, Any], data: bytes) -> Controller:
     try:
         shape = from_plain(ControllerShape, known(ControllerShape, about["shape"]))
@@ -185,7 +202,7 @@ def _controller(about: dict[str, Any], data: bytes) -> Controller:
             str(about.get("options", "")),
             int(about.get("version", 1)),
         )
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ControllerError(f"the run's controller cannot be read ({error}): update dreamfleet") from error
     if controller.sha256 != about["sha256"]:
         raise ControllerError("the controller arrived damaged; ask again")

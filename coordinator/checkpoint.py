@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.archives import Limits, read_arrays
 from dreamfleet.common.errors import JournalError
+from dreamfleet.common.printable import one_line
 from dreamfleet.coordinator.optimisers.api import State
 from dreamfleet.coordinator.optimisers.scalars import untag
 
@@ -48,7 +49,8 @@ class Checkpoint:
         try:
             return cls._of(read_arrays(data, _LIMITS))
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise JournalError(f"the journal's last state is damaged ({error}): restore it from a copy") from error
+            why = one_line(str(error))
+            raise JournalError(f"the journal's last state is damaged ({why}): restore it from a copy") from error
 
     @classmethod
     def _of(cls, arrays: State) -> Checkpoint:

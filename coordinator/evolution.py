@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DreamfleetError, JournalError, UsageError
+from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs import RunSettings
 from dreamfleet.coordinator.checkpoint import PREFIX, Checkpoint, Head
 from dreamfleet.coordinator.optimisers.api import Search
@@ -130,7 +131,11 @@ class Evolution:
             raise JournalError(
                 f"this run was written with {head.requirement}: pip install {head.requirement} (now {requirement})"
             )
-        self._optimiser.restore(checkpoint.state)
+        try:
+            self._optimiser.restore(checkpoint.state)
+        except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+            why = one_line(f"{type(error).__name__}: {error}")
+            raise JournalError(f"the journal's last state is damaged ({why}): restore it from a copy") from error
         self._is_open = False
 
 

@@ -9,11 +9,13 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.files import read_text
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.worker.inspection.charts import FONT, new_figure, png
 from dreamfleet.worker.inspection.section import Section
 
 Points = list[dict[str, float]]
+MOST_BYTES, MOST = 100_000_000, 1e30  # of a file of points, and of a loss that can be drawn
 LOSSES = (("vae", "the VAE"), ("mdnrnn", "the MDN-RNN"))
 
 
@@ -50,11 +52,13 @@ def loss(points: Points, name: str, what: str) -> Section:
 def read_points(path: Path) -> Points:
     """The points of a loss curve; `DatasetError` if the file is damaged or empty."""
     try:
-        points: Points = [json.loads(line) for line in path.read_text().splitlines() if line]
+        points: Points = [json.loads(line) for line in read_text(path, MOST_BYTES).splitlines() if line]
         names = set(points[0])
         if "update" not in names or any(set(point) != names for point in points):
             raise ValueError("points differ in what they tell")
-    except (OSError, ValueError, TypeError, IndexError) as error:
+        if not all(type(each) in (int, float) and abs(each) < MOST for point in points for each in point.values()):
+            raise ValueError("a point is no finite number")
+    except (OSError, ValueError, TypeError, IndexError, RecursionError) as error:
         raise DatasetError(f"{path} holds no loss curve ({error}); delete it, training writes it again") from error
     return points
 

@@ -43,12 +43,12 @@ def load_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
             progress: dict[str, Any] = json.loads(file.metadata()["progress"])
         weights = {name: tensor for name, tensor in tensors.items() if name.startswith("model.")}
         model.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
+        if optimiser is not None:
+            _restore_adam(optimiser, {name: tensor for name, tensor in tensors.items() if name.startswith("adam.")})
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, RecursionError, SafetensorError) as error:
         raise DatasetError(
             f"checkpoint {path} does not fit or is damaged ({error}); delete it to begin anew"
         ) from error
-    if optimiser is not None:
-        _restore_adam(optimiser, {name: tensor for name, tensor in tensors.items() if name.startswith("adam.")})
     return progress
 
 
@@ -57,7 +57,7 @@ def load_config(path: Path, kind: type[T]) -> T:
     about = _about(path)
     try:
         return from_plain(kind, json.loads(about["config"])) if "config" in about else kind()
-    except (ValueError, MalformedError, UsageError) as error:
+    except (ValueError, TypeError, RecursionError, MalformedError, UsageError) as error:
         raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
 
 
@@ -65,7 +65,7 @@ def load_progress(path: Path) -> dict[str, Any]:
     """How far a checkpoint has come."""
     try:
         progress: dict[str, Any] = json.loads(_about(path)["progress"])
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, RecursionError) as error:
         raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
     return progress
 

@@ -52,7 +52,11 @@ def run(args: argparse.Namespace) -> int:
     done = Evaluated(seeds, tuple(scores[seed] for seed in seeds))
     if args.json:
         report = {"mean": done.mean, "std": done.std, "scores": done.scores, "seeds": done.seeds}
-        print(json.dumps({**report, "task": controller.task, "bundle": controller.bundle, "judge": "gymnasium"}))
+        print(
+            json.dumps(
+                {**report, "task": controller.task, "bundle": bundle.sha256 if bundle else "", "judge": "gymnasium"}
+            )
+        )
     else:
         low, high = min(done.scores), max(done.scores)
         error = done.std / len(seeds) ** 0.5
