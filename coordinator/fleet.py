@@ -22,6 +22,11 @@ DEPARTURE_GRACE = 0.05  # seconds: a token's end overtakes results that are stil
 CLOCK_GAP = 2.0  # seconds between ticks that mean a suspended host
 SILENT_BEATS = 5
 ABSENT_BEATS = 2
+FORGOTTEN = 600.0  # seconds of silence after which a worker must say hello again
+VISIT = 60.0  # the same for one that was welcomed and has not beaten yet: a guest
+MOST_GUESTS = 256
+MOST_SLOTS = 4096  # that a hello is believed; a beat can say no more
+MOST_FAILED = 16  # workers that a job's failures are remembered of; two pause the run
 ATTEMPTS = 3  # of a failing job on one worker, where there is no other
 
 
@@ -65,6 +70,7 @@ class Fleet:
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this one and the last
         self._tail = Tail(beat)
         self._ticked: float | None = None
+        self._guests: dict[str, None] = {}  # identities, oldest first
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
         self.notes: list[str] = []  # what happened, for whoever writes it down and clears it
@@ -101,11 +107,14 @@ class Fleet:
             heapq.heapify(self._queue)
 
     def welcome(self, identity: str, slots: int, fingerprint: str, now: float) -> None:
-        """A worker was admitted; it has credit from its first beat on."""
+        """A worker was admitted; it has credit from its first beat on, and until then it is one of a few guests."""
         old = self.members.get(identity)
         if old is not None:
-            self._release(old)
-        self.members[identity] = Member(identity, slots, fingerprint, heard=now)
+            self._forget(old)
+        if len(self._guests) >= MOST_GUESTS:
+            self._forget(self.members[next(iter(self._guests))])
+        self._guests[identity] = None
+        self.members[identity] = Member(identity, min(slots, MOST_SLOTS), fingerprint, heard=now)
 
     def depart(self, identity: str, now: float) -> None:
         """A worker's token vanished."""
@@ -119,6 +128,7 @@ class Fleet:
             return
         self._hear(member, now)
         member.observe(beat)
+        self._guests.pop(identity, None)
         running = {self._tags.get(run.tag): run.steps for run in beat.running}
         shown = {self._tags.get(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
         for digest, lease in list(member.leases.items()):
@@ -138,7 +148,8 @@ class Fleet:
         verdict, work = self._judge(identity, result)
         if member is not None:
             member.leases.pop(result.digest, None)
-            member.verdicts.append(Verdict(result.digest, verdict))
+            if member.known or len(member.verdicts) < MOST_GUESTS:
+                member.verdicts.append(Verdict(result.digest, verdict))
             member.finished += verdict == "accepted"
         if verdict == "accepted":
             self._tail.learn(result.steps)
@@ -175,8 +186,9 @@ class Fleet:
             if member.lost is not None:
                 if now - max(member.lost, member.heard) >= DEPARTURE_GRACE:
                     self._note(member, "left")
-                    self._release(member)
-                    del self.members[member.identity]
+                    self._forget(member)
+            elif now - member.heard > (FORGOTTEN if member.known else VISIT):
+                self._forget(member)
             elif not member.silent and now - member.heard > SILENT_BEATS * self._beat:
                 member.silent = True
                 self._note(member, "is silent")
@@ -194,7 +206,7 @@ class Fleet:
                 self._apply(move, given)
         sends = []
         for member in self.members.values():
-            if member.lost is not None:
+            if member.lost is not None or not member.known:
                 continue
             for number, sent in member.unseen.items():
                 if now - sent.at > 2 * self._beat and not member.silent:
@@ -248,8 +260,9 @@ class Fleet:
             return ("duplicate" if result.digest in self._accepted else "obsolete"), None
         if result.fitness is None:
             self._failing[result.digest] = wanted
-            wanted.attempts[identity] += 1
-            wanted.failed[identity] = result.error or "no fitness and no reason"
+            if identity in wanted.failed or len(wanted.failed) < MOST_FAILED:
+                wanted.attempts[identity] += 1
+                wanted.failed[identity] = result.error or "no fitness and no reason"
             self.counts["errors"] += 1
             if member := self.members.get(identity):
                 self._drop_lease(member, result.digest)
@@ -316,7 +329,15 @@ class Fleet:
             self._enqueue(digest)
 
     def _note(self, member: Member, what: str) -> None:
+        if not member.known:
+            return  # nothing was given to it, and no log should grow with what strangers call themselves
         self.notes.append(f"worker {member.identity} {what}: {len(member.leases)} jobs are free again")
+
+    def _forget(self, member: Member) -> None:
+        """It is nobody's member any more; one that lives says hello again, for it is silent to it in turn."""
+        self._release(member)
+        self._guests.pop(member.identity, None)
+        del self.members[member.identity]
 
     def _release(self, member: Member) -> None:
         for digest in list(member.leases):
@@ -348,7 +369,9 @@ class Fleet:
                 passed_over.append(entry)
                 break  # what waits for slack is last in the queue
             able = [name for name in loads if name not in wanted.failed]
-            if not able and all(name in wanted.failed for name, member in self.members.items() if member.present):
+            if not able and all(
+                name in wanted.failed for name, member in self.members.items() if member.present and member.capacity
+            ):
                 able = list(loads)  # nobody else is there: a killed child must not hang a run
             if not able:
                 passed_over.append(entry)
@@ -365,7 +388,7 @@ class Fleet:
 
     def _slack_slots(self) -> int:
         """Rollouts of a mean fill the tail of a generation and never more than a quarter of the slots."""
-        return max(1, sum(member.slots for member in self.members.values() if member.present) // 4)
+        return max(1, sum(member.slots for member in self.members.values() if member.present and member.capacity) // 4)
 
 
 def _failure(wanted: Wanted) -> Failure:

@@ -129,6 +129,8 @@ def _results(work: Sequence[Work], scores: list[Score], spent: float, upload: by
         raise ValueError(f"the task gave {len(scores)} scores of {len(work)} episodes")
     if not all(math.isfinite(score.fitness) for score in scores):
         raise ValueError("the task gave a fitness that is no number")
+    if not all(0 <= int(score.steps) < 2**63 for score in scores):
+        raise ValueError("the task gave a number of steps that is none")
     sha256 = None if upload is None else hashlib.sha256(upload).digest()
     return tuple(
         Result(job.digest, float(score.fitness), int(score.steps), spent, None, sha256)
