@@ -10,6 +10,7 @@ from typing import Any
 import zenoh
 
 GRACE = 2.0  # seconds after which no end of replies is waited for
+MOST_REPLIES = 65_536  # that wait to be looked at: an answerer without end fills no memory
 LOOK = 0.2  # seconds between looks at whether to stop
 
 
@@ -23,10 +24,15 @@ def ask_all(
     """
     replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
     done = object()
+
+    def take(reply: Any) -> None:
+        if replies.qsize() < MOST_REPLIES:
+            replies.put(reply)
+
     encoding = None if payload is None else "application/json"
     left = 0
     for selector in selectors:
-        handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(done), indirect=False)
+        handler = zenoh.handlers.Callback(take, lambda: replies.put(done), indirect=False)
         session.get(selector, handler, timeout=timeout, payload=payload, encoding=encoding)
         left += 1
     payloads: list[bytes] = []

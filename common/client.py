@@ -79,7 +79,7 @@ class Client:
     def watch_documents(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[dict[str, Any]]:
         """As `watch`, but as the wire has it."""
         farewells: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        heard = enqueue_into(farewells, "status")
+        heard = enqueue_into(farewells, "status", most=1)
         subscriber: Any = self.session.declare_subscriber(keys.event_status(keys.check_run_name(run)), heard)
         lost_at: float | None = None  # when it counts as left, while nobody answers
         try:

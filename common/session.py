@@ -92,6 +92,14 @@ def _first_line(error: BaseException) -> str:
     return str(error).splitlines()[0][:200]
 
 
-def enqueue_into(inbox: queue.SimpleQueue[Any], kind: str) -> Callable[[Any], None]:
-    """A Zenoh callback that only enqueues `(kind, event)`: a slow callback looks like a frozen process."""
-    return zenoh.handlers.Callback(lambda event: inbox.put((kind, event)), indirect=False)
+def enqueue_into(inbox: queue.SimpleQueue[Any], kind: str, most: int | None = None) -> Callable[[Any], None]:
+    """A Zenoh callback that only enqueues `(kind, event)`: a slow callback looks like a frozen process.
+
+    Where `most` events wait already it drops: for what is said again until it is heard.
+    """
+
+    def enqueue(event: Any) -> None:
+        if most is None or inbox.qsize() < most:
+            inbox.put((kind, event))
+
+    return zenoh.handlers.Callback(enqueue, indirect=False)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import queue
 import threading
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,12 +26,13 @@ class Bound:
     rate: float = math.inf
 
 
+PATIENCE = 32  # events after which a hello is taken before others
 BOUNDS = {
     "result": Bound(2048, 16 << 20),
     "beat": Bound(2048, 8 << 20),
     "upload": Bound(512, 20 << 20),
     "token": Bound(4096, 1),  # without a payload
-    "hello": Bound(256, 4 << 20, 200.0),  # each costs what dozens of results cost, and who is not heard asks again
+    "hello": Bound(256, 4 << 20, 100.0),  # each costs what dozens of results cost, and who is not heard asks again
     "control": Bound(64, 1 << 20),
 }
 
@@ -41,7 +42,10 @@ class Arrivals:
 
     def __init__(self, bounds: dict[str, Bound] = BOUNDS) -> None:
         self._bounds = bounds
-        self._queue: queue.SimpleQueue[tuple[str, Any, int]] = queue.SimpleQueue()
+        self._signs: queue.SimpleQueue[None] = queue.SimpleQueue()  # one for each event, and for each wake
+        self._first: deque[tuple[str, Any, int]] = deque()
+        self._later: deque[tuple[str, Any, int]] = deque()
+        self._passed_over = 0
         self._count: Counter[str] = Counter()
         self._size: Counter[str] = Counter()
         self._budget = {kind: (float(bound.count), -math.inf) for kind, bound in bounds.items()}  # how many, as of when
@@ -62,20 +66,26 @@ class Arrivals:
                 return False
             self._count[kind] += 1
             self._size[kind] += size
-        self._queue.put((kind, event, size))
+            (self._later if kind == "hello" else self._first).append((kind, event, size))
+        self._signs.put(None)
         return True
 
     def wake(self) -> None:
         """End a wait without an event. Safe in a signal handler."""
-        self._queue.put(("wake", None, 0))
+        self._signs.put(None)
 
     def get(self, timeout: float) -> tuple[str, Any]:
-        """The oldest event, or `queue.Empty` after `timeout` seconds."""
-        kind, event, size = self._queue.get(timeout=timeout)
-        if kind != "wake":
-            with self._lock:
-                self._count[kind] -= 1
-                self._size[kind] -= size
+        """The oldest event, hellos after all else but for one in a while; `queue.Empty` after `timeout` seconds."""
+        self._signs.get(timeout=timeout)
+        with self._lock:
+            hello = self._later and (not self._first or self._passed_over >= PATIENCE)
+            waiting = self._later if hello else self._first
+            self._passed_over = 0 if hello else self._passed_over + 1
+            if not waiting:
+                return "wake", None
+            kind, event, size = waiting.popleft()
+            self._count[kind] -= 1
+            self._size[kind] -= size
         return kind, event
 
     def _refusal(self, kind: str, size: int, now: float) -> str:

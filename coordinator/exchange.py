@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from dreamfleet.common.bounds import LONGEST_EPISODE, excess, most_steps
 from dreamfleet.common.errors import DreamfleetError, InternalError
-from dreamfleet.common.messages import MOST_SLOTS, Beat, HelloRequest, Kind, Result, ResultBatch, UploadPart
+from dreamfleet.common.messages import Beat, HelloRequest, Kind, Result, ResultBatch, UploadPart
 from dreamfleet.common.printable import shortened
 from dreamfleet.common.runs import RunSettings
 from dreamfleet.coordinator.admission import Refusals, differ, refusal
@@ -50,7 +50,7 @@ class Exchange:
     def admit(self, request: HelloRequest, now: float) -> None:
         """Welcome a worker; what it computes is compared with the run's fingerprint once there is one."""
         self.refusals.admitted(request.worker)
-        self._fleet.welcome(request.worker, min(request.slots, MOST_SLOTS), request.fingerprint, now)
+        self._fleet.welcome(request.worker, request.slots, request.fingerprint, now)
 
     def beat(self, worker: str, beat: Beat, now: float) -> None:
         """A worker says what it holds."""

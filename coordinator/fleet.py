@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from dreamfleet.common.messages import TAG_BYTES, Beat, Kind, Result, Verdict, VerdictWord
+from dreamfleet.common.messages import MOST_SLOTS, TAG_BYTES, Beat, Kind, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.choice import Choice
 from dreamfleet.coordinator.failure import Failure
 from dreamfleet.coordinator.jobs import Work
@@ -25,6 +25,10 @@ CLOCK_GAP = 2.0  # seconds between ticks that mean a suspended host
 SILENT_BEATS = 5
 ABSENT_BEATS = 2
 ANSWER_BEATS = 2  # after which a worker that was sent nothing hears that it is known
+FORGOTTEN = 600.0  # seconds of silence after which a worker must say hello again
+VISIT = 60.0  # the same for one that was welcomed and has not beaten yet: a guest
+MOST_GUESTS = 256
+MOST_FAILED = 16  # workers that a job's failures are remembered of; two pause the run
 ATTEMPTS = 3  # of a failing job on one worker, where there is no other
 MOST_RECORDS = 4096  # of hosts, those that joined last
 
@@ -71,6 +75,7 @@ class Fleet:
         self._ticked: float | None = None
         self._now = 0.0  # of what is being handled
         self._records: dict[str, HostRecord] = {}  # by name of a host, the one that joined last at the end
+        self._guests: dict[str, None] = {}  # identities, oldest first
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
         self.notes: list[str] = []  # what happened, for whoever writes it down and clears it
@@ -107,11 +112,14 @@ class Fleet:
             heapq.heapify(self._queue)
 
     def welcome(self, identity: str, slots: int, fingerprint: str, now: float) -> None:
-        """A worker was admitted; it has credit from its first beat on."""
+        """A worker was admitted; it has credit from its first beat on, and until then it is one of a few guests."""
         old = self.members.get(identity)
         if old is not None:
-            self._release(old)
-        born = now if old is None else old.born
+            self._forget(old)
+        if len(self._guests) >= MOST_GUESTS:
+            self._forget(self.members[next(iter(self._guests))])
+        self._guests[identity] = None
+        slots, born = min(slots, MOST_SLOTS), now if old is None else old.born
         self.members[identity] = Member(identity, slots, fingerprint, now, born, self._recall_record(identity, old))
 
     def depart(self, identity: str, now: float) -> None:
@@ -122,8 +130,7 @@ class Fleet:
     def dismiss(self, identity: str) -> None:
         """Forget a worker; others get its jobs, and what it says counts no more until it is welcomed again."""
         if member := self.members.get(identity):
-            self._release(member)
-            del self.members[identity]
+            self._forget(member)
 
     def beat(self, identity: str, beat: Beat, now: float) -> None:
         """Reconcile what the worker holds with what it was given."""
@@ -131,6 +138,7 @@ class Fleet:
         if member is None:
             return
         self._hear(member, now)
+        self._guests.pop(identity, None)
         if beat.seen > member.number:
             self._count_on(member, beat.seen)
         member.observe(beat, now)
@@ -156,7 +164,8 @@ class Fleet:
         verdict, work = self._judge(identity, result)
         if member is not None:
             member.leases.pop(result.digest, None)
-            member.verdicts.append(Verdict(result.digest, verdict))
+            if member.known or len(member.verdicts) < MOST_GUESTS:
+                member.verdicts.append(Verdict(result.digest, verdict))
             member.finished += verdict == "accepted"
         if verdict == "accepted":
             self._tail.learn(result.steps)
@@ -193,7 +202,9 @@ class Fleet:
             if member.lost is not None:
                 if now - max(member.lost, member.heard) >= DEPARTURE_GRACE:
                     self._lose(member, now, "left")
-                    del self.members[member.identity]
+                    self._forget(member)
+            elif now - member.heard > (FORGOTTEN if member.known else VISIT):
+                self._forget(member)
             elif not member.silent and now - member.heard > SILENT_BEATS * self._beat:
                 member.silent = True
                 self._lose(member, now, "is silent")
@@ -215,12 +226,13 @@ class Fleet:
                 self._apply(move, given, now)
         sends: list[Send] = []
         for member in self.members.values():
-            if member.lost is None:
-                said = [*self._again(member, now), *self._news(member, given.get(member.identity, ()), durable, now)]
-                if not said and member.awaits_word(now, ANSWER_BEATS * self._beat):
-                    said = [Send(member.identity, 0, Content())]
-                member.spoken = now if said else member.spoken
-                sends += said
+            if member.lost is not None or not member.known:
+                continue
+            said = [*self._again(member, now), *self._news(member, given.get(member.identity, ()), durable, now)]
+            if not said and member.awaits_word(now, ANSWER_BEATS * self._beat):
+                said = [Send(member.identity, 0, Content())]
+            member.spoken = now if said else member.spoken
+            sends += said
         return sends
 
     @property
@@ -279,8 +291,9 @@ class Fleet:
             return ("duplicate" if result.digest in self._accepted else "obsolete"), None
         if result.fitness is None:
             self._failing[result.digest] = wanted
-            wanted.attempts[identity] += 1
-            wanted.failed[identity] = result.error or "no fitness and no reason"
+            if identity in wanted.failed or len(wanted.failed) < MOST_FAILED:
+                wanted.attempts[identity] += 1
+                wanted.failed[identity] = result.error or "no fitness and no reason"
             self.counts["errors"] += 1
             if member := self.members.get(identity):
                 self._drop_lease(member, result.digest)
@@ -331,6 +344,8 @@ class Fleet:
         return record
 
     def _lose(self, member: Member, now: float, what: str) -> None:
+        if not member.known:
+            return  # nothing was given to it, and no log should grow with what strangers call themselves
         self.notes.append(f"worker {member.identity} {what}: {len(member.leases)} jobs are free again")
         if member.leases:
             last = self._records.get(member.identity.partition("/")[0], member.record)
@@ -376,6 +391,12 @@ class Fleet:
             self.counts["reissued"] += 1
             self._enqueue(digest)
 
+    def _forget(self, member: Member) -> None:
+        """It is nobody's member any more; one that lives says hello again, for it is silent to it in turn."""
+        self._release(member)
+        self._guests.pop(member.identity, None)
+        del self.members[member.identity]
+
     def _release(self, member: Member) -> None:
         for digest in list(member.leases):
             self._drop_lease(member, digest)
@@ -408,7 +429,9 @@ class Fleet:
                 passed_over.append(entry)
                 break  # what waits for slack is last in the queue
             able = [name for name in loads if name not in wanted.failed]
-            if not able and all(name in wanted.failed for name, member in self.members.items() if member.present):
+            if not able and all(
+                name in wanted.failed for name, member in self.members.items() if member.present and member.capacity
+            ):
                 able = list(loads)  # nobody else is there: a killed child must not hang a run
             if not able:
                 passed_over.append(entry)
@@ -430,7 +453,7 @@ class Fleet:
 
     def _slack_slots(self) -> int:
         """Rollouts of a mean fill the tail of a generation and never more than a quarter of the slots."""
-        return max(1, sum(member.slots for member in self.members.values() if member.present) // 4)
+        return max(1, sum(member.slots for member in self.members.values() if member.present and member.capacity) // 4)
 
 
 def _failure(wanted: Wanted) -> Failure:

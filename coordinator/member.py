@@ -57,6 +57,7 @@ class Member:
     capacity: int = 0  # unknown, and so without credit, before its first beat
     lost: float | None = None
     silent: bool = False
+    known: bool = False  # by a beat: anybody can say hello
     number: int = 0
     seen: int = 0
     load: float = 0.0
@@ -74,6 +75,7 @@ class Member:
 
     def observe(self, beat: Beat, now: float) -> None:
         """Take what a beat says of the worker itself."""
+        self.known = True
         self.capacity, self.slots, self.seen = beat.capacity, beat.slots, beat.seen
         self.load, self.steps_per_second, self.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
         if beat.running and beat.steps_per_second:

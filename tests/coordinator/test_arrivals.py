@@ -3,7 +3,7 @@ import queue
 import pytest
 
 from dreamfleet.common.messages import MAX_MESSAGE
-from dreamfleet.coordinator.arrivals import BOUNDS, Arrivals, Bound
+from dreamfleet.coordinator.arrivals import BOUNDS, PATIENCE, Arrivals, Bound
 
 
 def taken(arrivals):
@@ -38,6 +38,15 @@ def test_a_burst_of_hellos_is_taken_and_then_so_many_a_second():
     assert sum(arrivals.put("hello", n, 1, 0.0) for n in range(20)) == 0
     assert sum(arrivals.put("hello", n, 1, 1.0) for n in range(20)) == 5
     assert arrivals.dropped["too many in a second"] == 35
+
+
+def test_a_hello_lets_others_pass_but_not_for_ever():
+    arrivals = Arrivals({"hello": Bound(10, 1000), "beat": Bound(100, 1000)})
+    arrivals.put("hello", 0, 1, 0.0)
+    for number in range(2 * PATIENCE):
+        arrivals.put("beat", number, 1, 0.0)
+    kinds = [kind for kind, _ in taken(arrivals)]
+    assert kinds == ["beat"] * PATIENCE + ["hello"] + ["beat"] * PATIENCE
 
 
 def test_a_wake_is_never_dropped():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.messages import TAG_BYTES, Beat, Result, Running
-from dreamfleet.coordinator.fleet import DEPARTURE_GRACE, SILENT_BEATS, Fleet
+from dreamfleet.coordinator.fleet import DEPARTURE_GRACE, FORGOTTEN, MOST_GUESTS, MOST_SLOTS, SILENT_BEATS, VISIT, Fleet
 from dreamfleet.coordinator.jobs import make_work, travelling
 from dreamfleet.coordinator.tail import UPLOAD_SECONDS
 from tests.support.samples import HEAD, SPEC
@@ -369,3 +369,35 @@ def test_memory_stays_flat_through_a_hundred_thousand_generations_of_churn():
     tracemalloc.stop()
     assert held[1] - held[0] < 200_000
     assert set(fleet.members) == {A}
+
+
+def test_who_says_hello_and_never_beats_is_one_of_a_few_and_soon_forgotten():
+    fleet = fleet_of(A)
+    for number in range(20_000):
+        fleet.welcome(f"stranger/{number:08x}", 2**62, "f", 1.0)
+    assert len(fleet.members) == 1 + MOST_GUESTS
+    assert max(member.slots for member in fleet.members.values()) == MOST_SLOTS
+    for now in range(1, int(VISIT) + 3):
+        fleet.beat(A, beat(), float(now))
+        fleet.tick(float(now))
+    assert set(fleet.members) == {A}
+    assert not fleet.notes, "no log grows with what strangers call themselves"
+
+
+def test_a_worker_that_beats_is_forgotten_only_after_a_long_silence():
+    fleet = fleet_of(A)
+    for now in range(int(FORGOTTEN)):
+        fleet.tick(float(now))
+    assert fleet.members[A].silent
+    for now in range(int(FORGOTTEN), int(FORGOTTEN) + 10):
+        fleet.tick(float(now))
+    assert not fleet.members
+    assert fleet.result(A, result(work(1)[0].job.digest), 100.0)[0] == "accepted", "its results still count"
+
+
+def test_a_stranger_who_only_said_hello_keeps_no_failing_job_from_being_tried_again():
+    fleet = fleet_of(A, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.welcome(B, 4, "f", 0.0)
+    fleet.result(A, result(digest, error="killed"), 0.1)
+    assert digests(fleet.dispatch(0.2), A) == [digest]

@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from dreamfleet.common import keys
-from dreamfleet.common.codec import decode_json, encode
+from dreamfleet.common.codec import decode_json, encode, encode_json
 from dreamfleet.common.messages import MAX_MESSAGE, ControlReply, HelloReply
 from dreamfleet.common.session import Network, open_session
 from dreamfleet.common.status import PARTS
@@ -145,3 +145,37 @@ def test_every_query_is_answered_whatever_it_asks_for(processes, random_bundle):
             (reply,) = session.get(keys.bundle("test", random_bundle.sha256) + asked, timeout=5)
             assert reply.ok is not None or b"whole numbers" in reply.err.payload.to_bytes(), text[:20]
     assert processes.status()["state"] == "waiting for workers"
+
+
+def test_large_messages_fill_no_memory_and_the_run_goes_on(processes, random_bundle):
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
+    )  # fmt: skip
+    processes.worker("--task", tasks.SLOW_TOY)
+    coordinator.wait_for("generation 0: mean")
+    before, most = resident(coordinator), 0
+    with open_session(Network(connect=(processes.endpoint,))) as session:
+        for number in range(40):
+            key = getattr(keys, ("result", "beat", "upload")[number % 3])("test", "stranger/0badc0de")
+            session.put(key, bytes(40_000_000), congestion_control=zenoh.CongestionControl.BLOCK)
+            most = max(most, resident(coordinator))
+        coordinator.wait_for("generation", times=2)
+    assert most - before < 100e6
+
+
+def test_a_flood_of_hellos_leaves_few_guests_and_the_run_goes_on(processes, random_bundle):
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0, "--mixed",
+    )  # fmt: skip
+    processes.worker("--task", tasks.SLOW_TOY)
+    coordinator.wait_for("generation 0: mean")
+    before = resident(coordinator)
+    with open_session(Network(connect=(processes.endpoint,))) as session:
+        for number in range(20_000):
+            request = replace(HELLO, worker=f"stranger/{number:08x}", fingerprint="x" * 2000, slots=2**60)
+            session.get(keys.hello("test"), lambda _: None, payload=encode_json(request), timeout=2)
+        coordinator.wait_for("generation", times=2)
+        status = processes.status()
+    assert 1 < status["workers"]["known"] < 400
+    assert status["dropped"]["too many in a second"] > 1000
+    assert resident(coordinator) - before < 60e6

@@ -14,7 +14,7 @@ from dreamfleet.common.asking import ask_all
 from dreamfleet.common.codec import Inbox, MalformedError, encode_json, from_plain
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, fingerprint, package_version
-from dreamfleet.common.messages import HelloReply, HelloRequest, Intervals, TaskSpec
+from dreamfleet.common.messages import MAX_TEXT, HelloReply, HelloRequest, Intervals, TaskSpec
 from dreamfleet.common.printable import one_line
 from dreamfleet.worker.service.announced import check_announced
 
@@ -42,7 +42,8 @@ def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: I
     """
     reply = _say(session, run, request, inbox)
     if reply is not None and not reply.accepted and reply.packages != request.packages:
-        about = replace(request, packages=reply.packages, fingerprint=fingerprint(reply.packages))
+        named = fingerprint(reply.packages)[:MAX_TEXT]  # the packages that they name are theirs to choose
+        about = replace(request, packages=reply.packages, fingerprint=named)
         reply = _say(session, reply.run, about, inbox)
     if reply is None:
         return None
@@ -53,13 +54,20 @@ def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: I
 
 def _say(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> HelloReply | None:
     replies = [reply for payload in ask_all(session, [keys.hello(run or "*")], HELLO_TIMEOUT, encode_json(request))
-               if (reply := inbox.decode_json(HelloReply, payload)) is not None]  # fmt: skip
+               if (reply := inbox.decode_json(HelloReply, payload)) is not None and _names_a_run(reply)]  # fmt: skip
     if not replies:
         return None
     if len(replies) > 1:
         names = ", ".join(sorted(reply.run for reply in replies))
         raise UsageError(f"several runs are live: choose one with --run: {names}")
     return replies[0]
+
+
+def _names_a_run(reply: HelloReply) -> bool:
+    """Whether an answer is of a run at all: what else answers is nobody's coordinator."""
+    with suppress(UsageError):
+        return bool(keys.check_run_name(reply.run))
+    return False
 
 
 def neediest(session: zenoh.Session, without: Collection[str] = ()) -> str | None:

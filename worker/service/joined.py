@@ -20,6 +20,7 @@ from dreamfleet.common import keys
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.errors import RefusedError
 from dreamfleet.common.messages import JobBatch, Result
+from dreamfleet.common.mishaps import Mishaps
 from dreamfleet.common.session import enqueue_into
 from dreamfleet.worker.service.admission import Admission
 from dreamfleet.worker.service.backlog import Backlog
@@ -31,6 +32,7 @@ from dreamfleet.worker.service.slots import Slots
 from dreamfleet.worker.service.uploads import PACE, Uploads
 
 log = logging.getLogger(__name__)
+MOST_WAITING = 1024  # batches; a coordinator sends again what was not seen
 CLOCK_GAP = 2.0  # seconds between turns of the loop that mean a suspended host
 
 Events = queue.SimpleQueue[tuple[str, Any]]
@@ -61,6 +63,7 @@ class JoinedRun:
         self._outbox = Outbox(admission.intervals.repeat)
         self._uploads = Uploads(admission.intervals.repeat)
         self._rate = Rate(monotonic())
+        self._mishaps = Mishaps(log)
         self._beat_at = 0.0
         self._finished = self._steps_finished = 0
 
@@ -75,7 +78,9 @@ class JoinedRun:
         self._membership.join(self._admission.nonce, self._admission.intervals.beat, monotonic())
         coordinators = keys.live_coordinator(run, "*")
         declared = [
-            session.declare_subscriber(keys.job(run, self._line.identity), enqueue_into(self._events, "job")),
+            session.declare_subscriber(
+                keys.job(run, self._line.identity), enqueue_into(self._events, "job", MOST_WAITING)
+            ),
             session.liveliness().declare_subscriber(
                 coordinators, enqueue_into(self._events, "coordinator"), history=True
             ),
@@ -114,12 +119,20 @@ class JoinedRun:
                 self._handle(*self._events.get_nowait())
 
     def _handle(self, kind: str, event: Any) -> None:
-        if kind == "job":
-            self._take_batch(event.payload.to_bytes())
-        elif kind == "slot":
+        """One event. No message of a coordinator ends a worker: what raises costs that message, which is sent again.
+
+        What a slot says is our own affair: a slot that cannot start ends the worker.
+        """
+        if kind == "slot":
             self._take_slot_event(event)
-        elif kind == "coordinator":
-            self._take_token(event)
+            return
+        try:
+            if kind == "job":
+                self._take_batch(event.payload.to_bytes())
+            elif kind == "coordinator":
+                self._take_token(event)
+        except Exception as error:
+            self._mishaps.note(kind, error, event)
 
     def _take_token(self, event: zenoh.Sample) -> None:
         nonce = str(event.key_expr).rsplit("/", 1)[-1]

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from dreamfleet.common.messages import Result
 
-BATCH = 64  # results of a message: each is far below a kilobyte
+BATCH = 64  # results of a message
+ROOM = 32 * 1024  # bytes of a message's errors: without one a result is far below a kilobyte
 
 
 @dataclass
@@ -53,5 +54,18 @@ class Outbox:
         due = [each for each in self._waiting.values() if each.sent is None or now - each.sent >= self.repeat]
         for waiting in due:
             waiting.sent = now
-        results = [waiting.result for waiting in due]
-        return [tuple(results[start : start + BATCH]) for start in range(0, len(results), BATCH)]
+        return _messages([waiting.result for waiting in due])
+
+
+def _messages(results: list[Result]) -> list[tuple[Result, ...]]:
+    """The results in as many messages as hold them, however long their errors are."""
+    messages: list[list[Result]] = []
+    room = 0
+    for result in results:
+        size = len((result.error or "").encode(errors="replace"))
+        if not messages or len(messages[-1]) == BATCH or size > room:
+            messages.append([])
+            room = ROOM
+        messages[-1].append(result)
+        room -= size
+    return [tuple(each) for each in messages]

@@ -13,12 +13,14 @@ from typing import Any
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.messages import Job, Result, TaskSpec
+from dreamfleet.common.printable import shortened
 from dreamfleet.worker.service.child import Ready
 from dreamfleet.worker.service.process import ChildProcess, Word
 from dreamfleet.worker.service.turn import Done, Failure, Turn, Work
 
 log = logging.getLogger(__name__)
 FAILED_STARTS = 3
+LONGEST_NAME = 100  # characters of who draws, which a task says
 RESPITE = 2.0  # seconds until a host that had no room for a child is asked again
 REMEDY = "give it fewer --slots, or this host more room (ulimit -n, ulimit -u, memory, the disk of temporary files)"
 LONGEST_PAUSE = 30.0  # seconds before another child, where one after another ends without having done anything
@@ -155,7 +157,7 @@ class Slot:
         if event.life != self._life:
             return ()
         if isinstance(event.word, Ready):
-            self.ready, self.drawn_by = True, event.word.drawn_by
+            self.ready, self.drawn_by = True, shortened(event.word.drawn_by, LONGEST_NAME) or "-"
             self._failed_starts = 0
             self._watch_anew()
         elif isinstance(event.word, Done):

@@ -1,0 +1,31 @@
+"""What a coordinator says, or a task of its worker, ends no worker."""
+
+from dreamfleet.common.codec import encode
+from dreamfleet.common.messages import MAX_TEXT, Result, ResultBatch
+from dreamfleet.worker.service.joined import JoinedRun
+from dreamfleet.worker.service.outbox import Outbox
+from tests.support.samples import HEAD
+from tests.support.stage import wait_for
+
+
+def test_a_batch_that_raises_costs_itself_alone(stage, cached, said, monkeypatch):
+    hand = stage.hand()
+    stage.worker()
+    hand.ready()
+    take = JoinedRun._take_batch
+    monkeypatch.setattr(JoinedRun, "_take_batch", lambda *_: 1 / 0)
+    hand.send(1, hand.job())
+    assert "ZeroDivisionError" in wait_for(said, "dropped a job")
+    monkeypatch.setattr(JoinedRun, "_take_batch", take)
+    hand.send(1, hand.job())
+    assert hand.result(hand.job()).fitness is not None
+
+
+def test_results_with_long_errors_are_spread_over_messages_that_hold_them():
+    outbox = Outbox(1.0)
+    for number in range(200):
+        outbox.add(Result(number.to_bytes(32), None, 0, 0.0, "ü" * MAX_TEXT, None))
+    messages = outbox.due(0.0)
+    for results in messages:
+        encode(ResultBatch(**HEAD, fingerprint="f" * MAX_TEXT, results=results))
+    assert sum(map(len, messages)) == 200
