@@ -1,5 +1,5 @@
 /* From shapes to pixels, one row of cells at a time: finds its dirty cells, draws inside them only, and averages each
-   as pygame's smoothscale does. Compiled a second time for processors with AVX2, see wide_avx2.c. */
+   as pygame's smoothscale does. Compiled again for wider processors, see wide_avx2.c and wide_avx512.c. */
 
 #include "canvas.h"
 
@@ -264,12 +264,20 @@ static inline void paint(uint32_t *row, int left, int right, uint32_t colour)
     if (count > 7) {
         __m256i eight = _mm256_set1_epi32((int)colour);
         int last = count - 8;
-        for (; last > 8; last -= 16, to += 16) {
+        for (; last > 24; last -= 16, to += 16) {
             _mm256_storeu_si256((__m256i *)to, eight);
             _mm256_storeu_si256((__m256i *)(to + 8), eight);
         }
-        _mm256_storeu_si256((__m256i *)(to + MIN(last, 0)), eight);
+        _mm256_storeu_si256((__m256i *)to, eight);
+        _mm256_storeu_si256((__m256i *)(to + MIN(last, 8)), eight);
+        _mm256_storeu_si256((__m256i *)(to + MIN(last, 16)), eight);
         _mm256_storeu_si256((__m256i *)(to + last), eight);
+        return;
+    }
+    if (count > 3) {
+        __m128i four = _mm_set1_epi32((int)colour);
+        _mm_storeu_si128((__m128i *)to, four);
+        _mm_storeu_si128((__m128i *)(to + count - 4), four);
         return;
     }
 #elif defined(__SSE2__)
