@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import io
 import json
 import os
 import re
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -20,13 +21,14 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from dreamfleet.common.archives import Archive, DamagedError, Limits, open_archive
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.controller import ControllerShape
-from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.fields import OPTIONAL, written
-from dreamfleet.common.files import write_aside
+from dreamfleet.common.files import is_there, open_growing, open_regular, read_regular, write_aside
 from dreamfleet.common.messages import Between, Word
-from dreamfleet.common.tensors import is_empty, read_array, weights_finite
+from dreamfleet.common.tensors import UnfitError, check_fit, is_empty, read_array, weights_finite
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -36,6 +38,8 @@ LINEAR, LAYERED = "controller-linear.onnx", "controller-hidden.onnx"  # controll
 WEIGHTS = "weights.safetensors"  # only in bundles that training goes on from
 REQUIRED = (ENCODER, DECODER, POLICY, INITIAL)
 _EPOCH = (1980, 1, 1, 0, 0, 0)
+MAX_BUNDLE = 256 << 20  # bytes, of the file and of all that it holds: the largest known is 16 MB
+_LIMITS = Limits(MAX_BUNDLE)
 _MAX_MANIFEST = 1_000_000
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
@@ -68,23 +72,38 @@ class Bundle:
         self._shape = shape
 
     @classmethod
-    def open(cls, path: Path | str) -> Bundle:
-        """Verify a bundle whole: archive, manifest, each part's hash; `BundleError` says what is wrong."""
+    def open(cls, path: Path | str, sha256: str | None = None) -> Bundle:
+        """Verify a bundle whole: archive, manifest, each part's hash, and its own if `sha256` names one.
+
+        What is verified is what was read: a file that is swapped meanwhile cannot pass. `BundleError` says what is
+        wrong.
+        """
         path = Path(path)  # a text is one too
         try:
-            sha256 = hash_file(path)
-            with zipfile.ZipFile(path) as archive:
-                manifest = _read_manifest(archive, path)
-                for name in {*REQUIRED, *manifest.parts}:
-                    data = archive.read(name)
-                    if hashlib.sha256(data).hexdigest() != manifest.parts.get(name):
-                        raise BundleError(f"{path}: part {name} is damaged; fetch or build the bundle again")
-                    _look(path, manifest, name, data)
+            data = read_regular(path, MAX_BUNDLE)
         except FileNotFoundError:
             raise BundleError(f"no bundle at {path}") from None
-        except (OSError, zipfile.BadZipFile, KeyError, EOFError, NotImplementedError) as error:
+        except OSError as error:
+            raise BundleError(f"{path} is not a whole bundle ({error.strerror}); fetch or build it again") from error
+        return cls._of(path, data, sha256)
+
+    @classmethod
+    def _of(cls, path: Path, data: bytes, wanted: str | None) -> Bundle:
+        """The bundle that these bytes of `path` are."""
+        found = hashlib.sha256(data).hexdigest()
+        if wanted is not None and found != wanted:
+            raise BundleError(
+                f"{path} is not the world model that is wanted: its hash is {found[:12]}..., not {wanted[:12]}...; "
+                "put the right one there; one in a cache may be deleted, and is fetched again"
+            )
+        try:
+            with open_archive(io.BytesIO(data), _LIMITS) as archive:
+                manifest = _read_manifest(archive, path)
+                for name in {*REQUIRED, *manifest.parts}:
+                    _look(path, manifest, name, _read_part(archive, path, manifest, name))
+        except DamagedError as error:
             raise BundleError(f"{path} is not a whole bundle ({error}); fetch or build it again") from error
-        return cls(path, sha256, manifest)
+        return cls(path, found, manifest)
 
     @property
     def default_shape(self) -> ControllerShape:
@@ -118,11 +137,17 @@ class Bundle:
         return Bundle(self.path, self.sha256, self.manifest, shape)
 
     def read(self, name: str) -> bytes:
-        """One part's bytes; `BundleError` if the bundle has no such part."""
+        """One part's bytes; `BundleError` if the bundle has no such part.
+
+        They are of the hash that the verified manifest gives them, whatever lies at the path by now.
+        """
         if name not in self.manifest.parts:
             raise BundleError(f"{self.path} holds no {name}")
-        with zipfile.ZipFile(self.path) as archive:
-            return archive.read(name)
+        try:
+            with open_regular(self.path, MAX_BUNDLE) as file, open_archive(file, _LIMITS) as archive:
+                return _read_part(archive, self.path, self.manifest, name)
+        except (OSError, DamagedError) as error:
+            raise BundleError(f"{self.path} was changed while it was in use ({error}); fetch it again") from error
 
 
 def write_bundle(path: Path, manifest: Manifest, parts: Mapping[str, bytes]) -> Bundle:
@@ -145,12 +170,13 @@ class BundleStore:
         """The verified bundle of this hash; a damaged cached copy is removed, so that it is fetched again."""
         cached = self._path(sha256)
         for path in (cached, *shipped_bundles().values()):
-            if not path.exists():
+            if (data := _bytes_of(path)) is None:
                 continue
-            if hash_file(path) == sha256:
-                return Bundle.open(path)
+            if hashlib.sha256(data).hexdigest() == sha256:
+                return Bundle._of(path, data, sha256)
             if path == cached:  # looked at, and wrong; one that another process completes meanwhile must stay
-                path.unlink(missing_ok=True)
+                with suppress(OSError):
+                    path.unlink(missing_ok=True)
         return None
 
     @contextmanager
@@ -162,25 +188,32 @@ class BundleStore:
         partial = self._partial(sha256)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            lock = partial.with_suffix(".lock").open("w")
+            lock = open_growing(partial.with_suffix(".lock"))
         except OSError as error:
-            raise BundleError(
-                f"cannot write in {self._folder}: {error.strerror}; point $DREAMFLEET_CACHE elsewhere"
-            ) from error
+            raise self.unwritable(error) from error
         with lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield partial
 
     def complete(self, sha256: str) -> Bundle:
         """Verify a finished download and give it its name; a wrong one is removed."""
-        partial = self._partial(sha256)
-        if (found := hash_file(partial)) != sha256:
-            partial.unlink()
-            raise BundleError(
-                f"the bundle arrived damaged: its hash is {found[:12]}..., not {sha256[:12]}...; try again"
-            )
-        partial.replace(self._path(sha256))
-        return Bundle.open(self._path(sha256))
+        partial, path = self._partial(sha256), self._path(sha256)
+        try:
+            if (found := hash_file(partial)) != sha256:
+                partial.unlink()
+                raise BundleError(
+                    f"the bundle arrived damaged: its hash is {found[:12]}..., not {sha256[:12]}...; try again"
+                )
+            partial.replace(path)
+        except OSError as error:
+            raise self.unwritable(error) from error
+        return Bundle.open(path, sha256)
+
+    def unwritable(self, error: OSError) -> BundleError:
+        """What to say where the folder takes nothing."""
+        return BundleError(
+            f"cannot write in {self._folder}: {error.strerror}; make room there, or point $DREAMFLEET_CACHE elsewhere"
+        )
 
     def _path(self, sha256: str) -> Path:
         return self._folder / f"{_checked(sha256)}.zip"
@@ -199,8 +232,12 @@ def _checked(sha256: str) -> str:
 def default_cache() -> Path:
     """`$DREAMFLEET_CACHE`, else `dreamfleet` in the user's cache folder."""
     given = os.environ.get("DREAMFLEET_CACHE")
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(given) if given else Path(base) / "dreamfleet"
+    if given:
+        return Path(given)
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dreamfleet"
+    except RuntimeError as error:  # neither $HOME nor the user's entry names a folder
+        raise UsageError("this user has no home folder: point $DREAMFLEET_CACHE at one for the cache") from error
 
 
 def pretrained() -> Path:
@@ -218,19 +255,24 @@ def find_bundle(name: str) -> Bundle:
     shipped = shipped_bundles()
     if name in shipped:
         return Bundle.open(shipped[name])
-    if not Path(name).exists():
+    if not is_there(Path(name)):
         raise BundleError(f"no bundle {name!r}: give a file, or one that ships: {', '.join(shipped) or 'none'}")
     return Bundle.open(Path(name))
 
 
 def hash_file(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as file:
+    """SHA-256 of a file, hexadecimal; `OSError` for what is none."""
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _look(path: Path, manifest: Manifest, name: str, data: bytes) -> None:
     """Refuse what would only show as nonsense while it is scored."""
+    if name.endswith(".onnx"):
+        try:
+            check_fit(data)
+        except UnfitError as error:
+            raise BundleError(f"{path}: {name} {error}; build the bundle again") from error
     if name.endswith(".onnx") and is_empty(data):
         raise BundleError(
             f"{path}: {name} is an empty graph; fetch the bundle again, or build it again from its models"
@@ -241,7 +283,7 @@ def _look(path: Path, manifest: Manifest, name: str, data: bytes) -> None:
         return
     try:
         latents = read_array(data)
-    except (ValueError, EOFError) as error:
+    except ValueError as error:
         raise BundleError(f"{path}: {name} is no array of latents ({error}); build the bundle again") from error
     if latents.ndim != 3 or latents.shape[1:] != (2, manifest.latent) or not len(latents):
         raise BundleError(
@@ -252,13 +294,32 @@ def _look(path: Path, manifest: Manifest, name: str, data: bytes) -> None:
         raise BundleError(f"{path}: {name} holds NaN or infinity; encode the rollouts again")
 
 
-def _read_manifest(archive: zipfile.ZipFile, path: Path) -> Manifest:
-    if archive.getinfo(MANIFEST).file_size > _MAX_MANIFEST:
-        raise BundleError(f"{path}: the manifest is too large to be one")
+def _bytes_of(path: Path) -> bytes | None:
+    """What lies at a path; `None` if that is nothing, or nothing that can be read."""
     try:
-        plain = json.loads(archive.read(MANIFEST))
+        return read_regular(path, MAX_BUNDLE)
+    except OSError:
+        return None
+
+
+def _read_part(archive: Archive, path: Path, manifest: Manifest, name: str) -> bytes:
+    """One part, of the hash that the manifest says."""
+    data = archive.read(name)
+    if hashlib.sha256(data).hexdigest() != manifest.parts.get(name):
+        raise BundleError(f"{path}: part {name} is damaged; fetch or build the bundle again")
+    return data
+
+
+def _read_manifest(archive: Archive, path: Path) -> Manifest:
+    try:
+        plain = json.loads(archive.read(MANIFEST, _MAX_MANIFEST))
         if plain["format"] != FORMAT:
-            raise BundleError(f"{path} has bundle format {plain['format']}; this version reads {FORMAT}")
-        return from_plain(Manifest, plain)
-    except (ValueError, TypeError, MalformedError, RecursionError) as error:
+            raise BundleError(f"{path} has bundle format {plain['format']!r:.20}; this version reads {FORMAT}")
+        manifest = from_plain(Manifest, plain)
+        if not all(isinstance(each, dict) for each in manifest.models.values()):
+            raise MalformedError("models are no configurations")
+    except DamagedError:
+        raise
+    except (ValueError, TypeError, KeyError, MalformedError, RecursionError) as error:
         raise BundleError(f"{path}: the manifest cannot be read ({error})") from error
+    return manifest

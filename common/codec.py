@@ -260,7 +260,22 @@ def _mapping_checker(hint: Any) -> Check:
     return mapping
 
 
+def _text(value: Any) -> str:
+    """Text that can travel: JSON may hold half a surrogate pair, which neither UTF-8 nor a journal takes."""
+    if type(value) is not str:
+        raise MalformedError("wrong type")
+    if not value.isascii():
+        try:
+            value.encode()
+        except UnicodeEncodeError:
+            raise MalformedError("half a surrogate pair") from None
+    return value
+
+
 def _exactly(kind: type[Any]) -> Check:
+    if kind is str:
+        return _text
+
     def exactly(value: Any) -> Any:
         if type(value) is not kind:  # a bool is no count
             raise MalformedError("wrong type")

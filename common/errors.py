@@ -31,6 +31,10 @@ class JournalError(DreamfleetError):
     """A run's journal is missing, foreign, damaged, locked or cannot be written."""
 
 
+class InternalError(DreamfleetError):
+    """A fault of ours left in doubt what is in memory; what is on disk is whole."""
+
+
 class ConnectionFailedError(DreamfleetError):
     """Nobody answered over Zenoh, or the address cannot be listened on."""
 

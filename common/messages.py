@@ -21,6 +21,8 @@ MAX_PART = 40 * 1024  # room for the envelope around a part's bytes
 MAX_UPLOAD = 32 << 20  # a rollout of 1000 steps is 12 MB (64x64) or 28 MB (96x96) before it is compressed
 MAX_OPTIONS = 8_000  # characters: a status and a controller carry them too
 MAX_LEASES = 1024  # of one worker: so that a beat, which names them all, stays under MAX_MESSAGE
+MOST_SLOTS = 4096  # of one worker
+MAX_TEXT = 2000  # characters: of an error, of why a worker is refused, of a fingerprint
 TAG_BYTES = 8
 COLDEST, HOTTEST = 1e-3, 1e3  # of a dream
 
@@ -48,7 +50,7 @@ Tag = Annotated[
     bytes, Length(TAG_BYTES, TAG_BYTES)
 ]  # a digest's first bytes, where only a worker's own jobs are told apart
 Word = Annotated[str, Length(1, 128)]
-Text = Annotated[str, Length(0, 2000)]
+Text = Annotated[str, Length(0, MAX_TEXT)]
 Part = Annotated[bytes, Length(0, MAX_PART)]
 Temperature = Annotated[float, Between(COLDEST, HOTTEST)]
 Packages = Annotated[tuple[Word, ...], Length(0, 64)]
@@ -188,7 +190,7 @@ class Beat(Message):
     nonce: Word
     seen: Count  # every batch up to this number has arrived
     capacity: Annotated[int, Between(0, MAX_LEASES)]  # slots x the task's width
-    slots: Annotated[int, Between(0, 4096)]
+    slots: Annotated[int, Between(0, MOST_SLOTS)]
     queued: Annotated[tuple[Tag, ...], Length(0, MAX_LEASES)]
     running: Annotated[tuple[Running, ...], Length(0, MAX_LEASES)]
     unacked: Annotated[tuple[Tag, ...], Length(0, MAX_LEASES)]  # oldest first

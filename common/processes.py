@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import queue
 import shlex
@@ -15,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from dreamfleet.common.errors import DreamfleetError
 
@@ -45,6 +46,14 @@ def call(*words: object) -> None:
     """Run a verb to its end in this terminal; `DreamfleetError` if it fails."""
     if subprocess.run(command(*words), check=False).returncode != 0:  # noqa: S603 - our own interpreter and verb
         raise DreamfleetError(f"dreamfleet {words[0]} failed")
+
+
+def ask(*words: object) -> Any:
+    """Run a verb to its end, its progress in this terminal, and read the JSON that it prints."""
+    done = subprocess.run(command(*words), check=False, stdout=subprocess.PIPE)  # noqa: S603 - our own interpreter
+    if done.returncode != 0:
+        raise DreamfleetError(f"dreamfleet {words[0]} failed")
+    return json.loads(done.stdout)
 
 
 class Child:

@@ -6,9 +6,9 @@ import json
 import math
 import os
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common import schema
+from dreamfleet.common.bounds import finite, saturated
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
@@ -29,6 +30,7 @@ BUNDLE = "bundle.zip"
 CONTROLLER = "controller.npz"
 ARCHIVE = "archive"
 ROLLOUTS = "rollouts"
+CONFIRMED = "confirmed"  # the fact's name
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ class RunSettings:
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions its fingerprint names
     optimiser: str = field(default="cma", metadata=OPTIONAL)  # registered, or module:attribute
     optimiser_options: tuple[str, ...] = field(default=(), metadata=OPTIONAL)  # each as name=value
+    # Fresh tracks on which the reported mean is driven as the run ends; 0: never, as in runs from before this.
+    confirm_episodes: Annotated[int, Between(0, 10**4)] = field(default=0, metadata=OPTIONAL)
 
     def to_json(self) -> str:
         """The text kept in the journal."""
@@ -117,6 +121,57 @@ class StoredEvaluation:
         return other.mean - self.mean > 2 * math.hypot(other.error, self.error)
 
 
+@dataclass(frozen=True)
+class StoredConfirmation:
+    """What a run reports as it ends: `generation`'s mean on fresh validation tracks, which took no part in any choice.
+
+    It was chosen among the evaluated means by other tracks. So `mean` is not the best of many looks but one look, and
+    its expected value is what the controller is worth.
+    """
+
+    generation: int
+    episodes: int
+    mean: float
+    std: float  # of the sample: `episodes - 1` in the denominator
+    closed: int  # generations that were closed by then: the evaluations of these were chosen among
+
+    @property
+    def error(self) -> float:
+        """Standard error of the mean."""
+        return self.std / math.sqrt(self.episodes)
+
+    def covers(self, best: StoredEvaluation | None) -> bool:
+        """Whether the best evaluated mean was among those that were chosen among; else the run went on and is ahead."""
+        return best is None or best.generation < self.closed
+
+    def to_json(self) -> str:
+        """The text kept in the journal."""
+        return json.dumps(asdict(self), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> StoredConfirmation:
+        """Read what `to_json` wrote; `JournalError` if it is damaged."""
+        try:
+            return from_plain(cls, json.loads(text))
+        except (ValueError, TypeError, MalformedError) as error:
+            raise JournalError(f"the journal's confirmed score is damaged: {error}") from error
+
+
+def best_of(evaluations: Iterable[StoredEvaluation]) -> StoredEvaluation | None:
+    """The one of the highest mean; of equals the first."""
+    return max(evaluations, key=lambda each: each.mean, default=None)
+
+
+def told(found: StoredEvaluation | StoredConfirmation | None) -> str:
+    """A mean's score in words, and whether it can be trusted."""
+    if found is None:
+        return "the last mean; it was not evaluated"
+    score = f"generation {found.generation}'s mean scored {found.mean:.1f} ± {found.error:.1f} (standard error)"
+    if isinstance(found, StoredConfirmation):
+        return f"{score} on {found.episodes} fresh validation tracks"
+    return f"{score} on {found.episodes} validation tracks; provisional: it is the best of several looks"
+
+
 class RunFolder:
     """A run's folder, read-only; close it, or use it in a `with`."""
 
@@ -157,7 +212,7 @@ class RunFolder:
 
     @property
     def fingerprint(self) -> str | None:
-        """The fingerprint that the run admits; `None` before its first worker."""
+        """The fingerprint that the run admits: its first accepted result's."""
         return self._fact("fingerprint")
 
     @property
@@ -199,12 +254,21 @@ class RunFolder:
     def history(self) -> list[StoredGeneration]:
         """Every closed generation, oldest first."""
         query = "SELECT number, mean, std, best, worst, sigma, steps, seconds FROM generation WHERE closed IS NOT NULL"
-        return [StoredGeneration(*row) for row in self._all(query + " ORDER BY number")]
+        return [_generation(*row) for row in self._all(query + " ORDER BY number")]
 
     def evaluations(self) -> list[StoredEvaluation]:
         """Every finished evaluation of a mean, oldest first."""
         query = "SELECT generation, episodes, mean, std FROM evaluation WHERE mean IS NOT NULL ORDER BY generation"
-        return [StoredEvaluation(*row) for row in self._all(query)]
+        return [StoredEvaluation(generation, episodes, finite(mean), finite(std))
+                for generation, episodes, mean, std in self._all(query)]  # fmt: skip
+
+    def confirmation(self) -> StoredConfirmation | None:
+        """The confirmed score of what is reported; `None` where what is reported is not confirmed."""
+        text, evaluations = self._fact(CONFIRMED), self.evaluations()
+        if text is None:
+            return None
+        found = StoredConfirmation.from_json(text)
+        return found if found.covers(best_of(evaluations)) else None
 
     def rollouts(self) -> list[Path]:
         """Every collected drive that was accepted, oldest first."""
@@ -233,6 +297,14 @@ class RunFolder:
             return self._connection.execute(query, values).fetchall()
         except sqlite3.DatabaseError as error:
             raise JournalError(f"the journal of run {self.name} is damaged: {error}") from error
+
+
+def _generation(
+    first: int, mean: float, std: float, best: float, worst: float, sigma: float, steps: int, seconds: float
+) -> StoredGeneration:
+    """A row of the journal; older ones hold numbers that cannot be told."""
+    told = finite(mean), finite(std), finite(best), finite(worst), finite(sigma)
+    return StoredGeneration(first, *told, saturated(steps), finite(seconds))
 
 
 _RESULT = "kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint"

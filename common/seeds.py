@@ -9,6 +9,7 @@ import hashlib
 
 TEST = range(10_000, 20_000)
 VALIDATION = range(20_000, 1_000_000)
+CHOOSING, CONFIRMING = 10_000, 20_000  # the first validation tracks of each; an evaluation has those before
 TRAINING_FIRST = 2**20
 TRAINING_LAST = 2**53 - 1  # a JSON number keeps every one of them
 
@@ -26,9 +27,13 @@ def collection_seed(run_seed: int, generation: int, episode: int) -> int:
     return _derived(f"dreamfleet collection {run_seed} {generation} {episode}")
 
 
-def validation_seeds(episodes: int) -> tuple[int, ...]:
-    """The first `episodes` validation seeds: the same tracks at every evaluation, so that its curve is comparable."""
-    return tuple(VALIDATION[:episodes])
+def validation_seeds(episodes: int, first: int = 0) -> tuple[int, ...]:
+    """So many validation seeds from the `first` on.
+
+    Every evaluation has those from 0 on, so that its curve is comparable. What chooses between evaluated means has
+    those from `CHOOSING` on, and what is reported of the chosen one those from `CONFIRMING` on: they chose nothing.
+    """
+    return tuple(VALIDATION[first : first + episodes])
 
 
 def _derived(text: str) -> int:

@@ -17,6 +17,9 @@ from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.network import Network, check_endpoint
 
 LEASE_MS = 4000  # announced by each side: after so long without a sign the other side drops its token
+MAX_RECEIVED = (
+    128 * 1024
+)  # bytes of a message: above it Zenoh itself lets go; the largest of the protocol is MAX_MESSAGE
 __all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_session"]  # an endpoint is of both
 
 
@@ -39,11 +42,12 @@ def _settings(network: Network, timeout_ms: int) -> dict[str, Any]:
         "unicast": {"max_sessions": 10_000, "accept_pending": 10_000} if router else {},
         "shared_memory": {"enabled": False},
         "link": {
+            "rx": {"max_message_size": MAX_RECEIVED},
             "tx": {
                 "lease": LEASE_MS,
                 "keep_alive": 4,
                 "queue": {"congestion_control": {"block": {"wait_before_close": 500_000}}},
-            }
+            },
         },
     }
     retry = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}

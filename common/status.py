@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.fields import OPTIONAL, known
 from dreamfleet.common.messages import MAX_MESSAGE, Count, Length, Seconds, Text, Word
-from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 
 SCHEMA = 2
 PARTS = ("", "generation", "workers", "history", "candidates", "best")
@@ -150,7 +150,7 @@ class Status:
     population: Population  # the head of the open generation's candidates
     last_population: Population | None  # the head of those of the one that was closed last
     evaluation: StoredEvaluation | None  # the last one
-    best: StoredEvaluation | None
+    best: StoredEvaluation | None  # of all; provisional, for the best of many looks is in part luck
     evaluations: Count  # finished ones
     evaluating: Progress
     collecting: Progress
@@ -164,6 +164,8 @@ class Status:
     failures: tuple[FailureStatus, ...]  # the first of them
     dropped: dict[str, int]  # messages, by reason
     refused: dict[str, str] = field(default_factory=dict, metadata=OPTIONAL)  # workers that could not join, and why
+    confirmed: StoredConfirmation | None = field(default=None, metadata=OPTIONAL)  # of what is reported
+    confirming: Progress = field(default=Progress(0, 0), metadata=OPTIONAL)  # one round of a confirmation
 
     @property
     def over(self) -> bool:

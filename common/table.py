@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dreamfleet.common.printable import printable
-from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.status import FailureStatus, OpenGeneration, Progress, Status, WorkerStatus
 
 STATE_STYLES = {
@@ -79,7 +79,7 @@ def _facts(status: Status) -> Table:
         "last generation", _spread(status.last) if status.last else "-",
         "step size", f"{status.generation.sigma:.4f} ({_optimiser(settings)})",
     )  # fmt: skip
-    row("evaluated mean", _evaluated(status.evaluation), "best", _evaluated(status.best))
+    row("evaluated mean", _evaluated(status.evaluation), "reported", _reported(status))
     steps, rate = status.throughput.environment_steps, status.throughput.steps_per_second
     row(
         "throughput", f"{rate:,.0f} steps/s, {steps:,} in all",
@@ -98,10 +98,17 @@ def _optimiser(settings: RunSettings) -> str:
     return settings.covariance if settings.optimiser == "cma" else settings.optimiser
 
 
-def _evaluated(each: StoredEvaluation | None) -> str:
+def _evaluated(each: StoredEvaluation | StoredConfirmation | None) -> str:
     if each is None:
         return "-"
-    return f"{each.mean:.1f} ± {each.std:.1f} on {each.episodes} tracks (generation {each.generation})"
+    tracks = f"{each.episodes} fresh tracks" if isinstance(each, StoredConfirmation) else f"{each.episodes} tracks"
+    return f"{each.mean:.1f} ± {each.error:.1f} on {tracks} (generation {each.generation})"
+
+
+def _reported(status: Status) -> str:
+    if status.confirmed is not None or status.best is None:
+        return _evaluated(status.confirmed)
+    return f"{_evaluated(status.best)}, provisional"
 
 
 def _failure(failure: FailureStatus) -> str:
@@ -114,6 +121,7 @@ def _progress(status: Status) -> Table:
     parts: dict[str, OpenGeneration | Progress] = {
         f"generation {status.generation.number}": status.generation,
         "evaluation": status.evaluating,
+        "confirmation": status.confirming,
         "kept rollouts": status.collecting,
     }
     for label, part in parts.items():

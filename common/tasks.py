@@ -53,7 +53,7 @@ def load_task(name: str) -> Any:
             make = points[head].load()
             return make(rest) if colon else make()
         if colon:
-            return getattr(import_module(head), rest)()
+            return _maker(import_module(head), rest)()
     except ModuleNotFoundError as error:
         raise UsageError(
             f"task {name!r} cannot be loaded: no module {error.name!r} here; install the package that has it, or name "
@@ -63,6 +63,14 @@ def load_task(name: str) -> Any:
         raise UsageError(f"task {name!r} cannot be loaded: {error}") from error
     known = ", ".join(f"{each}:ENVIRONMENT" if each == GYM else each for each in points) or "none"
     raise UsageError(f"unknown task {name!r}: known are {known}")
+
+
+def _maker(module: Any, name: str) -> Any:
+    """A task's class in a module; nothing else is called, for the name may come from a file that was passed on."""
+    found = getattr(module, name)
+    if not isinstance(found, type):
+        raise TypeError(f"{name} of {module.__name__} is no task: it is no class")
+    return found
 
 
 def describes_itself(name: str) -> bool:

@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dreamfleet.common.archives import parse_array
+
+_RUNTIMES_OWN = b"ORTM"  # its flat buffers' mark, which its reader takes for another format
+_DEEPEST = 64  # graphs within nodes within graphs
+_MOST_FIELDS = 500_000  # of all messages of a model; ours have some hundreds
+_MOST_NUMBER = 2**29  # of a field: the runtime's reader cuts longer ones short
+# Of onnx.proto: where messages of each kind hold messages that a tensor may stand in.
+_WITHIN = {
+    "model": {7: "graph", 20: "training", 25: "function"},
+    "training": {1: "graph", 2: "graph"},
+    "function": {7: "node", 11: "attribute"},
+    "graph": {1: "node", 5: "tensor", 15: "sparse"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
+    "sparse": {1: "tensor", 2: "tensor"},
+    "tensor": {},
+}
+_EXTERNAL_DATA, _DATA_LOCATION = 13, 14  # of TensorProto
 
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # protobuf's wire types
 # By onnx.proto's TensorProto.DataType.
@@ -35,6 +53,37 @@ def weights_finite(model: bytes) -> bool:
         return True
 
 
+class UnfitError(ValueError):
+    """What no model may have, in words that follow its name."""
+
+
+def check_fit(model: bytes) -> None:
+    """`UnfitError` if an ONNX model reads other files, or is too much to look through.
+
+    What is no model at all is not judged here; `check_closed` is for those who run it.
+    """
+    try:
+        check_closed(model)
+    except UnfitError:
+        raise
+    except ValueError:
+        return
+
+
+def check_closed(model: bytes) -> None:
+    """`ValueError` unless an ONNX model is one whole message that names no other file.
+
+    Stricter than the runtime's own reader, so that nothing passes here which means something else there: of messages
+    alone, without groups, in which no number is longer than it may be.
+    """
+    if model[4:8] == _RUNTIMES_OWN:
+        raise ValueError("it is in the runtime's own format, not in ONNX")
+    try:
+        _walk(memoryview(model), "model", [_MOST_FIELDS])
+    except IndexError as error:
+        raise ValueError("not a message") from error
+
+
 def is_empty(model: bytes) -> bool:
     """Whether an ONNX model computes nothing: it is no bytes at all, or a message without a node.
 
@@ -48,10 +97,26 @@ def is_empty(model: bytes) -> bool:
 
 def read_array(data: bytes) -> NDArray[np.float32]:
     """A `.npy` of floats; `ValueError` if it is none."""
-    array = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    array = parse_array(data)
     if array.dtype.kind != "f":
         raise ValueError("not an array of floats")
     return np.asarray(array, dtype=np.float32)
+
+
+def _walk(data: memoryview, kind: str, left: list[int], depth: int = 0) -> None:
+    """Look through one message; `left` holds how many fields may still come."""
+    if depth > _DEEPEST:
+        raise UnfitError("is nested too deeply")
+    for number, value in _fields(data):
+        left[0] -= 1
+        if left[0] < 0:
+            raise UnfitError(f"has more than {_MOST_FIELDS} fields")
+        if kind == "tensor" and (number == _EXTERNAL_DATA or (number == _DATA_LOCATION and value != 0)):
+            raise UnfitError("keeps weights in another file, which no graph may read")
+        if (inner := _WITHIN[kind].get(number)) is not None:
+            if not isinstance(value, memoryview):
+                raise ValueError("not a message")
+            _walk(value, inner, left, depth + 1)
 
 
 def _arrays(tensor: memoryview) -> Iterator[NDArray[Any]]:
@@ -72,7 +137,7 @@ def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
     while position < len(data):
         tag, position = _varint(data, position)
         number, kind = tag >> 3, tag & 7
-        if not number:
+        if not 0 < number < _MOST_NUMBER:
             raise ValueError("not a message")
         if kind == _VARINT:
             value, position = _varint(data, position)

@@ -97,6 +97,8 @@ def _best(snapshot: Snapshot, offset: int) -> dict[str, Any]:
     """The best evaluation, and the controller as it would be saved, its parameters from `offset` on."""
     best, reported = snapshot.status.best, snapshot.reported
     document = {"best": None if best is None else asdict(best), "evaluations": snapshot.status.evaluations}
+    confirmed = snapshot.status.confirmed
+    document["confirmed"] = None if confirmed is None else asdict(confirmed)
     if reported is None:
         return {**document, "controller": None}
     controller = reported.controller()

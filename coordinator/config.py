@@ -28,6 +28,7 @@ BOUNDS = {
     "population": (2, 10**5), "episodes": (1, 10**4), "horizon": (1, 10**6), "patience": (0, 10**6),
     "seed": (0, 2**63 - 1), "evaluate_every": (0, 10**6), "evaluation_episodes": (1, 10**4),
     "collect_every": (0, 10**6), "collect_episodes": (1, 10**4), "hidden_units": (1, 10**5),
+    "confirm_episodes": (0, 10**4),
 }  # fmt: skip
 
 
@@ -62,16 +63,25 @@ class RunConfig:
     seed: int = option(1, "makes the run: population and tracks follow from it")
     evaluate_every: int = option(25, "drive the mean in reality every so many generations; 0: never")
     evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation tracks")
+    confirm_episodes: int | None = option(
+        None,
+        "confirm what is reported as the run ends, on so many fresh tracks (default as many as of an evaluation, 2 at "
+        "least); 0: never",
+    )
     collect_every: int = option(0, "keep rollouts of the mean for training, every so many generations; 0: never")
     collect_episodes: int = option(8, "drives that are kept each time, on training tracks")
 
     def __post_init__(self) -> None:
         for name, (least, most) in BOUNDS.items():
             flag, value = f"--{name.replace('_', '-')}", getattr(self, name)
+            if value is None:
+                continue
             if value < least:
                 raise UsageError(f"{flag} must be at least {least}, not {value}")
             if value > most:
                 raise UsageError(f"{flag} must be at most {most}, not {value}")
+        if self.confirm_episodes == 1:
+            raise UsageError("--confirm-episodes must be 0 or at least 2: one track has no standard error")
         check_task(self.task)
         if self.racing and self.episodes < 2:
             raise UsageError("--racing needs at least 2 episodes: there is no second half of one")
@@ -105,6 +115,7 @@ class RunConfig:
             evaluation_episodes=self.evaluation_episodes,
             racing=self.racing,
             features=self.features,
+            confirm_episodes=self._confirm_episodes,
             collect_every=self.collect_every,
             collect_episodes=self.collect_episodes,
             heat=self.heat,
@@ -113,6 +124,13 @@ class RunConfig:
         )
         _try_optimiser(settings)
         return settings
+
+    @property
+    def _confirm_episodes(self) -> int:
+        """None where nothing is evaluated: there is nothing to choose among."""
+        if not self.evaluate_every:
+            return 0
+        return max(self.evaluation_episodes, 2) if self.confirm_episodes is None else self.confirm_episodes
 
     @property
     def _hidden(self) -> int:
@@ -228,7 +246,11 @@ class NetworkConfig:
     listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
     connect: tuple[str, ...] = option((), "connect to these stand-alone routers, as well where --listen is given")
     beat: float = option(1.0, "seconds between a worker's beats")
-    mixed: bool = option(False, "admit workers of any fingerprint; gives up replay to the bit")
+    mixed: bool = option(
+        False,
+        "take results of hosts whose CPU features or package versions differ from those of the first accepted result; "
+        "last bits may then differ, so the run cannot be repeated to the bit",
+    )
 
     def __post_init__(self) -> None:
         if not 0.05 <= self.beat <= 60:
@@ -249,6 +271,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "temperature": 1.5,
         "evaluate_every": 5,
         "evaluation_episodes": 16,
+        "confirm_episodes": 32,
     },
     "frugal": {"population": 32, "episodes": 2, "sigma0": 0.1, "covariance": "diagonal", "patience": 100},
 }

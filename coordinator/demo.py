@@ -10,26 +10,29 @@ import math
 import os
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean, stdev
 
 from rich.console import Console
 from rich.live import Live
+from rich.table import Table
 from rich.text import Text
 
 from dreamfleet.common.client import Client
 from dreamfleet.common.config import option
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
-from dreamfleet.common.processes import Child, call, spoken
-from dreamfleet.common.runs import CONTROLLER, open_run
+from dreamfleet.common.processes import Child, ask, call, spoken
+from dreamfleet.common.runs import CONTROLLER, best_of, open_run
 from dreamfleet.common.table import run_panel
 
 REFRESH = 0.5
 START_SECONDS = 30.0
 PLOT, VIDEO = "fitness.png", "drive.mp4"
 EVALUATE_EVERY, EVALUATION_TRACKS = 5, 8  # generations between looks at reality, and tracks of each
+CONFIRMATION_TRACKS = 16  # on which what a stage reports is confirmed
 
 
 @dataclass(frozen=True)
@@ -80,23 +83,45 @@ class Demo:
         """Evolve, judge, draw, record, and say what to try next."""
         for stage in self._stages:
             self._evolve(stage)
-        best = max(reversed(self._stages), key=self._evaluated)  # of equals the last
-        if len(self._stages) > 1:
-            self._say(f"going on with the mean that drove best when it was evaluated: run {best.run}'s")
+        best = max(reversed(self._stages), key=self._confirmed)  # of equals the last
         folder = self._runs_dir / best.run
-        self._say("judging the outcome on unseen tracks, whole episodes, in gymnasium's own environment")
-        controller = str(folder / CONTROLLER)
-        call("evaluate", "--controller", controller, "--episodes", self._config.tracks)
+        controller = folder / CONTROLLER
+        self._say(
+            f"judging run {best.run}'s controller on unseen tracks, whole episodes, in gymnasium's own environment"
+        )
+        drives = self._judge(controller)
+        self._console.print(self._table(best, drives))
         for stage in self._stages:
             self._plot(stage)
-        self._say("recording a drive, and beside it what the model dreams")
-        call("record", "--controller", controller, "--out", folder / VIDEO, "--steps", 1000)
+        track, score = median_drive(drives)
+        self._say(f"recording the median of these drives ({score:.0f} on track {track}), and what the model dreams")
+        call("record", "--controller", controller, "--out", folder / VIDEO, "--steps", 1000, "--seed", track)
         self._farewell(folder)
 
-    def _evaluated(self, stage: Stage) -> float:
-        """The best score of a stage's mean in reality, on tracks that are the same in every stage."""
+    def _confirmed(self, stage: Stage) -> float:
+        """A stage's confirmed score: in reality, on fresh tracks that are the same in every stage."""
         with open_run(self._runs_dir, stage.run) as run:
-            return max((each.mean for each in run.evaluations()), default=-math.inf)
+            found = run.confirmation()
+        return -math.inf if found is None else found.mean
+
+    def _judge(self, controller: Path) -> dict[int, float]:
+        """Score by track, on tracks that no part of the demonstration has seen."""
+        told = ask("evaluate", "--controller", controller, "--episodes", self._config.tracks, "--json")
+        return dict(zip(told["seeds"], told["scores"], strict=True))
+
+    def _table(self, chosen: Stage, drives: Mapping[int, float]) -> Table:
+        """What each stage's best look promised, what was confirmed, and what the chosen one did on unseen tracks."""
+        table = Table("run", "its best evaluation", "confirmed on fresh tracks", "on unseen tracks", box=None)
+        for stage in self._stages:
+            with open_run(self._runs_dir, stage.run) as run:
+                best, confirmed = best_of(run.evaluations()), run.confirmation()
+            table.add_row(
+                stage.run,
+                "-" if best is None else _score(best.mean, best.error, best.episodes),
+                "-" if confirmed is None else _score(confirmed.mean, confirmed.error, confirmed.episodes),
+                _drives(list(drives.values())) if stage is chosen else "",
+            )
+        return table
 
     def _evolve(self, stage: Stage) -> None:
         workers = self._config.workers or len(os.sched_getaffinity(0))
@@ -163,6 +188,20 @@ class Demo:
         self._console.print(text, style="bold", markup=False)
 
 
+def median_drive(drives: Mapping[int, float]) -> tuple[int, float]:
+    """The track and score of the middle drive, neither the best nor a crash; of an even number the lower one."""
+    return sorted(drives.items(), key=lambda drive: (drive[1], drive[0]))[(len(drives) - 1) // 2]
+
+
+def _score(mean: float, error: float, episodes: int) -> str:
+    return f"{mean:.0f} ± {error:.0f} ({episodes})"
+
+
+def _drives(scores: Sequence[float]) -> str:
+    error = stdev(scores) / math.sqrt(len(scores)) if len(scores) > 1 else 0.0
+    return f"{_score(fmean(scores), error, len(scores))}, {min(scores):.0f} to {max(scores):.0f}"
+
+
 def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
     """The demonstration's runs, in order."""
     found = []
@@ -176,11 +215,13 @@ def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
         flags = {
             "preset": "dream", "temperature": config.temperature, "sigma0": config.sigma0, "seed": config.seed,
             "minutes": config.dream_minutes, "evaluate-every": EVALUATE_EVERY, "evaluation-episodes": EVALUATION_TRACKS,
+            "confirm-episodes": CONFIRMATION_TRACKS,
         }  # fmt: skip
         found.append(Stage(dream, f"evolving in the dream for {config.dream_minutes:g} minutes", flags))
         reality |= {
             "init": runs_dir / dream / CONTROLLER, "sigma0": config.sigma0 / 2,
             "evaluate-every": EVALUATE_EVERY, "evaluation-episodes": EVALUATION_TRACKS,
+            "confirm-episodes": CONFIRMATION_TRACKS,
         }  # fmt: skip
     if config.minutes:
         found.append(Stage(name, f"evolving in reality for {config.minutes:g} minutes", reality))

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection
+from dataclasses import replace
 
-from dreamfleet.common.messages import Beat, HelloRequest, Result, ResultBatch, UploadPart
+from dreamfleet.common.bounds import LONGEST_EPISODE, excess, most_steps
+from dreamfleet.common.errors import DreamfleetError, InternalError
+from dreamfleet.common.messages import MOST_SLOTS, Beat, HelloRequest, Kind, Result, ResultBatch, UploadPart
+from dreamfleet.common.printable import shortened
 from dreamfleet.common.runs import RunSettings
-from dreamfleet.coordinator.admission import Refusals, refusal
-from dreamfleet.coordinator.failure import Failure
+from dreamfleet.coordinator.admission import Refusals, differ, refusal
+from dreamfleet.coordinator.failure import LONGEST_ERROR, Failure
 from dreamfleet.coordinator.fleet import Fleet, Send
 from dreamfleet.coordinator.jobs import Work
-from dreamfleet.coordinator.journal import Journal
+from dreamfleet.coordinator.journal import FINGERPRINT, Journal
 from dreamfleet.coordinator.member import Member
 from dreamfleet.coordinator.slack import Slack
 
@@ -20,10 +24,13 @@ class Exchange:
     """One incarnation's fleet as the service and the status see it; `score` takes accepted results of candidates."""
 
     def __init__(
-        self, journal: Journal, incarnation: int, fleet: Fleet, slack: Slack, score: Callable[[Result], None]
-    ) -> None:
+        self, journal: Journal, incarnation: int, fleet: Fleet, slack: Slack, score: Callable[[Result], None],
+        *, horizon: int, mixed: bool = False,
+    ) -> None:  # fmt: skip
         self.refusals = Refusals()
-        self.fingerprint = journal.fact("fingerprint")  # of the hosts that are admitted; `None` before the first
+        self.fingerprint = journal.fingerprint()  # of the first accepted result; `None` before it
+        self._horizon = horizon  # of a scored episode
+        self._mixed = mixed
         self._journal = journal
         self._incarnation = incarnation
         self._fleet = fleet
@@ -31,21 +38,19 @@ class Exchange:
         self._uploads = slack.collections.uploads
         self._score = score
 
-    def refusal(self, request: HelloRequest, settings: RunSettings, mixed: bool) -> tuple[str, str] | None:
+    def refusal(self, request: HelloRequest, settings: RunSettings) -> tuple[str, str] | None:
         """Why a worker cannot join and what to do about it; `None` if it may."""
-        found = refusal(request, settings.task.task, None if mixed else self.fingerprint, settings.packages)
+        admitted = None if self._mixed else self.fingerprint
+        found = refusal(request, settings.task.task, admitted, settings.packages)
         known = request.packages == settings.packages  # else it says hello again
         if found is not None and known and self.refusals.add(request.worker, found[0]):
             self._fleet.notes.append(f"refused worker {request.worker}: {found[0]}")
         return found
 
     def admit(self, request: HelloRequest, now: float) -> None:
-        """Welcome a worker; the first one's fingerprint becomes the run's."""
+        """Welcome a worker; what it computes is compared with the run's fingerprint once there is one."""
         self.refusals.admitted(request.worker)
-        if self.fingerprint is None:
-            self.fingerprint = request.fingerprint
-            self._journal.set_fact("fingerprint", request.fingerprint)
-        self._fleet.welcome(request.worker, request.slots, request.fingerprint, now)
+        self._fleet.welcome(request.worker, min(request.slots, MOST_SLOTS), request.fingerprint, now)
 
     def beat(self, worker: str, beat: Beat, now: float) -> None:
         """A worker says what it holds."""
@@ -56,17 +61,40 @@ class Exchange:
         self._fleet.depart(worker, now)
 
     def results(self, worker: str, batch: ResultBatch, now: float) -> None:
-        """Judge a worker's results; the first wanted ones are written and counted."""
+        """Judge a worker's results; the first wanted ones are written and counted.
+
+        One that raises keeps none of the others from being counted; then the first such error is raised.
+        """
+        if not self._equal(batch.fingerprint):
+            self._turn_away(worker, batch.fingerprint)
+            return
+        errors = []
         for each in batch.results:
-            result = self._slack.collections.receive(worker, each, self._fleet.wants(each.digest))
-            if result is None:
-                self._fleet.put_off(worker, each.digest, now)
-                continue
-            _, work = self._fleet.result(worker, result, now)
-            if work is not None:
-                self._journal.add_result(work.job, result, worker, batch.fingerprint, self._incarnation)
-                self._count(work, result)
-            self._uploads.forget(result.digest)
+            wanted = self._fleet.wants(each.digest)
+            try:
+                self._result(worker, each, batch.fingerprint, now)
+            except DreamfleetError:
+                raise
+            except Exception as error:
+                if wanted is not None and self._fleet.wants(each.digest) is None:
+                    raise _half_counted(error) from error
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def _result(self, worker: str, said: Result, fingerprint: str, now: float) -> None:
+        work = self._fleet.wants(said.digest)
+        each = said if work is None else bounded(said, work.job.kind, self._horizon)
+        result = self._slack.collections.receive(worker, each, work)
+        if result is None:
+            self._fleet.put_off(worker, each.digest, now)
+            return
+        _, work = self._fleet.result(worker, result, now)
+        if work is not None:
+            self._journal.add_result(work.job, result, worker, fingerprint, self._incarnation)
+            self._settle_fingerprint(fingerprint)
+            self._count(work, result)
+        self._uploads.forget(result.digest)
 
     def upload(self, worker: str, part: UploadPart, now: float) -> None:
         """Take in part of a rollout, from a worker that was given the job and while it is wanted."""
@@ -120,9 +148,55 @@ class Exchange:
         """Parts of uploads that were dropped, by reason."""
         return self._uploads.dropped
 
+    def _equal(self, fingerprint: str) -> bool:
+        """Whether a host of this fingerprint may add to the run."""
+        return self._mixed or self.fingerprint in (None, fingerprint)
+
+    def _settle_fingerprint(self, fingerprint: str) -> None:
+        """The first accepted result's fingerprint becomes the run's, in the transaction that writes the result."""
+        if self.fingerprint is not None:
+            return
+        self.fingerprint = fingerprint
+        self._journal.set_fact(FINGERPRINT, fingerprint)
+        for member in list(self._fleet.members.values()):
+            if not self._equal(member.fingerprint):
+                self._turn_away(member.identity, member.fingerprint)
+
+    def _turn_away(self, worker: str, fingerprint: str) -> None:
+        """Forget a worker of another fingerprint: it hears no more, says hello again, and is told why and what to do.
+
+        Nothing of what it has computed gets a verdict, so that it does not take silence for success.
+        """
+        why, _ = differ(self.fingerprint, fingerprint)
+        self._fleet.dismiss(worker)
+        if self.refusals.add(worker, why):
+            self._fleet.notes.append(f"worker {worker} must go: {why}")
+
     def _count(self, work: Work, result: Result) -> None:
         """What an accepted result, which is in the journal, means to whatever asked for it."""
         if work.job.kind == "score":
             self._score(result)
         else:
             self._slack.count(work, result)
+
+
+def bounded(result: Result, kind: Kind, horizon: int) -> Result:
+    """The result as it may be judged: one whose numbers would spoil the run's is the job's failure.
+
+    `horizon` is of a scored or kept episode; an evaluation drives whole ones, whose length only the world knows.
+    """
+    if kind == "evaluate":
+        horizon = LONGEST_EPISODE
+    steps = min(result.steps, most_steps(horizon))
+    if result.fitness is None:
+        return replace(result, steps=steps)
+    why = excess(result.fitness, result.steps, result.seconds, horizon)
+    return result if why is None else replace(result, fitness=None, steps=steps, error=why, upload=None)
+
+
+def _half_counted(error: Exception) -> InternalError:
+    """A job that nobody wants any more and that was not counted would be waited for without end."""
+    return InternalError(
+        f"a result could not be counted ({type(error).__name__}: {shortened(str(error), LONGEST_ERROR)}); nothing is "
+        "lost: what was committed is whole, and the run can be continued with --resume"
+    )

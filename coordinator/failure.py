@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dreamfleet.common.printable import printable
+from dreamfleet.common.printable import shortened
 from dreamfleet.coordinator.jobs import Work
 
 LONGEST_ERROR = 300  # characters of a worker's error that are told
@@ -43,8 +43,7 @@ class Failure:
 
 def shorten(error: str, longest: int = LONGEST_ERROR) -> str:
     """An error's text, cut to what a line can hold."""
-    error = printable(error)  # it came over the wire
-    return error if len(error) <= longest else error[: longest - 3] + "..."
+    return shortened(error, longest)  # it came over the wire
 
 
 def _number(count: int) -> str:

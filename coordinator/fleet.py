@@ -112,6 +112,12 @@ class Fleet:
         if (member := self.members.get(identity)) and member.lost is None:
             member.lost = now
 
+    def dismiss(self, identity: str) -> None:
+        """Forget a worker; others get its jobs, and what it says counts no more until it is welcomed again."""
+        if member := self.members.get(identity):
+            self._release(member)
+            del self.members[identity]
+
     def beat(self, identity: str, beat: Beat, now: float) -> None:
         """Reconcile what the worker holds with what it was given."""
         member = self.members.get(identity)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.bounds import finite
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.coordinator.jobs import Work, make_work
 
@@ -36,6 +37,7 @@ class Generation:
     ) -> None:  # fmt: skip
         self.number = number
         self.spec = spec
+        self.is_one_point = len(set(vectors)) == 1 < len(vectors)  # as they travel: nothing can be learned from it
         self.work = [
             work
             for candidate, vector in enumerate(vectors)
@@ -88,8 +90,12 @@ class Generation:
         """How each candidate is doing now."""
         scored = np.isfinite(self._scores)
         done = scored.sum(axis=1)
-        totals = np.where(scored, self._scores, 0.0).sum(axis=1)
-        means = [total / count if count else None for total, count in zip(totals.tolist(), done.tolist(), strict=True)]
+        with np.errstate(over="ignore"):  # of a generation that an older version closed
+            totals = np.where(scored, self._scores, 0.0).sum(axis=1)
+        means = [
+            finite(total / count) if count else None
+            for total, count in zip(totals.tolist(), done.tolist(), strict=True)
+        ]
         return Standing(self.number, done.tolist(), (self._wanted | scored).sum(axis=1).tolist(), means)
 
     def _pass_barrier(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from dreamfleet.common.bounds import finite, saturated
 from dreamfleet.common.runs import StoredGeneration
 
 
@@ -20,8 +21,8 @@ class History:
     def append(self, row: StoredGeneration) -> None:
         """Take the generation that has just been closed."""
         self._rows.append(row)
-        self.steps += row.steps
-        self.seconds += row.seconds
+        self.steps = saturated(self.steps + row.steps)
+        self.seconds = finite(self.seconds + row.seconds)
 
     def __len__(self) -> int:
         return len(self._rows)

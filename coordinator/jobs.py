@@ -29,9 +29,11 @@ def travelling(vector: NDArray[np.float64]) -> bytes:
 
 def make_work(
     spec: TaskSpec, kind: Kind, generation: int, candidate: int, vector: bytes, seeds: Sequence[int],
-    own: TaskSpec | None = None,
+    own: TaskSpec | None = None, first: int = 0,
 ) -> list[Work]:  # fmt: skip
-    """One job an episode; `seeds` holds one seed an episode. `own` is the run's specification where `spec` is another.
+    """One job an episode, numbered from `first` on; `seeds` holds one seed an episode.
+
+    `own` is the run's specification where `spec` is another.
 
     A job names its temperature only where that is not the run's own.
     """
@@ -53,5 +55,5 @@ def make_work(
             ),
             vector,
         )
-        for episode, seed in enumerate(seeds)
+        for episode, seed in enumerate(seeds, first)
     ]

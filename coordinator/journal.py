@@ -6,8 +6,8 @@ import json
 import secrets
 import shutil
 import sqlite3
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,16 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common import schema
+from dreamfleet.common.bounds import LARGEST_FITNESS, LONGEST_EPISODE, finite, most_steps
 from dreamfleet.common.errors import DreamfleetError, JournalError
+from dreamfleet.common.files import sync_folder, write_aside
 from dreamfleet.common.messages import Job, Result
 from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.collection import Collection
+from dreamfleet.coordinator.confirmation import Finalist
 from dreamfleet.coordinator.evaluation import Evaluation
 
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
 MOST_VARIABLES = 500  # of one SQL statement
+FINGERPRINT = "fingerprint"  # the fact's name
 
 
 @dataclass(frozen=True)
@@ -57,25 +61,32 @@ class Journal:
                 raise
 
     @classmethod
-    def create(cls, folder: Path, settings: RunSettings, bundle: Path | None) -> Journal:
-        """A new run in `folder`, which holds its own copy of the bundle, if any; whole or not at all."""
+    def create(
+        cls, folder: Path, settings: RunSettings, bundle: Path | None, facts: Mapping[str, str] | None = None
+    ) -> Journal:
+        """A new run in `folder`, which holds its own copy of the bundle, if any; whole or not at all.
+
+        `facts` are what else the run must never be without: where it begins, and how it is served.
+        """
         path = folder / JOURNAL
         if path.exists():
             raise JournalError(f"run {folder.name} exists: choose another --run, or continue it with --resume")
         aside = path.with_suffix(".new")
-        aside.unlink(missing_ok=True)
+        created = datetime.now(UTC).isoformat(timespec="seconds")
+        own = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": created}
         try:
+            # What a journal that was removed left beside it would be taken for this one's, and damage it.
+            for left in (aside, *beside(aside), *beside(path)):
+                left.unlink(missing_ok=True)
             if bundle is not None:
-                shutil.copyfile(bundle, folder / BUNDLE)
-            with _translated(path):
-                connection = sqlite3.connect(aside)
+                with bundle.open("rb") as source, write_aside(folder / BUNDLE) as copy:
+                    shutil.copyfileobj(source, copy)
+            with _translated(path), closing(sqlite3.connect(aside)) as connection:
                 schema.migrate(connection, 0)
-                created = datetime.now(UTC).isoformat(timespec="seconds")
-                facts = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": created}
-                connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", facts.items())
+                connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", {**own, **(facts or {})}.items())
                 connection.commit()
-                connection.close()
             aside.replace(path)
+            sync_folder(folder)
         except OSError as error:
             raise JournalError(f"cannot write in {folder}: {error.strerror}; choose another --runs-dir") from error
         return cls(path)
@@ -94,6 +105,14 @@ class Journal:
         """One of the run's facts, such as `uid` or `fingerprint`."""
         row = self._read("SELECT value FROM run WHERE key = ?", key).fetchone()
         return None if row is None else str(row[0])
+
+    def fingerprint(self) -> str | None:
+        """That of the first accepted result; `None` before it.
+
+        Journals from before that was the rule name their first worker's, which means nothing without a result.
+        """
+        scored = self._read("SELECT 1 FROM result LIMIT 1").fetchone() is not None
+        return self.fact(FINGERPRINT) if scored else None
 
     def set_fact(self, key: str, value: str) -> None:
         """Write one of the run's facts."""
@@ -144,6 +163,19 @@ class Journal:
             result.steps, result.seconds, worker, fingerprint, incarnation,
         )  # fmt: skip
 
+    def drop_excessive(self, horizon: int) -> int:
+        """Forget what older versions took in and what would spoil what is still to be told; how many results that is.
+
+        Those of closed generations were told, and stay.
+        """
+        within = "abs(fitness) <= ? AND steps BETWEEN 0 AND CASE kind WHEN 'evaluate' THEN ? ELSE ? END"
+        still = "kind != 'score' OR generation IN (SELECT number FROM generation WHERE closed IS NULL)"
+        query = f"DELETE FROM result WHERE NOT ({within}) AND ({still})"  # noqa: S608
+        bounds = LARGEST_FITNESS, most_steps(LONGEST_EPISODE), most_steps(horizon)
+        dropped = self._read(query, *bounds).rowcount
+        self.commit()
+        return dropped
+
     def schedule_evaluation(self, evaluation: Evaluation) -> None:
         """Write that the mean of a generation is to be evaluated."""
         self._write(
@@ -190,7 +222,7 @@ class Journal:
     def results_of(self, kind: str, generation: int) -> dict[bytes, tuple[float, int]]:
         """Fitness and steps of a generation's accepted results, by digest."""
         query = "SELECT digest, fitness, steps FROM result WHERE kind = ? AND generation = ?"
-        return {digest: (fitness, steps) for digest, fitness, steps in self._read(query, kind, generation)}
+        return {digest: (finite(fitness), steps) for digest, fitness, steps in self._read(query, kind, generation)}
 
     def fitness_of(self, digests: Sequence[bytes]) -> dict[bytes, float]:
         """Fitness of those of these jobs that have an accepted result, whichever generation asked for it."""
@@ -206,11 +238,19 @@ class Journal:
         query = "SELECT generation, vector, episodes FROM evaluation WHERE mean IS NULL ORDER BY generation"
         return [Evaluation(*row) for row in self._read(query)]
 
-    def best_evaluation(self) -> tuple[int, float, bytes] | None:
-        """(generation, mean, vector) of the best evaluated mean."""
-        query = "SELECT generation, mean, vector FROM evaluation WHERE mean IS NOT NULL ORDER BY mean DESC, generation"
-        row: tuple[int, float, bytes] | None = self._read(query).fetchone()
-        return row
+    def finalists(self, count: int) -> list[Finalist]:
+        """The best evaluated means, best first; of generations with one mean and of equals the earliest."""
+        query = (
+            "SELECT min(generation), vector, episodes, mean FROM evaluation WHERE mean IS NOT NULL GROUP BY vector "
+            "ORDER BY mean DESC, 1 LIMIT ?"
+        )
+        rows = self._read(query, count).fetchall()
+        return [Finalist(generation, vector, episodes, finite(mean)) for generation, vector, episodes, mean in rows]
+
+    def evaluated_vector(self, generation: int) -> bytes:
+        """The mean after a generation that was scheduled to be evaluated."""
+        (vector,) = self._read("SELECT vector FROM evaluation WHERE generation = ?", generation).fetchone()
+        return bytes(vector)
 
     def _write(self, statement: str, *values: Any) -> None:
         self._write_all(statement, [values])
@@ -231,6 +271,11 @@ class Journal:
         self._flush()
         with _translated(self.path):
             return self._connection.execute(query, values)
+
+
+def beside(path: Path) -> tuple[Path, ...]:
+    """What SQLite may keep beside a database: its write-ahead log, that log's index, or a rollback journal."""
+    return tuple(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))
 
 
 @contextmanager

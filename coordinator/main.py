@@ -11,7 +11,7 @@ from dreamfleet.common.bundle import Bundle, find_bundle
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import Intervals
-from dreamfleet.common.runs import BUNDLE, RunSettings, open_run, run_lock
+from dreamfleet.common.runs import BUNDLE, JOURNAL, RunSettings, open_run, run_lock
 from dreamfleet.common.session import Network
 from dreamfleet.coordinator.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.fleet import Fleet
@@ -45,16 +45,13 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
             f"cannot write in {request.runs_dir}: {error.strerror}; choose another --runs-dir"
         ) from error
     with run_lock(folder):
-        if request.config is None:
-            journal = Journal(folder / "journal.sqlite")
-        else:
-            journal = Journal.create(folder, settings, bundle.path if bundle else None)
+        journal = _open(request, folder, settings, bundle)
         service = _service(request, folder)
         on_stoppable(service.stop)
         try:
-            _keep(journal, request)
             fleet = Fleet(request.network.beat)
-            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), request.start))
+            mixed = request.network.mixed
+            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), mixed=mixed))
         finally:
             journal.close()
 
@@ -62,14 +59,24 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
 def _service(request: RunRequest, folder: Path) -> Service:
     network = request.network
     intervals = Intervals(network.beat, network.beat)
-    return Service(request.name, folder, Network(network.listen, network.connect), intervals, mixed=network.mixed)
+    return Service(request.name, folder, Network(network.listen, network.connect), intervals)
 
 
-def _keep(journal: Journal, request: RunRequest) -> None:
-    """Write how the run is served, at once: a coordinator that finds its port taken is not asked everything again."""
-    for name, text in facts_of(request.limits, request.network).items():
+def _open(request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None) -> Journal:
+    """The run's journal, with how it is served.
+
+    It is written before anything else can fail, as is where a new run begins, in the transaction that makes the run: a
+    coordinator that finds its port taken, or is killed, is continued with all that it was told.
+    """
+    facts = facts_of(request.limits, request.network)
+    if request.config is not None:
+        start = request.start.facts if request.start else {}
+        return Journal.create(folder, settings, bundle.path if bundle else None, {**facts, **start})
+    journal = Journal(folder / JOURNAL)
+    for name, text in facts.items():
         journal.set_fact(name, text)
     journal.commit()
+    return journal
 
 
 def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle | None]:
@@ -80,10 +87,7 @@ def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle | No
         settings = stored.settings
     if not settings.task.bundle:
         return settings, None
-    bundle = Bundle.open(folder / BUNDLE)
-    if bundle.sha256 != settings.task.bundle:
-        raise JournalError(f"{bundle.path} is not the bundle that this run was started with; restore the folder")
-    return settings, bundle
+    return settings, Bundle.open(folder / BUNDLE, settings.task.bundle)
 
 
 def _settle_new(config: RunConfig, start: Start | None) -> tuple[RunSettings, Bundle | None]:

@@ -18,7 +18,7 @@ DREAM = "dream"
 
 
 def plot_fitness(run: RunFolder, path: Path) -> None:
-    """Write a PNG: each generation's mean, spread and best; evaluations of the mean where there are any."""
+    """Write a PNG: each generation's mean, spread and best; evaluations and the confirmed mean where there are any."""
     history, evaluations, settings = run.history(), run.evaluations(), run.settings
     number = np.array([each.number for each in history])
     mean = np.array([each.mean for each in history])
@@ -37,6 +37,7 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
             [each.error for each in evaluations], fmt="o-" if dreamt else "o", color="tab:green", capsize=3,
             label=f"evaluated mean{' in reality' if dreamt else ''}, {episodes} (± standard error)",
         )  # fmt: skip
+        _draw_confirmed(real, run)
         if dreamt:
             real.set_ylabel(f"score in reality, {episodes}", color="tab:green")
             handles = tuple(a + b for a, b in zip(handles, real.get_legend_handles_labels(), strict=True))
@@ -50,3 +51,12 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     figure.savefig(path, dpi=120)
     plt.close(figure)
+
+
+def _draw_confirmed(axes: Any, run: RunFolder) -> None:
+    """The score that the run reports, which lies below its best evaluation where that was lucky."""
+    if (confirmed := run.confirmation()) is not None:
+        axes.errorbar(
+            confirmed.generation, confirmed.mean, confirmed.error, fmt="*", color="tab:red", capsize=3, markersize=10,
+            label=f"reported: confirmed on {confirmed.episodes} fresh tracks (± standard error)",
+        )  # fmt: skip

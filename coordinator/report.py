@@ -1,4 +1,8 @@
-"""What a run reports: its best evaluated mean, else the last mean; never the luckiest sample."""
+"""What a run reports: never the luckiest sample.
+
+While it goes on, its best evaluated mean, which is provisional: the best of many looks is in part luck. As it ends, the
+mean that was confirmed, with a score that chose nothing. Without evaluations, the last mean.
+"""
 
 from __future__ import annotations
 
@@ -9,28 +13,47 @@ import numpy as np
 
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import JournalError
-from dreamfleet.common.runs import RunSettings
+from dreamfleet.common.runs import RunSettings, StoredConfirmation, StoredEvaluation
 
 PACE = 5.0  # seconds between two writings of a mean that was not evaluated: each waits for the disk
 
 
 @dataclass(frozen=True)
+class Judged:
+    """A mean's score on validation tracks. Unless it is `confirmed`, these tracks also chose what they judge."""
+
+    mean: float
+    error: float  # standard error of the mean
+    episodes: int
+    confirmed: bool
+
+    @classmethod
+    def of(cls, found: StoredEvaluation | StoredConfirmation) -> Judged:
+        """From what the journal holds."""
+        return cls(found.mean, found.error, found.episodes, isinstance(found, StoredConfirmation))
+
+
+@dataclass(frozen=True)
 class Reported:
-    """A mean `(size,)`, as float32 bytes, with the generation that it is of and its evaluated score, if it has one."""
+    """A mean `(size,)`, as float32 bytes, with the generation that it is of and its score, if it has one."""
 
     run_uid: str
     settings: RunSettings
     generation: int
     vector: bytes
-    score: float | None
+    judged: Judged | None
     steps: int  # environment steps that the run had made by then
 
     def controller(self) -> Controller:
         """As it is saved."""
+        judged = self.judged
         provenance = {
             "run_uid": self.run_uid,
             "generation": self.generation,
-            "validation_mean": self.score,
+            "validation_mean": judged and judged.mean,
+            "validation_error": judged and judged.error,
+            "validation_episodes": judged and judged.episodes,
+            "confirmed": judged is not None and judged.confirmed,
             "settings": asdict(self.settings),
             "steps": self.steps,
         }
@@ -55,17 +78,18 @@ class Report:
 
     def closed(self, generation: int, mean: bytes, steps: int, now: float) -> None:
         """A generation was closed: its mean is reported, unless one was evaluated."""
-        if self.current is not None and self.current.score is not None:
+        judged = self.current.judged if self.current is not None else None
+        if self.current is not None and judged is not None:
             generation, mean = self.current.generation, self.current.vector
-        score = self.current.score if self.current is not None else None
-        self.current = Reported(self._run_uid, self._settings, generation, mean, score, steps)
+        self.current = Reported(self._run_uid, self._settings, generation, mean, judged, steps)
         self._due = self._due or now >= self._next
         if self._due:
             self._next = now + PACE
 
-    def evaluated(self, generation: int, mean: bytes, score: float, steps: int) -> None:
-        """A mean is the best of those that were evaluated."""
-        self.current = Reported(self._run_uid, self._settings, generation, mean, score, steps)
+    def judge(self, found: StoredEvaluation | StoredConfirmation, mean: bytes, steps: int) -> None:
+        """A mean is the best of those that were evaluated, or was confirmed."""
+        judged = Judged.of(found)
+        self.current = Reported(self._run_uid, self._settings, found.generation, mean, judged, steps)
         self._due = True
 
     def finish(self) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dreamfleet.common.heat import deciding_evaluation
 from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.exchange import Exchange
@@ -21,7 +21,7 @@ from dreamfleet.coordinator.history import History
 from dreamfleet.coordinator.journal import Journal
 from dreamfleet.coordinator.limits import stop_reason
 from dreamfleet.coordinator.slack import Slack
-from dreamfleet.coordinator.start import Start
+from dreamfleet.coordinator.start import kept_start
 
 
 class Run:
@@ -34,7 +34,8 @@ class Run:
         limits: LimitsConfig,
         fleet: Fleet,
         now: float,
-        start: Start | None = None,
+        *,
+        mixed: bool = False,
     ) -> None:
         self.settings = settings
         self.limits = limits
@@ -45,18 +46,21 @@ class Run:
         self.incarnation = journal.begin_incarnation()
         self._journal = journal
         self._untold: list[StoredGeneration] = []
-        self._ending = False  # a limit is reached: only evaluations and collected rollouts are waited for
+        if dropped := journal.drop_excessive(settings.task.horizon):
+            fleet.notes.append(f"{dropped} results of an older version are too large to count: asked for again")
+        self._ending = False  # a limit is reached: only what is in the slack is waited for
         closed, evaluations = journal.closed()
         self.history = History(closed)
         self.slack = Slack(journal, settings, self.uid, self.history, evaluations)
-        self.exchange = Exchange(journal, self.incarnation, fleet, self.slack, self._score)
-        self._evolution = Evolution(EvolutionConfig.of(settings), start.mean if start else None)
-        if start:
-            journal.set_fact("start", start.source)
+        self.exchange = Exchange(
+            journal, self.incarnation, fleet, self.slack, self._score, horizon=settings.task.horizon, mixed=mixed
+        )
+        self._evolution = Evolution(EvolutionConfig.of(settings), kept_start(journal))
         evaluated = self.slack.evaluations.finished
         self._generations = Generations(journal, settings, self._evolution, self.history, evaluated)
         self.opened = now
-        self.generation = self._begin(now)
+        self.generation = self._generations.begin()
+        self._begin(now)
 
     @property
     def sigma(self) -> float:
@@ -77,6 +81,11 @@ class Run:
     def best(self) -> StoredEvaluation | None:
         """The best evaluated mean."""
         return self.slack.evaluations.best
+
+    @property
+    def confirmed(self) -> StoredConfirmation | None:
+        """The confirmed score of what is reported; `None` where what is reported is not confirmed."""
+        return self.slack.confirmed
 
     @property
     def controller_path(self) -> Path | None:
@@ -103,8 +112,7 @@ class Run:
         if failure is not None and self.paused is None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
         self.fleet.hurry = self._waiting
-        if self._ending and not self.slack.in_progress and self.ended is None:
-            self._end()
+        self._finish()
         return len(self.history) > closed
 
     def commit(self) -> None:
@@ -144,28 +152,28 @@ class Run:
         deciding = deciding_evaluation(self.settings, self.generation.number + 1)
         return self._ending or (self.slack.evaluations.awaits(deciding) and self.generation.complete)
 
-    def _begin(self, now: float) -> Generation:
-        generation = self._generations.begin()
+    def _begin(self, now: float) -> None:
+        generation = self.generation
         self.fleet.begin(generation.number)
         work = self.slack.begin(self._generations.mean, now)
-        if self._stop_reason() is None or generation.done:
+        if self._stop_reason(generation) is None or generation.done:
             self._journal.drop_fact("ended")
             self.fleet.offer([*work, *generation.missing])
-        elif self.slack.in_progress:
+        else:
             self._ending = True
             self.fleet.offer(work)
-        else:
-            self._end()
-            self.commit()
-        return generation
+            self._finish()
+            if self.ended is not None:
+                self.commit()
 
     def _close(self, now: float) -> None:
         closed = self._generations.close(self.generation, now - self.opened)
         self._untold.append(closed)
-        reason = self._stop_reason()
-        self.fleet.offer(self.slack.schedule(closed.number, self._generations.mean, now, last=reason is not None))
+        mean = self._generations.mean
         # Opened also when the run ends here: a later life with wider limits then goes on from it.
         generation = self._generations.open(closed.number + 1)
+        reason = self._stop_reason(generation)
+        self.fleet.offer(self.slack.schedule(closed.number, mean, now, last=reason is not None))
         if generation.spec != self.generation.spec:
             self.fleet.notes.append(
                 f"generation {generation.number} dreams at temperature {generation.spec.temperature:g}: the evaluated "
@@ -184,10 +192,22 @@ class Run:
         if self.generation.record(result.digest, result.fitness, result.steps):
             self.fleet.offer(self.generation.missing)
 
-    def _stop_reason(self) -> str | None:
+    def _stop_reason(self, generation: Generation) -> str | None:
+        """Why the run ends before `generation` is scored; `None` if it goes on."""
+        if generation.is_one_point:
+            return f"converged: generation {generation.number} is one point; fork the run with a larger --sigma0"
         return stop_reason(self.limits, self.history, self.slack.evaluations)
 
+    def _finish(self) -> None:
+        """Where a limit is reached and its last evaluations are in: confirm what is reported, then end."""
+        if not self._ending or self.slack.in_progress or self.ended is not None:
+            return
+        if work := self.slack.confirm():
+            self.fleet.offer(work)
+        else:
+            self._end()
+
     def _end(self) -> None:
-        self.ended = self._stop_reason() or "stopped"
+        self.ended = self._stop_reason(self.generation) or "stopped"
         self._journal.set_fact("ended", self.ended)
         self.slack.report.finish()

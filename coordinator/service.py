@@ -5,15 +5,11 @@ Life: startup (session, lock on the name, queryables) -> loop (events, advance, 
 
 from __future__ import annotations
 
-import json
 import logging
 import queue
 import secrets
-import threading
-from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -21,60 +17,56 @@ from typing import Any
 import zenoh
 
 from dreamfleet.common import keys
-from dreamfleet.common.codec import Inbox, encode, encode_json, encoding
-from dreamfleet.common.errors import RefusedError
-from dreamfleet.common.fields import written
-from dreamfleet.common.fingerprint import package_version
+from dreamfleet.common.codec import Inbox, MalformedError, encode, encode_json, encoding
+from dreamfleet.common.errors import DreamfleetError, RefusedError
 from dreamfleet.common.messages import (
-    MAX_PART,
     Beat,
-    BundlePart,
-    ControlReply,
     GenerationEvent,
-    HelloReply,
     HelloRequest,
     Intervals,
     JobBatch,
+    Message,
     ResultBatch,
     UploadPart,
 )
+from dreamfleet.common.mishaps import Mishaps
 from dreamfleet.common.runs import BUNDLE
 from dreamfleet.common.session import LEASE_MS, Network, enqueue_into, open_session
-from dreamfleet.common.status import PARTS
 from dreamfleet.coordinator import answers
+from dreamfleet.coordinator.arrivals import Arrivals
 from dreamfleet.coordinator.fleet import Send
+from dreamfleet.coordinator.queryables import BundleServer, answer_status
+from dreamfleet.coordinator.replies import control_reply, hello_reply, misunderstanding
 from dreamfleet.coordinator.run import Run
 from dreamfleet.coordinator.status import Snapshot, as_left, take_snapshot
 
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a loss waits to be acted upon
 DRAIN = 256  # events that share one commit at most
-MOST_WAITING = 4096  # messages in the queue: at most 196 MB
 LINGER = 0.005  # seconds that a commit waits for more to share it
 SNAPSHOT_INTERVAL = 0.2
+_REPEATED: dict[str, type[Message]] = {"result": ResultBatch, "beat": Beat, "upload": UploadPart}
 
 
 class Service:
     """Serves one run until it ends or `stop` is called."""
 
-    def __init__(self, name: str, folder: Path, network: Network, intervals: Intervals, *, mixed: bool = False) -> None:
+    def __init__(self, name: str, folder: Path, network: Network, intervals: Intervals) -> None:
         self._name = name
         self._bundle = folder / BUNDLE
         self._network = network
         self._intervals = intervals
-        self._mixed = mixed
         self._nonce = secrets.token_hex(8)
-        self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._events = Arrivals()
         self._inbox = Inbox()
-        self._overflow: Counter[str] = Counter()  # counted in Zenoh's threads, under the lock
-        self._lock = threading.Lock()
+        self._mishaps = Mishaps(log)
         self._stopping = self._draining = False
         self._evaluations_told = 0
 
     def stop(self) -> None:
         """End the loop soon; the run can be continued. Safe in a signal handler."""
         self._stopping = True
-        self._events.put(("wake", None))
+        self._events.wake()
 
     def serve(self, run_maker: Callable[[], Run], on_ready: Callable[[Run], None] = lambda _run: None) -> Run:
         """Claim the name on the wire, make the run, serve it; the run as it was when the service left."""
@@ -85,7 +77,7 @@ class Service:
             self._exchange = self._run.exchange
             self._started = monotonic()
             self._snapshot = self._take_snapshot()
-            declared = self._declare(session)
+            declared = self._declare(session, stack)
             log.info("run %s, incarnation %d, generation %d", self._name, self._run.incarnation,
                      self._run.generation.number)  # fmt: skip
             if self._network.listen:
@@ -128,29 +120,27 @@ class Service:
             raise RefusedError(f"run {self._name} has a live coordinator already: stop it, or choose another --run")
         return session.liveliness().declare_token(mine)
 
-    def _declare(self, session: zenoh.Session) -> list[Any]:
-        name, events = self._name, self._events
+    def _declare(self, session: zenoh.Session, stack: ExitStack) -> list[Any]:
+        name = self._name
         subscribe, answer = session.declare_subscriber, session.declare_queryable
         return [
             *(subscribe(keys.any_worker(kind, name), self._enqueue(kind)) for kind in ("result", "beat", "upload")),
             session.liveliness().declare_subscriber(
-                keys.any_worker("live/worker", name), enqueue_into(events, "token"), history=True
+                keys.any_worker("live/worker", name), self._enqueue("token"), history=True
             ),
-            answer(keys.hello(name), enqueue_into(events, "hello")),
-            answer(keys.control(name, "*"), enqueue_into(events, "control")),
-            *(answer(keys.status(name, part), _callback(self._answer_status(part))) for part in PARTS),
-            *(answer(keys.bundle(name, sha256), _callback(self._answer_bundle)) for sha256 in self._bundles),
+            answer(keys.hello(name), self._enqueue("hello")),
+            answer(keys.control(name, "*"), self._enqueue("control")),
+            *answer_status(session, name, lambda: self._snapshot, self._mishaps),
+            *self._serve_bundle(session, stack),
         ]
 
     def _enqueue(self, kind: str) -> Any:
-        """What is repeated anyway is dropped and counted while too much waits: a flood must not fill the memory."""
+        """A callback that only enqueues; what is too much is dropped, and a query then ends without an answer."""
 
-        def enqueue(sample: zenoh.Sample) -> None:
-            if self._events.qsize() < MOST_WAITING:
-                self._events.put((kind, sample))
-            else:
-                with self._lock:
-                    self._overflow["too many at once"] += 1
+        def enqueue(event: Any) -> None:
+            size = len(event.payload) if event.payload is not None else 0
+            if not self._events.put(kind, event, size, monotonic()) and isinstance(event, zenoh.Query):
+                event.drop()  # type: ignore[no-untyped-call]
 
         return zenoh.handlers.Callback(enqueue, indirect=False)
 
@@ -192,7 +182,20 @@ class Service:
             pass
 
     def _handle(self, kind: str, event: Any) -> None:
-        now = monotonic()
+        """One event. What raises costs that event alone, for no message may end the run: its sender repeats it.
+
+        Our own expected failures pass: a journal that cannot be written ends the coordinator.
+        """
+        try:
+            self._take(kind, event, monotonic())
+        except MalformedError as error:
+            self._mishaps.note(kind, error, event)
+        except DreamfleetError:
+            raise
+        except Exception as error:
+            self._mishaps.note(kind, error, event)
+
+    def _take(self, kind: str, event: Any, now: float) -> None:
         if kind == "hello":
             self._hello(event, now)
         elif kind == "control":
@@ -200,18 +203,21 @@ class Service:
         elif kind == "token":
             if event.kind == zenoh.SampleKind.DELETE:
                 self._exchange.depart(keys.worker_of(str(event.key_expr)), now)
-        elif kind == "result":
-            results = self._inbox.decode(ResultBatch, event.payload.to_bytes())
-            if results is not None and self._ours(results.run_uid):
-                self._exchange.results(keys.worker_of(str(event.key_expr)), results, now)
-        elif kind == "beat":
-            beat = self._inbox.decode(Beat, event.payload.to_bytes())
-            if beat is not None and self._ours(beat.run_uid) and beat.nonce == self._nonce:
-                self._exchange.beat(keys.worker_of(str(event.key_expr)), beat, now)
-        elif kind == "upload":
-            part = self._inbox.decode(UploadPart, event.payload.to_bytes())
-            if part is not None and self._ours(part.run_uid):
-                self._exchange.upload(keys.worker_of(str(event.key_expr)), part, now)
+        elif kind in _REPEATED:
+            self._hear(kind, event, now)
+
+    def _hear(self, kind: str, sample: zenoh.Sample, now: float) -> None:
+        """Pass on what a worker of this run says, if it is of the schema."""
+        message = self._inbox.decode(_REPEATED[kind], sample.payload.to_bytes())
+        if message is None or not self._ours(message.run_uid):
+            return
+        worker = keys.worker_of(str(sample.key_expr))
+        if isinstance(message, ResultBatch):
+            self._exchange.results(worker, message, now)
+        elif isinstance(message, UploadPart):
+            self._exchange.upload(worker, message, now)
+        elif isinstance(message, Beat) and message.nonce == self._nonce:
+            self._exchange.beat(worker, message, now)
 
     def _ours(self, run_uid: str) -> bool:
         if run_uid != self._run.uid:
@@ -222,37 +228,13 @@ class Service:
         with query:
             payload = query.payload.to_bytes() if query.payload is not None else b""
             request = self._inbox.decode_json(HelloRequest, payload)
-            if request is None or not keys.is_worker(request.worker):
-                reply = self._hello_reply("the request is not a hello", "update dreamfleet on the worker's host")
-            elif not request.protocol_min <= keys.PROTOCOL_VERSION <= request.protocol_max:
-                reply = self._hello_reply(
-                    f"the worker speaks protocol {request.protocol_min} to {request.protocol_max}, this run "
-                    f"{keys.PROTOCOL_VERSION}",
-                    f"install dreamfleet {package_version('dreamfleet')} on the worker's host",
-                )
-            elif refusal := self._exchange.refusal(request, self._run.settings, self._mixed):
-                reply = self._hello_reply(*refusal)
-            else:
-                self._exchange.admit(request, now)
-                reply = self._hello_reply()
+            refusal = misunderstanding(request)
+            if request is not None and refusal is None:
+                refusal = self._exchange.refusal(request, self._run.settings)
+                if refusal is None:
+                    self._exchange.admit(request, now)
+            reply = hello_reply(self._run, self._name, self._nonce, self._intervals, *(refusal or ()))
             query.reply(keys.hello(self._name), encode_json(reply), encoding="application/json")
-
-    def _hello_reply(self, why: str = "", remedy: str = "") -> HelloReply:
-        return HelloReply(
-            accepted=not why,
-            protocol_min=keys.PROTOCOL_VERSION,
-            protocol_max=keys.PROTOCOL_VERSION,
-            package=package_version("dreamfleet") or "unknown",
-            run=self._name,
-            run_uid=self._run.uid,
-            incarnation=self._run.incarnation,
-            nonce=self._nonce,
-            why=why,
-            remedy=remedy,
-            spec={} if why else written(self._run.settings.task),
-            intervals={} if why else asdict(self._intervals),
-            packages=self._run.settings.packages,
-        )
 
     def _control(self, query: zenoh.Query) -> None:
         verbs: dict[str, Callable[[], None]] = {
@@ -263,10 +245,8 @@ class Service:
         }
         with query:
             verb = str(query.key_expr).rsplit("/", 1)[-1]
-            why = "" if verb in verbs else f"{verb!r} is no control verb of this version; it knows: {', '.join(verbs)}"
-            if not why:
-                verbs[verb]()
-            reply = ControlReply(v=keys.PROTOCOL_VERSION, run=self._name, accepted=not why, why=why)
+            verbs.get(verb, lambda: None)()
+            reply = control_reply(self._name, verb, verbs)
             query.reply(query.key_expr, encode_json(reply), encoding="application/json")
 
     def _resume(self) -> None:
@@ -318,50 +298,15 @@ class Service:
 
     def _take_snapshot(self) -> Snapshot:
         now = monotonic()
-        with self._lock:
-            dropped = self._inbox.dropped + self._exchange.dropped + self._overflow
+        dropped = self._inbox.dropped + self._exchange.dropped + self._events.dropped + self._mishaps.counts
         return take_snapshot(self._run, self._name, dropped, now - self._started, now)
 
-    def _answer_status(self, part: str) -> Callable[[zenoh.Query], None]:
-        """An answer in the queryable's own thread: it reads the last snapshot and nothing else."""
-
-        def answer(query: zenoh.Query) -> None:
-            with query:
-                payload = answers.answer(self._snapshot, part, query.parameters)
-                query.reply(keys.status(self._name, part), payload, encoding="application/json")
-
-        return answer
-
-    @property
-    def _bundles(self) -> tuple[str, ...]:
-        """The world models that are served: one, or none where the task needs none."""
+    def _serve_bundle(self, session: zenoh.Session, stack: ExitStack) -> list[Any]:
+        """Serve the run's world model, if its task needs one."""
         sha256 = self._run.settings.task.bundle
-        return (sha256,) if sha256 else ()
-
-    def _answer_bundle(self, query: zenoh.Query) -> None:
-        """In the queryable's own thread: reads a file that nobody writes."""
-        with query:
-            sha256 = self._run.settings.task.bundle
-            asked = query.parameters
-            try:
-                offset, length = int(asked.get("offset") or 0), int(asked.get("length") or MAX_PART)
-            except ValueError:
-                query.reply_err(json.dumps({"why": "offset and length must be whole numbers"}).encode())
-                return
-            total = self._bundle.stat().st_size
-            with self._bundle.open("rb") as file:
-                file.seek(min(max(offset, 0), total))
-                data = file.read(min(max(length, 0), MAX_PART))
-            part = BundlePart(
-                run_uid=self._run.uid,
-                incarnation=self._run.incarnation,
-                sha256=bytes.fromhex(sha256),
-                offset=min(max(offset, 0), total),
-                total=total,
-                data=data,
-            )
-            query.reply(keys.bundle(self._name, sha256), encode(part), encoding=encoding(BundlePart))
-
-
-def _callback(answer: Callable[[zenoh.Query], None]) -> Any:
-    return zenoh.handlers.Callback(answer, indirect=False)
+        if not sha256:
+            return []
+        head = {"run_uid": self._run.uid, "incarnation": self._run.incarnation, "sha256": bytes.fromhex(sha256)}
+        server = BundleServer(self._bundle, keys.bundle(self._name, sha256), head)
+        stack.callback(server.close)
+        return [server.declare(session, self._mishaps)]

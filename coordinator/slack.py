@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import CONTROLLER, RunSettings, StoredEvaluation
+from dreamfleet.common.runs import CONFIRMED, CONTROLLER, RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.coordinator.collection import Collection, Collections
+from dreamfleet.coordinator.confirmation import FINALISTS, Confirmation
 from dreamfleet.coordinator.evaluation import Evaluation, Evaluations
 from dreamfleet.coordinator.history import History
 from dreamfleet.coordinator.jobs import Work
@@ -28,19 +29,33 @@ class Slack:
         self._journal = journal
         self._settings = settings
         self._history = history
+        self._confirmation: Confirmation | None = None  # while the run is ending
+        text = journal.fact(CONFIRMED)
+        self._confirmed = None if text is None else StoredConfirmation.from_json(text)
 
     @property
     def in_progress(self) -> bool:
-        """Whether anything is still to come."""
-        return bool(self.evaluations.in_progress or self.collections.in_progress)
+        """Whether anything is still to come of what was begun."""
+        confirming = self._confirmation is not None and self._confirmation.in_progress
+        return bool(self.evaluations.in_progress or self.collections.in_progress or confirming)
+
+    @property
+    def confirmed(self) -> StoredConfirmation | None:
+        """The confirmed score of what is reported; `None` where what is reported is not confirmed."""
+        found = self._confirmed
+        return found if found is not None and found.covers(self.evaluations.best) else None
+
+    @property
+    def confirming(self) -> tuple[int, int]:
+        """Episodes of the confirmation's open round: done, wanted."""
+        return (0, 0) if self._confirmation is None else self._confirmation.progress
 
     def begin(self, mean: bytes, now: float) -> list[Work]:
         """Continue where the last incarnation ended: what is reported, and the missing jobs."""
         if (last := self._history.last) is not None:
             self.report.closed(last.number, mean, self._history.steps, now)
-        if (best := self._journal.best_evaluation()) is not None:
-            generation, score, vector = best
-            self.report.evaluated(generation, vector, score, self._history.steps)
+        if (judged := self.confirmed or self.evaluations.best) is not None:
+            self.report.judge(judged, self._journal.evaluated_vector(judged.generation), self._history.steps)
         evaluations = [
             each for evaluation in self._journal.pending_evaluations() for each in self._evaluate(evaluation)
         ]
@@ -68,6 +83,28 @@ class Slack:
         assert result.fitness is not None
         for generation in self.evaluations.record(result.digest, result.fitness):
             self._finish(generation)
+        if self._confirmation is not None:
+            self._confirmation.record(result.digest, result.fitness)
+
+    def confirm(self) -> list[Work]:
+        """The run is ending and nothing is in progress: the next jobs that confirm what it reports.
+
+        None once it is confirmed, or where nothing was evaluated.
+        """
+        closed = len(self._history)
+        if self._confirmation is None:
+            if self._confirmed is not None and self._confirmed.closed == closed:
+                return []
+            episodes, finalists = self._settings.confirm_episodes, self._journal.finalists(FINALISTS)
+            if not (episodes and finalists):
+                return []
+            self._confirmation = Confirmation(self._settings.task, episodes, finalists, closed)
+        work = self._confirmation.advance(self._journal.fitness_of)
+        if (outcome := self._confirmation.outcome) is not None:
+            self._journal.set_fact(CONFIRMED, outcome.to_json())
+            self._confirmation, self._confirmed = None, outcome
+            self.report.judge(outcome, self._journal.evaluated_vector(outcome.generation), self._history.steps)
+        return work
 
     def _evaluate(self, evaluation: Evaluation) -> list[Work]:
         wanted = [each.job.digest for each in evaluation.work(self._settings.task)]
@@ -82,7 +119,7 @@ class Slack:
         finished, vector = found
         self._journal.finish_evaluation(generation, finished.mean, finished.std)
         if self.evaluations.best is finished:
-            self.report.evaluated(generation, vector, finished.mean, self._history.steps)
+            self.report.judge(finished, vector, self._history.steps)
 
     def _collect(self, collection: Collection) -> list[Work]:
         known = self._journal.results_of("collect", collection.generation)

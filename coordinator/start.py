@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.errors import ControllerError, DreamfleetError
+from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
 from dreamfleet.common.runs import RunFolder, RunSettings, open_run
 from dreamfleet.common.shelf import find_controller
 from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.config import RunConfig
+from dreamfleet.coordinator.journal import Journal
+
+SOURCE, MEAN = "start", "start_mean"  # the facts' names
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,11 @@ class Start:
         """The configuration with the options that this start was evolved under, where it names none."""
         given = config.task_options is not None or config.environment or config.normalise
         return config if given else replace(config, task_options=self.options)
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What the journal keeps of it, whole: the file that it came from may be gone when the run is continued."""
+        return {SOURCE: self.source, MEAN: base64.b64encode(self.mean.astype("<f8").tobytes()).decode()}
 
     def check(self, settings: RunSettings) -> None:
         """Refuse parameters that mean nothing to this world model, these options and this controller."""
@@ -46,6 +55,8 @@ class Start:
                 f"{self.source} has {len(self.mean)} parameters, this run's controllers {shape.size}: give its own "
                 "--controller, --hidden-units and --features"
             )
+        if not (np.abs(self.mean) <= np.finfo(np.float32).max).all():
+            raise ControllerError(f"{self.source} has parameters that no single-precision number can hold")
 
 
 def _told(bundle: str) -> str:
@@ -76,3 +87,17 @@ def latest(stored: RunFolder) -> tuple[NDArray[np.float64], float]:
         raise DreamfleetError(f"run {stored.name} has no generation yet")
     head = Checkpoint.unpack(state).head
     return head.mean, head.sigma
+
+
+def kept_start(journal: Journal) -> NDArray[np.float64] | None:
+    """The mean `(size,)` that the journal says its run begins at; `None`: at zero.
+
+    A journal from before it was kept has a first generation wherever it names a start, and goes on from that.
+    """
+    kept = journal.fact(MEAN)
+    if kept is None:
+        return None
+    try:
+        return np.frombuffer(base64.b64decode(kept, validate=True), dtype="<f8").astype(np.float64)
+    except ValueError as error:
+        raise JournalError(f"the start kept in {journal.path} is damaged: {error}; restore the folder") from error

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 
+from dreamfleet.common.bounds import saturated
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.common.status import (
     SCHEMA,
@@ -89,6 +90,8 @@ def _status(run: Run, name: str, standing: Standing, now: float) -> Status:
         failures=tuple(_failure(each) for each in failures[:MOST_FAILURES]),
         dropped={},
         refused=_refused(run),
+        confirmed=run.confirmed,
+        confirming=Progress(*run.slack.confirming),
     )
 
 
@@ -116,7 +119,7 @@ def _headless(standing: Standing) -> Population:
 
 def _throughput(run: Run, present: Sequence[Member]) -> Throughput:
     rate = sum(member.steps_per_second for member in present)
-    return Throughput(round(rate, 1), run.history.steps + run.generation.steps)
+    return Throughput(round(rate, 1), saturated(run.history.steps + run.generation.steps))
 
 
 def _refused(run: Run) -> dict[str, str]:
@@ -127,7 +130,7 @@ def _refused(run: Run) -> dict[str, str]:
 def _waste(counts: Mapping[str, int]) -> Waste:
     discarded, accepted = counts["discarded_steps"], counts["accepted_steps"]
     return Waste(
-        discarded_steps=discarded,
+        discarded_steps=saturated(discarded),
         share=round(discarded / (discarded + accepted), 4) if discarded else 0.0,
         reissued=counts["reissued"],
         recalled=counts["recalled"],

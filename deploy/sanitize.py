@@ -40,7 +40,7 @@ def drive(steps: int) -> None:
     done = episode = 0
     while done < steps:
         environment = environments[episode % 3]
-        _native.widen(bool(episode % 2))
+        _native.widen(episode // 3 % 3)
         environment.reset(seed=episode)
         environment.t = random.uniform(0, 1.5)
         act = wild(random)

@@ -136,18 +136,19 @@ def _stop_on_signals(stop: Callable[[], None]) -> None:
 
 def _report(args: argparse.Namespace, run: Run, request: RunRequest, *, nothing_new: bool) -> None:
     from dreamfleet.common.processes import spoken
-    from dreamfleet.common.runs import CONTROLLER
+    from dreamfleet.common.runs import CONTROLLER, told
 
     again = spoken("coordinator", "--resume", request.name, "--runs-dir", request.runs_dir)
     path = request.runs_dir / request.name / CONTROLLER
     controller = path if path.is_file() else None
     facts: dict[str, Any] = {"run": request.name, "ended": run.ended, "controller": controller, "continue": again}
     facts["best"] = None if run.best is None else vars(run.best)
+    facts["confirmed"] = None if run.confirmed is None else {**vars(run.confirmed), "error": run.confirmed.error}
+    judged = run.confirmed or run.best
+    score = f"; {told(judged)}" if judged else ""
     if run.ended is None:
-        text = f"left run {request.name} open; continue it with: {again}"
+        text = f"left run {request.name} open{score}; continue it with: {again}"
     else:
-        best = run.best
-        score = f"; its mean scored {best.mean:.1f} on {best.episodes} validation tracks" if best else ""
         where = f"; controller: {controller}" if controller else "; it has no controller yet"
         more = f"; it goes on with wider limits, such as: {again} --generations 0 --minutes 30" if nothing_new else ""
         text = f"run {request.name} ended after {run.ended}{score}{where}{more}"

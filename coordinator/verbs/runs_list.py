@@ -33,14 +33,14 @@ def run(args: argparse.Namespace) -> int:
     if not rows:
         print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME", file=sys.stderr)
         return 0
-    print_rows(rows, right=("generations", "mean", "evaluated"))
+    print_rows(rows, right=("generations", "mean", "evaluated", "confirmed"))
     return 0
 
 
 def _row(path: Path) -> dict[str, object]:
     try:
         with RunFolder(path) as run:
-            history, evaluations = run.history(), run.evaluations()
+            history, evaluations, confirmed = run.history(), run.evaluations(), run.confirmation()
             return {
                 "run": run.name,
                 "created": run.created,
@@ -48,8 +48,9 @@ def _row(path: Path) -> dict[str, object]:
                 "generations": len(history),
                 "mean": round(history[-1].mean, 1) if history else "-",
                 "evaluated": round(evaluations[-1].mean, 1) if evaluations else "-",
+                "confirmed": round(confirmed.mean, 1) if confirmed else "-",
                 "state": f"ended: {run.ended}" if run.ended else "open",
             }
     except JournalError as error:
         return {"run": path.name, "created": "-", "task": "-", "generations": "-", "mean": "-", "evaluated": "-",
-                "state": str(error)}  # fmt: skip
+                "confirmed": "-", "state": str(error)}  # fmt: skip

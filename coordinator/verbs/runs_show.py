@@ -8,7 +8,7 @@ import sys
 from dataclasses import asdict
 
 from dreamfleet.common.listing import add_json, print_rows
-from dreamfleet.common.runs import RunSettings, StoredGeneration, open_run
+from dreamfleet.common.runs import RunSettings, StoredGeneration, best_of, open_run, told
 from dreamfleet.common.site import offer
 
 SUMMARY = "show one run from its journal: settings, history, evaluations"
@@ -27,12 +27,15 @@ def run(args: argparse.Namespace) -> int:
     """Print the run."""
     with open_run(args.runs_dir, args.run_name) as stored:
         settings, history, evaluations = stored.settings, stored.history(), stored.evaluations()
+        confirmed = stored.confirmation()
         facts = {"run": stored.name, "run_uid": stored.uid, "created": stored.created, "ended": stored.ended,
                  "fingerprint": stored.fingerprint}  # fmt: skip
     if args.json:
         rows = {"history": [asdict(each) for each in history], "evaluations": [asdict(each) for each in evaluations]}
-        print(json.dumps({**facts, "settings": asdict(settings), **rows}, indent=2))
+        reported = None if confirmed is None else {**asdict(confirmed), "error": confirmed.error}
+        print(json.dumps({**facts, "settings": asdict(settings), "confirmed": reported, **rows}, indent=2))
         return 0
+    facts["reported"] = told(confirmed or best_of(evaluations))
     print_rows([{"": name, "value": value} for name, value in {**facts, **_flat(settings)}.items()])
     print()
     shown = history[-SHOWN:] if sys.stdout.isatty() else history

@@ -5,6 +5,7 @@ A new message's fixture is written by `python -m tests.common.test_codec`; one t
 
 import dataclasses
 import gc
+import json
 import tracemalloc
 from pathlib import Path
 
@@ -174,6 +175,18 @@ def test_a_million_damaged_messages_never_raise_are_all_counted_and_leave_nothin
         held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     assert held[1] - held[0] < 100_000
+
+
+def test_half_a_surrogate_pair_is_no_text_in_json_or_out():
+    hello = JSON["hello-request"]
+    with pytest.raises(MalformedError, match="surrogate"):
+        decode_json(HelloRequest, json.dumps({**dataclasses.asdict(hello), "fingerprint": "\ud800"}).encode())
+    with pytest.raises(MalformedError, match="surrogate"):
+        encode_json(dataclasses.replace(hello, fingerprint="\ud800"))
+    assert (
+        decode_json(HelloRequest, encode_json(dataclasses.replace(hello, fingerprint="ä \U0001f697"))).fingerprint
+        == "ä \U0001f697"
+    )
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.messages import Result
 from dreamfleet.common.runs import RunFolder, RunSettings, StoredGeneration, open_run, run_lock
+from dreamfleet.coordinator.confirmation import Finalist
 from dreamfleet.coordinator.evaluation import Evaluation
 from dreamfleet.coordinator.generation import Generation
 from dreamfleet.coordinator.jobs import travelling
@@ -83,7 +84,16 @@ def test_evaluations_are_kept_until_finished(journal):
     assert journal.pending_evaluations() == [Evaluation(4, VECTORS[0], 2)]
     journal.finish_evaluation(4, 800.0, 10.0)
     assert journal.pending_evaluations() == []
-    assert journal.best_evaluation() == (4, 800.0, VECTORS[0])
+    assert journal.evaluated_vector(4) == VECTORS[0]
+
+
+def test_finalists_are_the_best_means_each_once(journal):
+    vectors = [bytes([each]) * 8 for each in range(4)]
+    for generation, vector, mean in ((1, 0, 5.0), (2, 1, 7.0), (3, 1, 7.0), (4, 2, 7.0), (5, 3, 6.0)):
+        journal.schedule_evaluation(Evaluation(generation, vectors[vector], 2))
+        journal.finish_evaluation(generation, mean, 1.0)
+    assert [each.generation for each in journal.finalists(3)] == [2, 4, 5]
+    assert journal.finalists(1) == [Finalist(2, vectors[1], 2, 7.0)]
 
 
 def test_a_run_is_never_overwritten(folder, random_bundle):

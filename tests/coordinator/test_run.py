@@ -27,6 +27,8 @@ SETTINGS = RunSettings(
 class Bench:
     """A run in a folder, driven by hand; time stands still unless it is moved."""
 
+    mixed = False
+
     def __init__(self, path, bundle, settings=SETTINGS, generations=1):
         self.path, self.now = path, 0.0
         self.settings, self.limits = settings, LimitsConfig(generations=generations)
@@ -35,7 +37,7 @@ class Bench:
         self.begin()
 
     def begin(self):
-        self.run = Run(self.journal, self.settings, self.limits, Fleet(1.0), self.now)
+        self.run = Run(self.journal, self.settings, self.limits, Fleet(1.0), self.now, mixed=self.mixed)
         self.run.advance(self.now)
         self.run.commit()
         for name in (A, B):
@@ -277,3 +279,19 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
     assert len(accepted) == len(set(accepted))
     assert bench.run.ended is not None
     bench.journal.close()
+
+
+def test_a_run_whose_population_is_one_point_ends_and_says_so(tmp_path, random_bundle):
+    """Where all fitness is equal the step size falls until nothing is left to learn; later it would underflow."""
+    settings = replace(SETTINGS, population=4, collect_every=0, sigma0=1e-30)
+    bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=0)
+    for _ in range(2):
+        while bench.run.ended is None:
+            for send in bench.run.fleet.dispatch(bench.now):
+                for work in send.content.work:
+                    bench.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
+        assert bench.run.ended.startswith("converged: generation ")
+        closed = len(bench.run.history)
+        bench.restart()
+        assert len(bench.run.history) == closed
+        assert bench.run.ended

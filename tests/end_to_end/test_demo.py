@@ -4,8 +4,17 @@ import pytest
 
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.runs import open_run
+from dreamfleet.coordinator.demo import median_drive
 
 pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.mark.parametrize(
+    ("drives", "expected"),
+    [({5: 1.0}, 5), ({5: 1.0, 6: 3.0}, 5), ({5: 9.0, 6: 3.0, 7: 4.0}, 7), ({5: 9.0, 6: 3.0, 7: 4.0, 8: 384.0}, 7)],
+)
+def test_its_video_shows_the_median_track(drives, expected):
+    assert median_drive(drives) == (expected, drives[expected])
 
 
 def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
@@ -21,8 +30,12 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         assert real.history()
         assert dream.evaluations()
         assert Controller.load(real.controller_path).bundle == random_bundle.sha256
-        best = max((real, dream), key=lambda run: max(each.mean for each in run.evaluations())).name
+        best = max((real, dream), key=lambda run: run.confirmation().mean).name
+        confirmed = [f"{run.confirmation().mean:.0f} ± {run.confirmation().error:.0f} (16)" for run in (real, dream)]
+        told = Controller.load((real if best == "demo" else dream).controller_path).provenance
+    assert told["confirmed"]
     assert f"run {best}'s" in out.replace("\n", " ")
+    assert all(score in out for score in confirmed), out
     for made in (f"{best}/drive.mp4", "demo/fitness.png", "demo-dream/fitness.png"):
         assert (processes.runs / made).stat().st_size > 1000
     assert "evolving in the dream" in out

@@ -1,18 +1,20 @@
 """What strangers put on the wire changes nothing, and is counted."""
 
+import json
 import os
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 import zenoh
 
 from dreamfleet.common import keys
-from dreamfleet.common.codec import encode
-from dreamfleet.common.messages import MAX_MESSAGE
+from dreamfleet.common.codec import decode_json, encode
+from dreamfleet.common.messages import MAX_MESSAGE, ControlReply, HelloReply
 from dreamfleet.common.session import Network, open_session
 from tests.support import tasks
 from tests.support.mutations import mutations
-from tests.support.samples import MSGPACK
+from tests.support.samples import JSON, MSGPACK
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -88,3 +90,41 @@ def test_a_hundred_thousand_damaged_messages_leave_no_trace_but_their_count(proc
     (_, before), (dropped, after) = flood(processes, random_bundle, 10_000, 100_000)
     assert dropped == 110_000
     assert after - before < 20e6
+
+
+HELLO = replace(JSON["hello-request"], tasks=(tasks.SLOW_TOY,), slots=1)
+
+
+def say(session, key, payload=None):
+    """The one answer to a query."""
+    (reply,) = list(session.get(key, payload=payload, timeout=5))
+    return reply.ok.payload.to_bytes()
+
+
+def hello(session, **changes):
+    """What a coordinator answers to a hello, whose text may be what no worker of ours would say."""
+    document = {**asdict(HELLO), **changes}
+    return decode_json(HelloReply, say(session, keys.hello("test"), json.dumps(document).encode()))
+
+
+def test_no_hello_and_no_control_verb_is_too_long_to_be_answered(processes, random_bundle):
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
+        "--generations", 2,
+    )  # fmt: skip
+    with open_session(Network(connect=(processes.endpoint,))) as session:
+        names = [f"task-{number}-{'x' * 100}" for number in range(80)]
+        assert not (reply := hello(session, tasks=names)).accepted
+        assert "task-0-" in reply.why
+        assert "more" in reply.why
+        assert not (reply := hello(session, fingerprint="half a pair: \ud800")).accepted
+        assert "not a hello" in reply.why
+        processes.worker("--task", tasks.SLOW_TOY)
+        coordinator.wait_for("generation 0: mean")
+        for strange in ("y" * 2000, "\x1b" * 2000):
+            assert not (reply := hello(session, fingerprint=strange)).accepted
+            assert "fingerprints differ" in reply.why
+        reply = decode_json(ControlReply, say(session, keys.control("test", "z" * 3000)))
+        assert not reply.accepted
+        assert "no control verb" in reply.why
+    assert coordinator.finish()[0] == 0

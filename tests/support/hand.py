@@ -49,6 +49,7 @@ class Hand:
         self.damage = lambda offset, data: data  # what becomes of a bundle's part; `None`: no answer
         self._held = []
         self._bundle = bundle.path.read_bytes()
+        self.total = lambda: len(self._bundle)  # as it says
         self._said = queue.SimpleQueue()
         self.endpoint = f"tcp/127.0.0.1:{port}"
         self._shares = beside is not None  # the router of another
@@ -164,7 +165,7 @@ class Hand:
         with query:
             part = BundlePart(
                 run_uid=self.run_uid, incarnation=self.incarnation, sha256=bytes.fromhex(self.spec.bundle),
-                offset=offset, total=len(self._bundle), data=data,
+                offset=offset, total=self.total(), data=data,
             )  # fmt: skip
             query.reply(query.key_expr, encode(part))
 

@@ -13,12 +13,14 @@ from gymnasium import spaces
 from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 
 MODULE = "tests.support.tasks"
-TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC = (
+TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, EXPLODING, ENDLESS = (
     f"{MODULE}:{name}"
     for name in (
         "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Optimistic",
+        "Exploding", "Endless",
     )
 )  # fmt: skip
+ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
 ODD_REWARD = "DREAMFLEET_TEST_ODD_REWARD"  # a file that holds a number: the next episode gives it, and the file is gone
 
@@ -253,6 +255,33 @@ class Optimistic(Toy):
 
     def make_batch(self, assignment):
         return OptimisticBatch(assignment.spec.temperature)
+
+
+class Exploding(Toy):
+    """Its rewards are numbers, their mean is none."""
+
+    name = EXPLODING
+
+    def make_batch(self, assignment):
+        return Constant(Score(1.7e308, 10))
+
+
+class Endless(Toy):
+    """It counts more steps than any journal."""
+
+    name = ENDLESS
+
+    def make_batch(self, assignment):
+        return Constant(Score(1.0, 2**63 - 1))
+
+
+class Constant:
+    def __init__(self, score):
+        self._score = score
+
+    def score(self, episodes, on_step):
+        on_step(self._score.steps)
+        return [self._score for _ in episodes]
 
 
 class OptimisticBatch:

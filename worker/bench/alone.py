@@ -22,9 +22,10 @@ def print_figures(measure: Callable[[Bundle], dict[str, Any]], args: argparse.Na
     from multiprocessing import get_context
 
     from dreamfleet.common.bundle import find_bundle
-    from dreamfleet.common.threads import pin_thread_pools
+    from dreamfleet.common.threads import forget_library_settings, pin_thread_pools
 
     bundle = find_bundle(args.bundle)
+    forget_library_settings()
     pin_thread_pools()
     # A child, for numpy's library reads its thread count once, as it loads, and the command line has loaded it.
     with get_context("spawn").Pool(1) as pool:

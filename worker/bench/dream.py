@@ -9,6 +9,7 @@ import numpy as np
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.worker.bench.blocks import Measured, alternate
+from dreamfleet.worker.bench.products import Size, fastest, product_cases
 from dreamfleet.worker.dream.batch import Dreamer
 from dreamfleet.worker.tasks.api import Episode
 
@@ -21,8 +22,9 @@ HORIZON = 64  # steps of a measured dream
 def bench_dream(bundle: Bundle) -> dict[str, Any]:
     """Dreamed steps a second by batch, whole: noise, controllers, reward and sums included.
 
-    `of_floor`: at 256, the time of the step's matrix products alone, by NumPy at their own sizes, over the time of the
-    whole; `torch_naive_ratio`: over a step of torch's modules and distributions at 256.
+    `of_floor`: at 256, the time of the step's matrix products alone, at their own sizes, each by the library that is
+    fastest at it on this core, over the time of the whole; activations, chance, sums and Python count nothing.
+    `torch_naive_ratio`: over a step of torch's modules and distributions at 256.
     """
     dreamer = Dreamer(bundle, TaskSpec("dream", bundle.sha256, HORIZON, 0, temperature=1.25))
     random = np.random.default_rng(0)
@@ -34,7 +36,8 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
         return lambda: dreamer.score(dreams)
 
     cases: dict[str, Measured] = {str(batch): dream(batch) for batch in BATCHES}
-    cases["floor"] = _products(bundle, random)
+    sizes = product_sizes(bundle)
+    cases |= product_cases(sizes)
     note = ""
     try:
         from dreamfleet.worker.bench.eager import make_torch_dream
@@ -44,31 +47,25 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
         note = f"torch_naive_ratio needs {error.name}: pip install 'dreamfleet[train]'"
     seconds = alternate(cases)
     rates = {str(batch): batch * HORIZON / seconds[str(batch)] for batch in BATCHES}
-    floor = TILE / seconds["floor"]
+    least, libraries = fastest(seconds, len(sizes))
+    floor = TILE / least
     return {
         "steps_per_second": {batch: round(rate) for batch, rate in rates.items()},
         "of_floor": round(rates[str(TILE)] / floor, 3),
         "torch_naive_ratio": round(rates[str(TILE)] * seconds["torch"] / TILE, 2) if "torch" in seconds else None,
         "floor_steps_per_second": round(floor),
+        "floor_by": ", ".join(libraries),
         **({"note": note} if note else {}),
     }
 
 
-def _products(bundle: Bundle, random: np.random.Generator) -> Measured:
-    """The matrix products of one step of `TILE` rows: the LSTM's, the heads', the controllers'."""
+def product_sizes(bundle: Bundle) -> tuple[Size, ...]:
+    """The matrix products of one step of `TILE` rows: the LSTM's four gates in one, the heads', the controllers'."""
     manifest = bundle.manifest
     features = manifest.latent + manifest.hidden
     outputs = 3 * int(manifest.models["mdnrnn"]["mixtures"]) * manifest.latent + 1
-    shapes = (
+    return (
         ((TILE, features + manifest.actions), (features + manifest.actions, 4 * manifest.hidden)),
         ((TILE, manifest.hidden), (manifest.hidden, outputs)),
         ((TILE, manifest.actions, features), (TILE, features, 1)),
     )
-    pairs = [tuple(random.normal(size=shape).astype(np.float32) for shape in pair) for pair in shapes]
-    outs = [left @ right for left, right in pairs]
-
-    def multiply() -> None:
-        for (left, right), out in zip(pairs, outs, strict=True):
-            np.matmul(left, right, out=out)
-
-    return multiply

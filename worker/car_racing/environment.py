@@ -52,11 +52,11 @@ class CarRacing(_Base):  # type: ignore[misc]
 
     def step(self, action: Any) -> Any:
         """Gymnasium's step; an action of another shape, or NaN, is refused before anything moves."""
-        if self.car.__class__ is car_dynamics.Car:  # a new one, of a reset
+        if self.car.__class__ is car_dynamics.Car and available():  # a new one, of a reset
             self.car.__class__ = Car
         if action is not None and self.continuous:
             action = np.asarray(action)
-            if action.shape != (3,) or not all(map(math.isfinite, action)):
+            if action.shape != (3,) or not all(map(math.isfinite, action.tolist())):
                 raise InvalidAction(f"an action is three finite numbers (steering, gas, brake), not {action!r}")
         return super().step(action)
 

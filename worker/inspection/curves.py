@@ -80,6 +80,13 @@ def fitness(run: RunFolder) -> Section | None:
         handles.append(
             real.errorbar(generations, means, errors, fmt="s", color="tab:green", capsize=3, label="evaluated mean")
         )
+        if (confirmed := run.confirmation()) is not None:
+            handles.append(
+                real.errorbar(
+                    confirmed.generation, confirmed.mean, confirmed.error, fmt="*", color="tab:red", capsize=3,
+                    markersize=9, label="reported, confirmed",
+                )
+            )  # fmt: skip
         real.set_ylabel("score of whole episodes", color="tab:green")
     panel.legend(handles=handles, fontsize=FONT, loc="best")
     panel.grid(alpha=0.3)

@@ -46,7 +46,7 @@ def find_subject(name: str, runs_dir: Path) -> Iterator[Subject]:
         if not run.spec.bundle:
             yield Subject(None, run=run)
             return
-        bundle = Bundle.open(run.bundle_path)
+        bundle = Bundle.open(run.bundle_path, run.spec.bundle)
         if not run.controller_path.exists():
             yield Subject(bundle, run=run)
             return

@@ -15,6 +15,7 @@ from dreamfleet.common.codec import Inbox, MalformedError, encode_json, from_pla
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, fingerprint, package_version
 from dreamfleet.common.messages import HelloReply, HelloRequest, Intervals, TaskSpec
+from dreamfleet.worker.service.announced import check_announced
 
 HELLO_TIMEOUT = 2.0
 
@@ -35,13 +36,18 @@ class Admission:
 def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> Admission | None:
     """Say hello to `run`, or to the only live one; `None` if nobody answers, `RefusedError` if the answer is no.
 
+    A run that asks for a task which the request does not announce is refused in turn: its word imports nothing here.
     Where the run's fingerprint names other packages than the request's, hello is said again about those.
     """
     reply = _say(session, run, request, inbox)
     if reply is not None and not reply.accepted and reply.packages != request.packages:
         about = replace(request, packages=reply.packages, fingerprint=fingerprint(reply.packages))
         reply = _say(session, reply.run, about, inbox)
-    return None if reply is None else _admission(reply)
+    if reply is None:
+        return None
+    admission = _admission(reply)
+    check_announced(admission.spec.task, request.tasks)
+    return admission
 
 
 def _say(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> HelloReply | None:

@@ -11,10 +11,11 @@ import zenoh
 
 from dreamfleet.common import keys
 from dreamfleet.common.asking import ask_all
-from dreamfleet.common.bundle import Bundle, BundleStore, default_cache
+from dreamfleet.common.bundle import MAX_BUNDLE, Bundle, BundleStore, default_cache
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError
+from dreamfleet.common.files import open_growing
 from dreamfleet.common.messages import MAX_PART, BundlePart
 
 log = logging.getLogger(__name__)
@@ -37,7 +38,10 @@ def obtain(
         for attempt in range(1, ATTEMPTS + 1):
             if (bundle := store.find(sha256)) is not None:  # another worker of this host was faster
                 return bundle
-            _download(session, keys.bundle(run, sha256), sha256, path, inbox, stopped)
+            try:
+                _download(session, keys.bundle(run, sha256), sha256, path, inbox, stopped)
+            except OSError as error:  # what has come stays, and the next worker goes on from there
+                raise store.unwritable(error) from error
             if stopped():
                 return None
             try:
@@ -62,28 +66,41 @@ def fetch_for(controller: Controller, session: zenoh.Session, run: str) -> Bundl
 def _download(
     session: zenoh.Session, key: str, sha256: str, path: Path, inbox: Inbox, stopped: Callable[[], bool]
 ) -> None:
-    """Append to `path` until it is as long as the bundle, or `stopped`."""
+    """Append to `path` until it is as long as the bundle, or `stopped`.
+
+    How long that is, the first part says; one that says otherwise is of something else.
+    """
     total, silences = None, 0
-    with path.open("ab") as file:
+    with open_growing(path) as file:
         while (total is None or file.tell() < total) and not stopped():
             before = file.tell()
             offsets = [before + index * MAX_PART for index in range(WINDOW if total else 1)]
-            parts = _ask(session, key, [each for each in offsets if total is None or each < total], inbox, stopped)
+            wanted = [each for each in offsets if total is None or each < total]
+            parts = [part for part in _ask(session, key, wanted, inbox, stopped) if part.sha256.hex() == sha256]
             for part in sorted(parts, key=lambda part: part.offset):
-                if part.sha256.hex() == sha256:
-                    total = part.total
-                    if part.offset == file.tell():
-                        file.write(part.data)
+                total = _length(part) if total is None else total
+                if part.total == total and part.offset == file.tell() and part.offset + len(part.data) <= total:
+                    file.write(part.data)
             if total is not None and file.tell() > total:
                 file.seek(0)
                 file.truncate()  # the beginning of something else
             elif file.tell() > before or file.tell() == total:
                 silences = 0
             else:
-                silences += 1
+                silences, total = silences + 1, None  # which was perhaps of something else
                 sleep(PAUSE)
             if silences >= SILENCES:
                 raise BundleError("the coordinator no longer answers for its bundle; start the worker again later")
+
+
+def _length(part: BundlePart) -> int:
+    """How long the bundle is; `BundleError` before more is written than a bundle may be."""
+    if part.total > MAX_BUNDLE:
+        raise BundleError(
+            f"the coordinator says that its bundle is {part.total / 1e6:,.0f} MB long, {MAX_BUNDLE / 1e6:.0f} at most "
+            "are fetched: check its copy"
+        )
+    return part.total
 
 
 def _ask(

@@ -30,28 +30,38 @@ class Ready:
 
 
 def serve_jobs(
-    pipe: Connection[Any, Any], steps: Any, abandoned: Any, spec: TaskSpec, bundle: Path | None, parent: int
-) -> None:
-    """Score jobs from the pipe until it closes. `steps` and `abandoned` are shared with the parent."""
+    pipe: Connection[Any, Any], steps: Any, abandoned: Any, spec: TaskSpec, bundle: Path | None,
+    announced: tuple[str, ...], parent: int,
+) -> None:  # fmt: skip
+    """Score jobs from the pipe until it closes. `steps` and `abandoned` are shared with the parent.
+
+    Nothing is imported for a task that is not among the `announced` ones.
+    """
     die_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker decides; Ctrl-C reaches the whole group
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     with suppress(OSError, AttributeError, ValueError, RuntimeError):  # no stderr: no traceback of a crash
         faulthandler.enable()
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    scorer = _make_scorer(pipe, spec, bundle)
+    scorer = _make_scorer(pipe, spec, bundle, announced)
     pipe.send(Ready(scorer.drawn_by))
     _take_turns(pipe, scorer, steps, abandoned)
 
 
-def _make_scorer(pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None) -> Scorer:
+def _make_scorer(pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None, announced: tuple[str, ...]) -> Scorer:
     """Load task and world model; what keeps them from loading is this child's last word."""
     from dreamfleet.common.bundle import Bundle
     from dreamfleet.worker.scoring.scorer import Scorer
+    from dreamfleet.worker.service.announced import check_announced, check_world
     from dreamfleet.worker.service.turn import Failure
 
     try:
-        return Scorer(spec, None if bundle is None else Bundle.open(bundle))
+        check_announced(spec.task, announced)
+        if bundle is None:
+            return Scorer(spec)
+        opened = Bundle.open(bundle, spec.bundle)
+        check_world(opened, announced)
+        return Scorer(spec, opened)
     except Exception as error:
         pipe.send(Failure.of(error))
         raise SystemExit(1) from error

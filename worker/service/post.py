@@ -15,6 +15,7 @@ from dreamfleet.worker.service.admission import Admission
 from dreamfleet.worker.service.slots import Slots
 from dreamfleet.worker.service.uploads import Piece
 
+MOST_A_SECOND = 1e9  # steps that a beat can say
 SMOOTHING = 0.3  # weight of the newest interval in the throughput
 
 
@@ -75,7 +76,7 @@ class Post:
             running=tuple(running[:MAX_LEASES]),
             unacked=_tags(unacked),
             load=os.getloadavg()[0],
-            steps_per_second=rate,
+            steps_per_second=min(rate, MOST_A_SECOND),
             drawn_by=slots.drawn_by,
         )
         self._put(keys.beat(self._run.run, self._identity), beat)

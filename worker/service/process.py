@@ -29,14 +29,18 @@ Word = Ready | Done | Failure | None
 class ChildProcess:
     """A running child; `hear` is called in a thread of its own with each word, and with `None` at the end."""
 
-    def __init__(self, spec: TaskSpec, bundle: Path | None, hear: Callable[[Word], None]) -> None:
+    def __init__(
+        self, spec: TaskSpec, bundle: Path | None, announced: tuple[str, ...], hear: Callable[[Word], None]
+    ) -> None:
         pin_thread_pools()
         context = get_context("spawn")
         self._steps: Any = context.Value("Q", 0, lock=False)
         self._abandoned: Any = context.Array("Q", 2, lock=False)  # turns to give up: an even one, an odd one
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
-            target=serve_jobs, args=(theirs, self._steps, self._abandoned, spec, bundle, os.getpid()), daemon=True
+            target=serve_jobs,
+            args=(theirs, self._steps, self._abandoned, spec, bundle, announced, os.getpid()),
+            daemon=True,
         )
         with signals_held():
             self._process.start()

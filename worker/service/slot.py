@@ -54,14 +54,16 @@ class Slot:
         spec: TaskSpec,
         bundle: Path | None,
         events: queue.SimpleQueue[tuple[str, Any]],
+        announced: tuple[str, ...],
         memory_limit: int = 0,
     ) -> None:
-        """`memory_limit` in bytes; 0: none."""
+        """`announced` are the tasks that its worker lets itself be asked for; `memory_limit` in bytes; 0: none."""
         self.number = number
         self.ready = False
         self.drawn_by = "-"
         self._spec = spec
         self._bundle = bundle
+        self._announced = announced
         self._events = events
         self._memory_limit = memory_limit
         self._turns: deque[Turn] = deque()
@@ -197,7 +199,10 @@ class Slot:
         self._life += 1
         number, life, events = self.number, self._life, self._events
         self._child = ChildProcess(
-            self._spec, self._bundle, lambda word: events.put(("slot", SlotEvent(number, life, word)))
+            self._spec,
+            self._bundle,
+            self._announced,
+            lambda word: events.put(("slot", SlotEvent(number, life, word))),
         )
         self._watch_anew()
         waiting, self._turns = self._turns, deque()

@@ -7,7 +7,9 @@ import queue
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.bounds import saturated
 from dreamfleet.common.messages import MAX_LEASES, TAG_BYTES, Job, Result, Running, TaskSpec
+from dreamfleet.worker.service.announced import check_announced
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.failures import Failures
 from dreamfleet.worker.service.slot import Slot, SlotEvent
@@ -25,13 +27,15 @@ class Slots:
         spec: TaskSpec,
         bundle: Path | None,
         events: queue.SimpleQueue[tuple[str, Any]],
+        announced: tuple[str, ...],
         memory_limit: int,
     ) -> None:
-        """`memory_limit` in bytes a slot; 0: none."""
+        """`RefusedError` for a task that is not `announced`; `memory_limit` in bytes a slot; 0: none."""
+        check_announced(spec.task, announced)
         self._task = spec.task
         self._width = find_task(spec.task).width
         self._failures = Failures()
-        self._slots = [Slot(number, spec, bundle, events, memory_limit) for number in range(count)]
+        self._slots = [Slot(number, spec, bundle, events, announced, memory_limit) for number in range(count)]
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -60,7 +64,7 @@ class Slots:
     def running(self) -> list[Running]:
         """Each running job, with its share of its turn's steps."""
         return [
-            Running(job.digest[:TAG_BYTES], slot.steps // len(slot.running))
+            Running(job.digest[:TAG_BYTES], saturated(slot.steps // len(slot.running)))
             for slot in self._slots
             for job in slot.running
         ]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dreamfleet.common.bounds import LONGEST_EPISODE, excess, saturated
 from dreamfleet.common.messages import MAX_UPLOAD, Job, Result
 
 if TYPE_CHECKING:  # the child imports this module before it imports what scores
@@ -104,12 +105,12 @@ def do_turn(scorer: Scorer, turn: int, work: Sequence[Work], count: Callable[[in
         count(0)
         scores, upload = _score(scorer, work, on_step)
         spent = (perf_counter() - started) / len(work)
-        return Done(turn, _results(work, scores, spent, upload), upload)
+        return Done(turn, _results(work, scores, spent, upload, scorer.spec.horizon), upload)
     except AbandonedError:
         return Done(turn, ())
     except Exception as error:
         failure = Failure.of(error)
-        each = made // len(work), (perf_counter() - started) / len(work), failure.text
+        each = saturated(made // len(work)), (perf_counter() - started) / len(work), failure.text
         return Done(turn, tuple(Result(job.digest, None, *each, None) for job, _ in work), failure=failure)
 
 
@@ -123,17 +124,25 @@ def _score(scorer: Scorer, work: Sequence[Work], on_step: Callable[[int], None])
     return scorer.score_all(episodes, on_step, scorer.spec.at(work[0][0].temperature)), None
 
 
-def _results(work: Sequence[Work], scores: list[Score], spent: float, upload: bytes | None) -> tuple[Result, ...]:
-    """A result of each job; `ValueError` where a task's scores are not one number a job."""
+def _results(
+    work: Sequence[Work], scores: list[Score], spent: float, upload: bytes | None, horizon: int
+) -> tuple[Result, ...]:
+    """A result of each job; `ValueError` where a task's scores are not one number a job that a run can count."""
     if len(scores) != len(work):
         raise ValueError(f"the task gave {len(scores)} scores of {len(work)} episodes")
     if not all(math.isfinite(score.fitness) for score in scores):
         raise ValueError("the task gave a fitness that is no number")
     sha256 = None if upload is None else hashlib.sha256(upload).digest()
-    return tuple(
-        Result(job.digest, float(score.fitness), int(score.steps), spent, None, sha256)
-        for (job, _), score in zip(work, scores, strict=True)
-    )
+    return tuple(_result(job, score, spent, sha256, horizon) for (job, _), score in zip(work, scores, strict=True))
+
+
+def _result(job: Job, score: Score, spent: float, sha256: bytes | None, horizon: int) -> Result:
+    """A number that would spoil the run's is this job's error, and not that of the jobs that were scored with it."""
+    fitness, steps = float(score.fitness), int(score.steps)
+    why = excess(fitness, steps, spent, LONGEST_EPISODE if job.kind == "evaluate" else horizon)
+    if why is None:
+        return Result(job.digest, fitness, steps, spent, None, sha256)
+    return Result(job.digest, None, saturated(steps), spent, why, None)
 
 
 def _packed(drive: Rollout) -> bytes:

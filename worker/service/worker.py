@@ -18,6 +18,7 @@ from dreamfleet.common.codec import Inbox
 from dreamfleet.common.errors import ConnectionFailedError, RefusedError
 from dreamfleet.common.session import Network, open_session
 from dreamfleet.worker.service.admission import Admission, ask, make_request, neediest
+from dreamfleet.worker.service.announced import check_world
 from dreamfleet.worker.service.bundle_fetch import obtain
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.joined import JoinedRun, Line
@@ -94,9 +95,11 @@ class Worker:
         self._events = queue.SimpleQueue()
         with ExitStack() as stack:
             memory, path = self._config.slot_memory << 20, bundle.path if bundle else None
-            slots = Slots(self._slot_count, admission.spec, path, self._events, memory)
-            stack.callback(slots.stop)
             try:
+                if bundle is not None:
+                    check_world(bundle, self._hello.tasks)
+                slots = Slots(self._slot_count, admission.spec, path, self._events, self._hello.tasks, memory)
+                stack.callback(slots.stop)
                 JoinedRun(line, admission, self._membership, slots, self._events).serve()
             except RefusedError as error:
                 self._take_refusal(admission.run, error)

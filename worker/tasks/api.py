@@ -108,6 +108,14 @@ class Assignment:
     spec: TaskSpec
     bundle: Bundle | None = None
 
+    def __post_init__(self) -> None:
+        """`BundleError` for another world model than the specification names: a fitness would be of another run."""
+        if self.bundle is not None and self.bundle.sha256 != self.spec.bundle:
+            raise BundleError(
+                f"{self.bundle.path} is the world model {self.bundle.sha256[:12]}..., and what is scored in is "
+                f"{self.spec.bundle[:12]}...: put the right one there"
+            )
+
     @classmethod
     def of(cls, task: str, bundle: Bundle) -> Assignment:
         """A task on a world model outside of any run."""

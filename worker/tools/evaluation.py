@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.bundle import Bundle, BundleStore, default_cache, find_bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, DreamfleetError
+from dreamfleet.common.files import is_there
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.threads import pin_thread_pools
 from dreamfleet.worker.scoring.scorer import Scorer
@@ -51,8 +52,8 @@ def bundle_for(controller: Controller, named: str | None, beside: Path | None = 
         return None
     if named is not None:
         bundle = find_bundle(named)
-    elif beside is not None and beside.exists():
-        bundle = Bundle.open(beside)
+    elif beside is not None and is_there(beside):
+        bundle = Bundle.open(beside, controller.bundle)
     else:
         found = BundleStore(default_cache()).find(controller.bundle)
         if found is None:
@@ -110,4 +111,4 @@ def _drive(spec: TaskSpec, bundle: Path | None, parameters: NDArray[np.float32],
 @cache
 def _scorer(spec: TaskSpec, bundle: Path | None) -> Scorer:
     """One a process, made by its first drive, so that whatever is wrong is that drive's error."""
-    return Scorer(spec, Bundle.open(bundle) if bundle else None, judge=True)
+    return Scorer(spec, Bundle.open(bundle, spec.bundle) if bundle else None, judge=True)

@@ -31,7 +31,7 @@ def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[Replayed
     from dreamfleet.worker.scoring.scorer import Scorer
 
     spec = spec_of(run, generation)
-    scorer = Scorer(spec, Bundle.open(run.bundle_path) if spec.bundle else None)
+    scorer = Scorer(spec, Bundle.open(run.bundle_path, spec.bundle) if spec.bundle else None)
     for result in results:
         yield Replayed(
             result.episode, result.seed, result.fitness, scorer.score("score", parameters, result.seed).fitness

@@ -23,9 +23,10 @@ def run(args: argparse.Namespace) -> int:
     from multiprocessing import get_context
 
     from dreamfleet.common.bundle import find_bundle
-    from dreamfleet.common.threads import pin_thread_pools
+    from dreamfleet.common.threads import forget_library_settings, pin_thread_pools
 
     bundle = find_bundle(args.bundle)
+    forget_library_settings()
     pin_thread_pools()
     if args.exact:
         return _compare(bundle, args.json)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.bundle import DECODER, DREAM, ENCODER, LAYERED, LINEAR, POLICY, Bundle
 from dreamfleet.common.errors import BundleError
+from dreamfleet.common.tensors import check_closed
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]
@@ -19,8 +20,10 @@ ATTENTION = "attention"  # an output of dreams with a window
 
 def open_part(bundle: Bundle, name: str) -> onnxruntime.InferenceSession:
     """A session on one of a bundle's graphs; one thread, because scoring processes are one a core."""
+    graph = bundle.read(name)
     try:
-        return open_graph(bundle.read(name), threads=1)
+        check_closed(graph)
+        return open_graph(graph, threads=1)
     except Exception as error:  # the runtime's errors share no public base
         raise BundleError(f"{bundle.path}: {name} cannot be run ({error})") from error
 
@@ -31,6 +34,7 @@ def open_graph(graph: bytes, threads: int) -> onnxruntime.InferenceSession:
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.load_model_format", "ONNX")  # whatever its first bytes say
     options.log_severity_level = 3
     return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 

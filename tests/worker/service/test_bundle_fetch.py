@@ -1,6 +1,7 @@
 """Downloads that are cut, over a real router: what is on disk stays, and the whole is verified."""
 
 import hashlib
+import resource
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -143,3 +144,35 @@ def test_a_window_of_parts_is_asked_for_at_once(session, hand, store, bundle):
     fetch(session, hand, store)
     assert PARTS < WINDOW
     assert sorted(asked(hand)) == [index * MAX_PART for index in range(-(-bundle.path.stat().st_size // MAX_PART))]
+
+
+def test_a_bundle_that_is_said_to_be_endless_writes_nothing(session, hand, store, bundle, monkeypatch):
+    monkeypatch.setattr(hand, "total", lambda: 2**62)
+    with pytest.raises(BundleError, match=r"is 4,611,686,018,427 MB long, 268 at most"):
+        fetch(session, hand, store)
+    with store.downloading(bundle.sha256) as partial:
+        assert not partial.stat().st_size
+
+
+def test_parts_of_another_length_are_of_something_else(session, hand, store, bundle, monkeypatch):
+    monkeypatch.setattr(bundle_fetch, "PAUSE", 0.0)
+    size, asked = bundle.path.stat().st_size, iter(range(10**6))
+    monkeypatch.setattr(hand, "total", lambda: size + next(asked) % 2)
+    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
+
+
+def test_a_beginning_of_another_bundle_is_thrown_away(session, hand, store, bundle, random_bundle):
+    begun(store, bundle, random_bundle.path.read_bytes()[: MAX_PART + 5])
+    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
+
+
+def test_a_disk_that_takes_no_more_is_one_line_and_what_has_come_stays(session, hand, store, bundle):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_PART + 100, hard))
+    try:
+        with pytest.raises(BundleError, match=r"cannot write in .*File too large; make room there"):
+            fetch(session, hand, store)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
+    assert MAX_PART + 100 in asked(hand)

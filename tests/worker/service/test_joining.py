@@ -1,12 +1,18 @@
 """How a worker comes to a run: it waits, is welcomed or refused."""
 
+import os
+import queue
+from dataclasses import replace
+
 import pytest
 
+from dreamfleet.common.bundle import write_bundle
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, fingerprint
-from dreamfleet.common.messages import Intervals
+from dreamfleet.common.messages import Intervals, TaskSpec
 from dreamfleet.common.session import Network
 from dreamfleet.worker.service.config import WorkerConfig
+from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.service.worker import Worker
 from tests.support import tasks
 from tests.support.hand import DEADLINE, Hand
@@ -98,3 +104,52 @@ def test_a_name_that_cannot_be_kept_is_refused():
 def test_a_task_that_it_is_told_of_and_cannot_load_is_an_error_at_once():
     with pytest.raises(UsageError, match=r"'tests\.support\.tasks:Moon' cannot be loaded"):
         Worker(WorkerConfig(), Network(), ("tests.support.tasks:Moon",))
+
+
+def foreign(tmp_path, monkeypatch):
+    """A module that leaves a mark when it is imported, and the mark."""
+    mark = tmp_path / "imported"
+    (tmp_path / "foreign_world.py").write_text(
+        f"open({str(mark)!r}, 'w').close()\ndef World():\n    raise SystemExit\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    return mark
+
+
+def test_a_task_that_it_did_not_announce_is_never_imported(stage, cached, tmp_path, monkeypatch):
+    mark = foreign(tmp_path, monkeypatch)
+    stage.hand("foreign_world:World")
+    _, served = stage.worker()
+    assert isinstance(error := served.exception(DEADLINE), RefusedError)
+    assert "'foreign_world:World', which this worker did not announce" in str(error)
+    assert not mark.exists()
+
+
+def test_a_worker_of_any_run_leaves_one_of_an_unannounced_task_to_others(stage, said, cached):
+    hand = stage.hand("os:abort", run="evil")
+    other = stage.also(hand, run="second")
+    other.slots = 1
+    stage.worker(run=None, any=True)
+    assert "'os:abort', which this worker did not announce" in wait_for(said, "announce")
+    other.ready()
+
+
+def test_a_child_imports_no_task_that_its_worker_did_not_announce(tmp_path, monkeypatch):
+    mark, events = foreign(tmp_path, monkeypatch), queue.SimpleQueue()
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    slot = Slot(0, TaskSpec("foreign_world:World", "", 100, 0), None, events, (tasks.TOY,))
+    failure = events.get(timeout=DEADLINE)[1].failure
+    assert failure.text.startswith("RefusedError: ")
+    slot.stop()
+    assert not mark.exists()
+
+
+def test_a_world_model_of_a_world_that_it_did_not_announce_imports_nothing(stage, tmp_path, monkeypatch):
+    mark, small = foreign(tmp_path, monkeypatch), stage.bundle
+    parts = {name: small.read(name) for name in small.manifest.parts}
+    world = replace(small.manifest, task="foreign_world:World")
+    stage.bundle = write_bundle(tmp_path / "foreign.zip", world, parts)
+    stage.hand("dream")
+    _, served = stage.worker()
+    assert isinstance(served.exception(DEADLINE), RefusedError)
+    assert not mark.exists()

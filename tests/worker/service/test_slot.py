@@ -3,6 +3,7 @@ import io
 import os
 import queue
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,27 +14,29 @@ from time import monotonic
 import numpy as np
 import pytest
 
+from dreamfleet.common.bundle import hash_file
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.worker.service.slot import FAILED_STARTS, START_LIMIT, Slot
 from tests.support import tasks
+from tests.support.bundles import write_random_bundle
 from tests.support.processes import environment
 from tests.support.samples import VECTOR, job
 
 TIMEOUT = 60
 
 
-def spec(task):
-    return TaskSpec(task=task, bundle="ab" * 32, horizon=100, patience=0)
+def spec(task, bundle):
+    return TaskSpec(task=task, bundle=hash_file(bundle), horizon=100, patience=0)
 
 
 class Harness:
     """A slot and its worker's queue."""
 
     def __init__(self, task, bundle, memory_limit):
-        self.spec = spec(task)
+        self.spec = spec(task, bundle)
         self.events = queue.SimpleQueue()
-        self.slot = Slot(0, self.spec, bundle, self.events, memory_limit)
+        self.slot = Slot(0, self.spec, bundle, self.events, tasks.ALL, memory_limit)
 
     def wait_ready(self):
         while not self.slot.ready:
@@ -299,9 +302,10 @@ def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
         "from dreamfleet.worker.service.slot import Slot\n"
         "if __name__ == '__main__':\n"
         "    events = queue.SimpleQueue()\n"
-        "    slot = Slot(0, spec(tasks.HANGING), pathlib.Path(sys.argv[1]), events)\n"
+        "    path = pathlib.Path(sys.argv[1])\n"
+        "    slot = Slot(0, spec(tasks.HANGING, path), path, events, tasks.ALL)\n"
         "    slot.handle(events.get()[1])\n"
-        "    slot.submit([(job(spec=spec(tasks.HANGING)), VECTOR)])\n"
+        "    slot.submit([(job(spec=spec(tasks.HANGING, path)), VECTOR)])\n"
         "    print(slot.pid, slot.ready, flush=True)\n"
         "    events.get()\n"
     )
@@ -317,3 +321,15 @@ def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
             os.kill(int(pid), signal.SIGKILL)
         os.close(child)
         assert died, "it hangs in its job, where no closed pipe ends it"
+
+
+def test_a_bundle_that_was_swapped_is_never_scored_with(harness, random_bundle, tmp_path):
+    path = tmp_path / "cached.zip"
+    shutil.copyfile(random_bundle.path, path)
+    slot = harness(tasks.TOY, path)
+    slot.score()
+    write_random_bundle(tmp_path / "other.zip", seed=1).path.replace(path)
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    slot.slot.handle(slot.gone())  # another child starts
+    with pytest.raises(DreamfleetError, match=r"a slot cannot start: BundleError: .*is not the world model that is w"):
+        slot.wait_ready()

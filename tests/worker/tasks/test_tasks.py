@@ -118,3 +118,9 @@ def test_a_turn_is_scored_at_its_jobs_temperature_as_a_run_of_that_temperature_s
         assert scores == found.setdefault(temperature, scores)
         assert scores == Scorer(spec.at(temperature), random_bundle).score_all(jobs, lambda _: None)
     assert len({score.fitness for scores in found.values() for score in scores}) == 9
+
+
+@pytest.mark.parametrize("name", ["os:abort", "sys:exit", "tests.support.tasks:steps_made"])
+def test_what_is_no_class_is_never_called_as_a_task(name):
+    with pytest.raises(UsageError, match="is no task: it is no class"):
+        find_task(name)

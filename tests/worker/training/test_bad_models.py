@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import pytest
 
 from dreamfleet.common.bundle import DREAM, INITIAL, POLICY, find_bundle, write_bundle
@@ -149,3 +150,73 @@ def test_a_whole_folder_still_makes_a_bundle(folder):
     bundle = assemble(folder, folder / "b.zip", "b", with_weights=True)
     assert bundle.manifest.models["vae"]["latent"] == 4
     assert PolicyStep(bundle).state_size == 16
+
+
+def with_weights_elsewhere(model):
+    """The first initialiser's numbers lie in a file beside the model."""
+    tensor = model.graph.initializer[0]
+    elsewhere(tensor)
+
+
+def numbers():
+    return onnx.numpy_helper.from_array(np.zeros(2, np.float32), "c")
+
+
+def with_a_constant_elsewhere(model):
+    node = onnx.helper.make_node("Constant", [], ["c"], value=numbers())
+    elsewhere(node.attribute[0].t)
+    model.graph.node.append(node)
+
+
+def with_a_branch_elsewhere(model):
+    inner = onnx.helper.make_graph([], "inner", [], [], [numbers()])
+    elsewhere(inner.initializer[0])
+    model.graph.node.append(onnx.helper.make_node("If", ["x"], ["y"], then_branch=inner, else_branch=inner))
+
+
+def with_a_function_elsewhere(model):
+    node = onnx.helper.make_node("Constant", [], ["c"], value=numbers())
+    elsewhere(node.attribute[0].t)
+    model.functions.append(onnx.helper.make_function("own", "f", [], ["c"], [node], []))
+
+
+def elsewhere(tensor):
+    tensor.ClearField("raw_data")
+    tensor.ClearField("float_data")
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="secret.bin")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [with_weights_elsewhere, with_a_constant_elsewhere, with_a_branch_elsewhere, with_a_function_elsewhere],
+)
+def test_a_graph_reads_no_other_file(random_bundle, tmp_path, monkeypatch, change):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "secret.bin").write_bytes(bytes(10**7))
+    model = onnx.load_from_string(random_bundle.read(POLICY))
+    change(model)
+    parts = {**parts_of(random_bundle), POLICY: model.SerializeToString()}
+    with pytest.raises(BundleError, match=r"policy\.onnx keeps weights in another file"):
+        write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)
+
+
+@pytest.mark.parametrize(
+    ("graph", "says"),
+    [
+        (b"\x08\x08\x00\x00ORTM" + bytes(100), "the runtime's own format"),
+        (b"\xba\x80\x80\x80\x10\x00", "not a message"),  # field 7, if 32 bits of its number are looked at
+        (b"\x3b\x3c", "not a message"),  # a group
+    ],
+)
+def test_what_the_runtime_might_read_otherwise_is_not_run(random_bundle, tmp_path, graph, says):
+    path = tmp_path / "b.zip"
+    bundle = write_bundle(path, random_bundle.manifest, {**parts_of(random_bundle), DREAM: graph})
+    with pytest.raises(BundleError, match=rf"dream\.onnx cannot be run \(.*{says}"):
+        DreamStep(bundle)
+
+
+def test_a_graph_of_endless_fields_is_not_looked_through(random_bundle, tmp_path):
+    parts = {**parts_of(random_bundle), DREAM: b"\x40\x00" * 10**6}
+    with pytest.raises(BundleError, match="has more than 500000 fields"):
+        write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)

@@ -1,5 +1,5 @@
 /* From shapes to pixels, one row of cells at a time: finds its dirty cells, draws inside them only, and averages each
-   as pygame's smoothscale does. Compiled a second time for processors with AVX2, see band_avx2.c. */
+   as pygame's smoothscale does. Compiled a second time for processors with AVX2, see wide_avx2.c. */
 
 #include "canvas.h"
 
@@ -153,12 +153,30 @@ static bool clip_edge(const Band *band, const Edge *edge, Line *line, int *left,
 /* The columns that all of the spans share, and those that any of them touches. */
 static void bound(const Span *spans, int count, Span *all, Span *any)
 {
+    int i = 1;
     *all = *any = spans[0];
-    for (int i = 1; i < count; i++) {
-        all->left = MAX(all->left, spans[i].left);
-        all->right = MIN(all->right, spans[i].right);
+#ifdef __SSE2__
+    if (count > 3) { /* four at a time, some of them twice */
+        __m128i most = _mm_loadu_si128((const __m128i *)(spans + count - 4)), least = most;
+        for (i = 0; i + 4 < count; i += 4) {
+            __m128i four = _mm_loadu_si128((const __m128i *)(spans + i));
+            most = _mm_max_epi16(most, four);
+            least = _mm_min_epi16(least, four);
+        }
+        __m128i half = _mm_max_epi16(most, _mm_shuffle_epi32(most, _MM_SHUFFLE(1, 0, 3, 2)));
+        most = _mm_max_epi16(half, _mm_shuffle_epi32(half, _MM_SHUFFLE(2, 3, 0, 1)));
+        half = _mm_min_epi16(least, _mm_shuffle_epi32(least, _MM_SHUFFLE(1, 0, 3, 2)));
+        least = _mm_min_epi16(half, _mm_shuffle_epi32(half, _MM_SHUFFLE(2, 3, 0, 1)));
+        *all = (Span){(int16_t)_mm_extract_epi16(most, 0), (int16_t)_mm_extract_epi16(least, 1)};
+        *any = (Span){(int16_t)_mm_extract_epi16(least, 0), (int16_t)_mm_extract_epi16(most, 1)};
+        return;
+    }
+#endif
+    for (; i < count; i++) {
         any->left = MIN(any->left, spans[i].left);
         any->right = MAX(any->right, spans[i].right);
+        all->left = MAX(all->left, spans[i].left);
+        all->right = MIN(all->right, spans[i].right);
     }
 }
 
@@ -228,11 +246,21 @@ static void find_runs(const Canvas *canvas, Band *band)
 }
 
 /* Mostly short: stores that overlap are cheaper than a branch that nobody can foresee. */
-static void paint(uint32_t *row, int left, int right, uint32_t colour)
+static inline void paint(uint32_t *row, int left, int right, uint32_t colour)
 {
     int count = right - left + 1;
     uint32_t *to = row + left;
-#if defined(__AVX2__)
+#if defined(__AVX512F__)
+    __m512i many = _mm512_set1_epi32((int)colour);
+    for (; count > 32; count -= 32, to += 32) {
+        _mm512_storeu_si512(to, many);
+        _mm512_storeu_si512(to + 16, many);
+    }
+    uint32_t left_over = count > 0 ? ~(uint32_t)0 >> (32 - count) : 0;
+    _mm512_mask_storeu_epi32(to, (__mmask16)left_over, many);
+    _mm512_mask_storeu_epi32(to + 16, (__mmask16)(left_over >> 16), many);
+    return;
+#elif defined(__AVX2__)
     if (count > 7) {
         __m256i eight = _mm256_set1_epi32((int)colour);
         int last = count - 8;
@@ -262,8 +290,12 @@ static void paint(uint32_t *row, int left, int right, uint32_t colour)
 }
 
 /* Two neighbouring pixels of an outline, which share its colour: d + ((c - d) * a >> 8) in each channel, which is
-   (d * (256 - a) + c * a) >> 8. The alphas of the pair follow from one weight. */
+   (d * (256 - a) + c * a) >> 8. The alphas of the pair follow from one weight w: 255 * (255 - w) >> 8, which is 254 - w,
+   and 255 * w >> 8, which is w - 1, neither below 0. */
 typedef struct {
+#ifdef __AVX2__
+    __m256i wide;
+#endif
 #ifdef __SSE2__
     __m128i colour;
 #else
@@ -275,22 +307,36 @@ typedef struct {
 static Ink ink_of(uint32_t colour)
 {
     __m128i one = _mm_unpacklo_epi8(_mm_cvtsi32_si128((int)colour), _mm_setzero_si128());
-    return (Ink){_mm_unpacklo_epi64(one, one)};
+    Ink ink;
+    ink.colour = _mm_unpacklo_epi64(one, one);
+#ifdef __AVX2__
+    ink.wide = _mm256_broadcastsi128_si256(ink.colour);
+#endif
+    return ink;
 }
 
-static void dots(uint32_t *near, uint32_t *far, Ink ink, uint32_t weight)
+static __m128i blend(__m128i under, Ink ink, uint32_t weight)
 {
-    int pair = (int)(255 * (255 - weight) >> 8 | (255 * weight >> 8) << 16);
-    __m128i alpha = _mm_cvtsi32_si128(pair);
-    alpha = _mm_shuffle_epi32(_mm_unpacklo_epi16(alpha, alpha), _MM_SHUFFLE(1, 1, 0, 0));
-    __m128i under = _mm_unpacklo_epi32(_mm_cvtsi32_si128((int)*near), _mm_cvtsi32_si128((int)*far));
+    __m128i w = _mm_shuffle_epi32(_mm_shufflelo_epi16(_mm_cvtsi32_si128((int)weight), 0), 0);
+    __m128i alpha = _mm_unpacklo_epi64(_mm_subs_epu16(_mm_set1_epi16(254), w), _mm_subs_epu16(w, _mm_set1_epi16(1)));
     under = _mm_unpacklo_epi8(under, _mm_setzero_si128());
     __m128i sum = _mm_add_epi16(_mm_mullo_epi16(under, _mm_sub_epi16(_mm_set1_epi16(256), alpha)),
                                 _mm_mullo_epi16(ink.colour, alpha));
     sum = _mm_srli_epi16(sum, 8);
-    sum = _mm_packus_epi16(sum, sum);
-    *near = (uint32_t)_mm_cvtsi128_si32(sum);
-    *far = (uint32_t)_mm_cvtsi128_si32(_mm_srli_si128(sum, 4));
+    return _mm_packus_epi16(sum, sum);
+}
+
+static void dots(uint32_t *near, uint32_t *far, Ink ink, uint32_t weight)
+{
+    __m128i both = blend(_mm_unpacklo_epi32(_mm_cvtsi32_si128((int)*near), _mm_cvtsi32_si128((int)*far)), ink, weight);
+    *near = (uint32_t)_mm_cvtsi128_si32(both);
+    *far = (uint32_t)_mm_cvtsi128_si32(_mm_srli_si128(both, 4));
+}
+
+/* Both side by side, the left one with the weight's first alpha. */
+static void dots_beside(uint32_t *left, Ink ink, uint32_t weight)
+{
+    _mm_storel_epi64((__m128i *)left, blend(_mm_loadl_epi64((const __m128i *)left), ink, weight));
 }
 #else
 static Ink ink_of(uint32_t colour)
@@ -311,9 +357,86 @@ static void dots(uint32_t *near, uint32_t *far, Ink ink, uint32_t weight)
     *near = blend(*near, ink.colour, 255 * (255 - weight) >> 8);
     *far = blend(*far, ink.colour, 255 * weight >> 8);
 }
+
+static void dots_beside(uint32_t *left, Ink ink, uint32_t weight)
+{
+    dots(left, left + 1, ink, weight);
+}
+#endif
+
+#ifdef __AVX2__
+/* Two such pairs; the weights are the second bytes of the first words of `at`'s halves. */
+static __m128i blend_two(__m128i under, Ink ink, __m256i at, __m256i turn)
+{
+    __m256i second = _mm256_set1_epi16((short)0x8001);
+    __m256i w = _mm256_xor_si256(_mm256_shuffle_epi8(at, second), turn);
+    __m256i alpha = _mm256_unpacklo_epi64(_mm256_subs_epu16(_mm256_set1_epi16(254), w),
+                                          _mm256_subs_epu16(w, _mm256_set1_epi16(1)));
+    __m256i sum = _mm256_add_epi16(
+        _mm256_mullo_epi16(_mm256_cvtepu8_epi16(under), _mm256_sub_epi16(_mm256_set1_epi16(256), alpha)),
+        _mm256_mullo_epi16(ink.wide, alpha));
+    sum = _mm256_srli_epi16(sum, 8);
+    return _mm_packus_epi16(_mm256_castsi256_si128(sum), _mm256_extracti128_si256(sum, 1));
+}
+
+static __m256i two_weights(uint32_t at, uint32_t slope)
+{
+    return _mm256_inserti128_si256(_mm256_castsi128_si256(_mm_cvtsi32_si128((int)at)),
+                                   _mm_cvtsi32_si128((int)(at + slope)), 1);
+}
 #endif
 
 enum { STRIDE = MARGIN + WIDTH + MARGIN };
+
+/* A step is a row: its two pixels lie side by side, the lighter one on either side. */
+static void draw_steep(const Edge *edge, const Line *line, uint32_t *origin, Ink ink)
+{
+    uint32_t at = edge->slope * (uint32_t)line->from, turn = edge->step < 0 ? 255 : 0;
+    uint32_t *row = origin + edge->low.x - (edge->step < 0) - (edge->low.y + line->from) * STRIDE;
+    int n = line->from;
+#ifdef __AVX2__
+    __m256i weights = two_weights(at, edge->slope), more = _mm256_set1_epi32((int)(2 * edge->slope));
+    __m256i turns = _mm256_set1_epi16((short)turn);
+    for (; n < line->to; n += 2, at += 2 * edge->slope, row -= 2 * STRIDE) {
+        __m128i *first = (__m128i *)(row + edge->step * (int)(at >> 16));
+        __m128i *second = (__m128i *)(row - STRIDE + edge->step * (int)((at + edge->slope) >> 16));
+        __m128i four = _mm_unpacklo_epi64(_mm_loadl_epi64(first), _mm_loadl_epi64(second));
+        four = blend_two(four, ink, weights, turns);
+        _mm_storel_epi64(first, four);
+        _mm_storel_epi64(second, _mm_unpackhi_epi64(four, four));
+        weights = _mm256_add_epi32(weights, more);
+    }
+#endif
+    for (; n <= line->to; n++, at += edge->slope, row -= STRIDE)
+        dots_beside(row + edge->step * (int)(at >> 16), ink, (at >> 8 & 255) ^ turn);
+}
+
+/* A step is a column: its two pixels lie above each other. */
+static void draw_shallow(const Edge *edge, const Line *line, uint32_t *origin, Ink ink)
+{
+    uint32_t at = edge->slope * (uint32_t)line->from;
+    uint32_t *column = origin + edge->low.x + edge->step * line->from - edge->low.y * STRIDE;
+    int n = line->from;
+#ifdef __AVX2__
+    __m256i weights = two_weights(at, edge->slope), more = _mm256_set1_epi32((int)(2 * edge->slope));
+    for (; n < line->to; n += 2, at += 2 * edge->slope, column += 2 * edge->step) {
+        uint32_t *first = column - (int)(at >> 16) * STRIDE;
+        uint32_t *second = column + edge->step - (int)((at + edge->slope) >> 16) * STRIDE;
+        __m128i one = _mm_insert_epi32(_mm_cvtsi32_si128((int)*first), (int)*(first - STRIDE), 1);
+        __m128i other = _mm_insert_epi32(_mm_cvtsi32_si128((int)*second), (int)*(second - STRIDE), 1);
+        __m128i four = blend_two(_mm_unpacklo_epi64(one, other), ink, weights, _mm256_setzero_si256());
+        *first = (uint32_t)_mm_cvtsi128_si32(four);
+        *(first - STRIDE) = (uint32_t)_mm_extract_epi32(four, 1);
+        *second = (uint32_t)_mm_extract_epi32(four, 2);
+        *(second - STRIDE) = (uint32_t)_mm_extract_epi32(four, 3);
+        weights = _mm256_add_epi32(weights, more);
+    }
+#endif
+    for (; n <= line->to; n++, at += edge->slope, column += edge->step) {
+        uint32_t *pixel = column - (int)(at >> 16) * STRIDE;
+        dots(pixel, pixel - STRIDE, ink, at >> 8 & 255);
+    }
+}
 
 static void draw_line(Canvas *canvas, const Band *band, const Line *line)
 {
@@ -334,24 +457,10 @@ static void draw_line(Canvas *canvas, const Band *band, const Line *line)
     }
     if (first.y >= bottom && first.y <= top)
         origin[first.x - first.y * STRIDE] = colour;
-    uint32_t at = edge->slope * (uint32_t)line->from;
-    Ink ink = ink_of(colour);
-    if (edge->kind == STEEP) {
-        uint32_t *row = origin + low.x - (low.y + line->from) * STRIDE;
-        for (int n = line->from; n <= line->to; n++, at += edge->slope, row -= STRIDE) {
-            uint32_t *pixel = row + edge->step * (int)(at >> 16);
-            uint32_t weight = at >> 8 & 255;
-            dots(pixel, pixel + edge->step, ink, weight);
-        }
-    }
-    else {
-        uint32_t *column = origin + low.x + edge->step * line->from - low.y * STRIDE;
-        for (int n = line->from; n <= line->to; n++, at += edge->slope, column += edge->step) {
-            uint32_t *pixel = column - (int)(at >> 16) * STRIDE;
-            uint32_t weight = at >> 8 & 255;
-            dots(pixel, pixel - STRIDE, ink, weight);
-        }
-    }
+    if (edge->kind == STEEP)
+        draw_steep(edge, line, origin, ink_of(colour));
+    else
+        draw_shallow(edge, line, origin, ink_of(colour));
 }
 
 static void draw_patch(Canvas *canvas, const Band *band, const Patch *patch)

@@ -48,23 +48,32 @@ static void axis_init(Axis *axis, int length)
 }
 
 static CanvasFinish *finish;
+static CanvasShrink *shrink;
 
-bool canvas_widen(bool wide)
+int canvas_widen(int most)
 {
-#ifdef DREAMFLEET_AVX2
-    wide = wide && __builtin_cpu_supports("avx2");
-    finish = wide ? band_finish_avx2 : band_finish;
-    return wide;
-#else
-    (void)wide;
-    finish = band_finish;
-    return false;
+#ifdef DREAMFLEET_WIDE
+    if (most >= 2 && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("bmi2")) {
+        finish = band_finish_avx512;
+        shrink = box_shrink_avx512;
+        return 2;
+    }
+    if (most >= 1 && __builtin_cpu_supports("avx2")) {
+        finish = band_finish_avx2;
+        shrink = box_shrink_avx2;
+        return 1;
+    }
 #endif
+    (void)most;
+    finish = band_finish;
+    shrink = box_shrink;
+    return 0;
 }
 
 void canvas_init(Canvas *canvas)
 {
-    canvas_widen(true);
+    canvas_widen(2);
     axis_init(&canvas->across, WIDTH);
     axis_init(&canvas->down, HEIGHT);
 }
@@ -81,4 +90,9 @@ void canvas_begin(Canvas *canvas, int top, int bottom)
 void canvas_finish(Canvas *canvas, uint32_t background, int from, int to, uint8_t *out)
 {
     finish(canvas, background, from, to, out);
+}
+
+void canvas_shrink(const uint8_t *source, uint8_t *target)
+{
+    shrink(source, target);
 }

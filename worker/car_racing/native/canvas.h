@@ -14,6 +14,7 @@ enum {
     WIDTH = 1000,
     HEIGHT = 800,
     CELLS = 96,      /* across and down */
+    SMALL = 64,      /* across and down, of the small picture */
     SCENE_ROWS = 84, /* rows of cells above the indicator bar */
     SCENE = 700,     /* source rows above it */
     BAND = 12,       /* source rows of a row of cells, at most */
@@ -85,14 +86,21 @@ void canvas_solid(Canvas *canvas, const int *x, const int *y, int count, uint32_
 typedef void CanvasFinish(Canvas *canvas, uint32_t background, int from, int to, uint8_t *out);
 CanvasFinish canvas_finish;
 
-/* Whether the processor's wider instructions draw. They change no bit; to do without is for comparing. */
-bool canvas_widen(bool wide);
+/* The 64x64 picture of the 84 rows of cells above the bar. */
+typedef void CanvasShrink(const uint8_t *source, uint8_t *target);
+CanvasShrink canvas_shrink;
 
-/* What canvas_finish chooses from. */
+/* Draws with the processor's widest instructions up to 0 (none), 1 (AVX2) or 2 (AVX-512); says with which. They change
+   no bit; to do without is for comparing. */
+int canvas_widen(int most);
+
+/* What canvas_finish and canvas_shrink choose from. */
 CanvasFinish band_finish;
+CanvasShrink box_shrink;
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
-#define DREAMFLEET_AVX2
-CanvasFinish band_finish_avx2;
+#define DREAMFLEET_WIDE
+CanvasFinish band_finish_avx2, band_finish_avx512;
+CanvasShrink box_shrink_avx2, box_shrink_avx512;
 #endif
 
 #endif

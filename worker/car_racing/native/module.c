@@ -1,18 +1,16 @@
-/* CarRacing's picture for Python: `scene`, `bar`, `picture`, `widen`. Arrays come as buffers of doubles.
+/* CarRacing's picture for Python: `scene`, `bar`, `picture`, `widen`, and `roll` of roll.c. Arrays come as buffers of doubles.
 
    One canvas a process, whatever the number of environments: it is rebuilt for every picture, and the interpreter
    lock is held throughout. */
 
-#define Py_LIMITED_API 0x030b0000
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+#include "roll.h"
 
 #include "canvas.h"
 
 #include <math.h>
 #include <string.h>
 
-enum { BODIES = 5, BODY = 4, VIEW = 5, MAX_VERTICES = 8, SMALL = 64 };
+enum { BODIES = 5, BODY = 4, VIEW = 5, MAX_VERTICES = 8 };
 
 static Canvas canvas;
 
@@ -319,49 +317,27 @@ static PyObject *picture(PyObject *self, PyObject *args)
     if (!PyArg_ParseTuple(args, "w*y*", &out, &in))
         return NULL;
     bool fits = out.len == SMALL * SMALL * 3 && in.len >= SCENE_ROWS * CELLS * 3;
-    if (fits) {
-        const uint8_t *source = in.buf;
-        uint8_t *target = out.buf;
-        for (int i = 0; i < SMALL; i++, target += SMALL * 3) {
-            uint16_t sums[CELLS * 3 + 6] = {0}; /* 21 sixteenths of a row down; 6 more that nobody looks at */
-            int top = 21 * i, bottom = top + 21;
-            for (int row = top / 16; 16 * row < bottom; row++) {
-                int low = 16 * row > top ? 16 * row : top, high = 16 * row + 16 < bottom ? 16 * row + 16 : bottom;
-                const uint8_t *line = source + row * CELLS * 3;
-                uint16_t weight = (uint16_t)(high - low);
-                for (int x = 0; x < CELLS * 3; x++)
-                    sums[x] = (uint16_t)(sums[x] + weight * line[x]);
-            }
-            /* Three cells become two: averages for every place, of which each third is one. */
-            uint8_t left[CELLS * 3], right[CELLS * 3];
-            for (int x = 0; x < CELLS * 3; x++) {
-                left[x] = (uint8_t)((uint16_t)(2 * sums[x] + sums[x + 3] + 31) / 63);
-                right[x] = (uint8_t)((uint16_t)(sums[x + 3] + 2 * sums[x + 6] + 31) / 63);
-            }
-            for (int pair = 0; pair < SMALL / 2; pair++) {
-                memcpy(target + 6 * pair, left + 9 * pair, 3);
-                memcpy(target + 6 * pair + 3, right + 9 * pair, 3);
-            }
-        }
-    }
+    if (fits)
+        canvas_shrink(in.buf, out.buf);
     PyBuffer_Release(&in);
     PyBuffer_Release(&out);
     return fits ? Py_NewRef(Py_None) : (fail("pictures of wrong sizes"), NULL);
 }
 
-/* widen(wide): whether the processor's wider instructions draw from now on, which changes no bit. */
-static PyObject *widen(PyObject *self, PyObject *wide)
+/* widen(most): how wide the instructions are that draw from now on, as canvas_widen; they change no bit. */
+static PyObject *widen(PyObject *self, PyObject *most)
 {
     (void)self;
-    int wanted = PyObject_IsTrue(wide);
-    return wanted < 0 ? NULL : PyBool_FromLong(canvas_widen(wanted));
+    long wanted = PyLong_AsLong(most);
+    return wanted == -1 && PyErr_Occurred() ? NULL : PyLong_FromLong(canvas_widen((int)wanted));
 }
 
 static PyMethodDef methods[] = {
     {"scene", scene, METH_VARARGS, "Draw the 84 rows of cells above the bar."},
     {"bar", bar, METH_VARARGS, "Draw the bar's 12 rows without its text."},
     {"picture", picture, METH_VARARGS, "The 64x64 picture of an observation's scene."},
-    {"widen", widen, METH_O, "Draw with the processor's wider instructions, or not; say whether it does."},
+    {"roll", roll, METH_VARARGS, "A step of the car's wheels."},
+    {"widen", widen, METH_O, "Draw with instructions at most so wide: 0 plain, 1 AVX2, 2 AVX-512; say with which."},
     {NULL, NULL, 0, NULL},
 };
 
@@ -372,5 +348,7 @@ static struct PyModuleDef definition = {
 PyMODINIT_FUNC PyInit__native(void)
 {
     canvas_init(&canvas);
+    if (!roll_init())
+        return NULL;
     return PyModule_Create(&definition);
 }

@@ -209,24 +209,16 @@ static bool two_sided(const Point *points, int count)
     return turns + (way != first) == 2;
 }
 
-/* The crossings of lines `bottom` to `top` (y, clipped) with one edge, without a division a line. */
-static void walk_edge(Point low, Point high, int bottom, int top, bool last, int *found)
+/* The crossings of rows `top` to `bottom` (clipped) with one edge. A double's quotient is exact here: half a unit more
+   outweighs its error, and is less than what lacks to the next whole quotient. */
+static void walk_edge(Point low, Point high, int top, int bottom, bool last, int *found)
 {
-    int from = MAX(low.y, bottom), to = MIN(high.y - !last, top), height = high.y - low.y;
-    if (from > to)
-        return;
-    int64_t scaled = (int64_t)65536 * (from - low.y);
-    int part = (int)(scaled / height), rest = (int)(scaled % height);
-    int whole = 65536 / height, more = 65536 % height;
+    int from = MAX(HEIGHT - 1 - high.y + !last, top), to = MIN(HEIGHT - 1 - low.y, bottom);
+    double once = 1.0 / (high.y - low.y);
     uint32_t dx = (uint32_t)(high.x - low.x), start = 65536u * (uint32_t)low.x;
-    for (int y = from; y <= to; y++) {
-        found[y - bottom] = (int)((uint32_t)part * dx + start);
-        part += whole;
-        rest += more;
-        if (rest >= height) {
-            rest -= height;
-            part++;
-        }
+    for (int row = from; row <= to; row++) {
+        uint32_t part = (uint32_t)(int)((65536.0 * (HEIGHT - 1 - row - low.y) + 0.5) * once);
+        found[row - top] = (int)(part * dx + start);
     }
 }
 
@@ -234,19 +226,17 @@ static void walk_edge(Point low, Point high, int bottom, int top, bool last, int
 static void fill_between(Canvas *canvas, Shape *shape, const Point *points, int count, int highest)
 {
     int up[HEIGHT], down[HEIGHT]; /* the crossing with either side */
-    Span *spans = canvas->spans + canvas->spans_used - (shape->bottom - shape->top + 1);
-    int bottom = HEIGHT - 1 - shape->bottom, top = HEIGHT - 1 - shape->top;
+    int rows = shape->bottom - shape->top + 1;
+    Span *spans = canvas->spans + canvas->spans_used - rows;
     for (int i = 0; i < count; i++) {
         Point a = points[i], b = points[(i + 1) % count];
         if (a.y < b.y)
-            walk_edge(a, b, bottom, top, b.y == highest, up);
+            walk_edge(a, b, shape->top, shape->bottom, b.y == highest, up);
         else if (a.y > b.y)
-            walk_edge(b, a, bottom, top, a.y == highest, down);
+            walk_edge(b, a, shape->top, shape->bottom, a.y == highest, down);
     }
-    for (int y = top; y >= bottom; y--) {
-        int a = up[y - bottom], b = down[y - bottom];
-        *spans++ = between(MIN(a, b), MAX(a, b));
-    }
+    for (int i = 0; i < rows; i++)
+        spans[i] = between(MIN(up[i], down[i]), MAX(up[i], down[i]));
 }
 
 /* gfxdraw.aapolygon and gfxdraw.filled_polygon over it. */

@@ -1,0 +1,88 @@
+"""A run's start is in its journal before anything else can fail: a coordinator that is continued begins there."""
+
+import signal
+import socket
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.controller import Controller, ControllerShape
+from dreamfleet.common.runs import open_run
+from tests.support import tasks
+
+pytestmark = pytest.mark.timeout(120)
+SIGMA = 0.01
+
+
+@pytest.fixture
+def settings(random_bundle):
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
+            "--sigma0", SIGMA, "--task", tasks.TOY, "--generations", 1)  # fmt: skip
+
+
+@pytest.fixture
+def controller(random_bundle, tmp_path):
+    """Parameters far away from zero."""
+    size = random_bundle.default_shape.size
+    parameters = np.linspace(1, 2, size, dtype=np.float32)
+    shape = ControllerShape(**vars(random_bundle.default_shape))
+    path = tmp_path / "start.npz"
+    Controller(shape, parameters, tasks.TOY, random_bundle.sha256).save(path)
+    return path
+
+
+def refused(processes, *words):
+    """Started where the port is taken: the run is made, and nothing of it begins."""
+    with socket.create_server(("127.0.0.1", processes.port)):
+        code, _, err = processes.call(*words, "--runs-dir", processes.runs, "--listen", processes.endpoint)
+    assert code != 0
+    assert "is in use" in err
+
+
+def continued(processes, name):
+    again = processes.start("coordinator", "--resume", name, "--runs-dir", processes.runs)
+    return first_population(processes, again, name)
+
+
+def first_population(processes, coordinator, name):
+    """What it asks for first; it has left, so that this is on disk."""
+    coordinator.wait_for("generation 0")
+    coordinator.popen.send_signal(signal.SIGTERM)
+    assert coordinator.finish()[0] == 130
+    with open_run(processes.runs, name) as run:
+        return np.stack([run.candidate(0, number) for number in range(4)])
+
+
+def test_a_start_outlives_a_coordinator_that_never_began_and_its_own_file(processes, settings, controller):
+    mean = Controller.load(controller).parameters
+    refused(processes, "coordinator", "--run", "night", "--init", controller, *settings)
+    controller.unlink()
+    population = continued(processes, "night")
+    assert np.abs(population - mean).max() < 10 * SIGMA
+    with open_run(processes.runs, "night") as run:
+        assert "start.npz" in run.fact("start")
+
+
+def test_a_run_that_was_refused_its_port_asks_for_what_one_that_was_not_asks_for(processes, settings, controller):
+    again = processes.start("coordinator", "--run", "whole", "--runs-dir", processes.runs, "--listen",
+                            processes.endpoint, "--init", controller, *settings)  # fmt: skip
+    whole = first_population(processes, again, "whole")
+    refused(processes, "coordinator", "--run", "parts", "--init", controller, *settings)
+    assert np.array_equal(continued(processes, "parts"), whole)
+
+
+def test_a_fork_that_never_began_goes_on_from_its_source_though_that_is_gone(processes, settings, controller):
+    mean = Controller.load(controller).parameters
+    first = processes.coordinator(*settings, "--init", controller, name="first")
+    processes.worker("--task", tasks.TOY, "--run", "first", "--exit-when-done")
+    assert first.finish()[0] == 0
+    refused(processes, "fork", "first")
+    processes.call("runs", "delete", "first", "--yes", "--runs-dir", processes.runs)
+    assert np.abs(continued(processes, "first-fork") - mean).max() < 10 * SIGMA
+
+
+def test_how_a_run_is_served_is_kept_with_its_start(processes, settings, controller):
+    refused(processes, "coordinator", "--run", "night", "--init", controller, *settings, "--mixed")
+    with open_run(processes.runs, "night") as run:
+        assert run.fact("limits") == '{"generations": 1}'
+        assert '"mixed": true' in run.fact("network")
