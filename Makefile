@@ -48,7 +48,7 @@ simulate: $(VENV)/.dev  ## SCHEDULES seeded schedules of faults against the pure
 	$(BIN)/python -m tests.simulation --schedules $(or $(SCHEDULES),100000) --seed $(or $(SEED),1) --jobs $(or $(JOBS),2)
 
 chaos: $(VENV)/.dev  ## a fleet under FAULTS seeded faults gives the bits of one that nobody disturbs
-	$(BIN)/python -m tests.chaos.chaos --faults $(or $(FAULTS),200) --seed $(or $(SEED),7)
+	$(BIN)/python -m tests.chaos.chaos --faults $(or $(FAULTS),200) --seed $(or $(SEED),7) $(ARGS)
 
 sanitize: $(VENV)/.dev  ## 200,000 steps of the native picture under AddressSanitizer: ten minutes
 	mkdir -p build

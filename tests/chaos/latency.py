@@ -12,7 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.chaos.chaos import POPULATION, Fleet, accepted
+from tests.chaos.fleet import POPULATION, Fleet, accepted
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
 from tests.support.processes import processes_in
@@ -38,12 +38,12 @@ def measure(folder):
     figures = {"killed_worker": [], "stopped_worker": [], "coordinator_start": [], "killed_coordinator": []}
     bundle = write_random_bundle(folder / "random.zip").path
     with processes_in(folder / "fleet") as processes:
-        fleet = Fleet(processes, bundle, generations=10**6, seed=1)
+        fleet = Fleet(processes, bundle, generations=10**6, seed=1, task=tasks.COUNTED)
         fleet.coordinator.wait_for("generation 3: mean")
         for _ in range(ROUNDS):
             fleet.workers[0].popen.kill()
             figures["killed_worker"].append(until_said(fleet, "left:"))
-            fleet.workers[0] = fleet._new_worker(0)
+            fleet.workers[0] = fleet.new_worker(0)
             fleet.coordinator.wait_for("generation", times=100)
             os.kill(fleet.workers[1].popen.pid, signal.SIGSTOP)
             figures["stopped_worker"].append(until_said(fleet, "is silent:"))

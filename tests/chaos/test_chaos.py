@@ -1,12 +1,13 @@
-"""A short one; `make chaos` is the long one."""
+"""Short ones; `make chaos` is the long one."""
 
 import pytest
 
-from tests.chaos.chaos import compare
+from tests.chaos.chaos import NARROW, WIDE, compare
 
 
 @pytest.mark.timeout(300)
-def test_a_fleet_under_faults_gives_the_undisturbed_fleets_bits(tmp_path):
-    figures = compare(tmp_path, faults=8, seed=3)
+@pytest.mark.parametrize("stage", [NARROW, WIDE], ids=lambda stage: stage.name)
+def test_a_fleet_under_faults_gives_the_undisturbed_fleets_bits(tmp_path, stage):
+    figures = compare(tmp_path, faults=8, seed=3, stage=stage)
     assert figures["identical"]
     assert figures["lost"] == 0

@@ -68,7 +68,7 @@ class Coordinator:
 
     def welcome(self, request: HelloRequest, now: float) -> bool:
         """Whether the worker may join."""
-        if self.exchange.refusal(request, self.run.settings, mixed=False):
+        if self.exchange.refusal(request, self.run.settings):
             return False
         self.exchange.admit(request, now)
         return True

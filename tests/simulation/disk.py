@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from dreamfleet.common.messages import Job, Result
 from dreamfleet.common.runs import JOURNAL, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.collection import Collection
+from dreamfleet.coordinator.confirmation import Finalist
 from dreamfleet.coordinator.evaluation import Evaluation
 from dreamfleet.coordinator.journal import OpenGeneration
 from tests.simulation.violation import Violation
@@ -71,6 +72,13 @@ class MemoryJournal:
 
     def drop_fact(self, key: str) -> None:
         self._put("fact", key, None)
+
+    def fingerprint(self) -> str | None:
+        return self.fact("fingerprint")
+
+    def drop_excessive(self, horizon: int) -> int:
+        """No older version wrote here."""
+        return 0
 
     def begin_incarnation(self) -> int:
         number = int(self.fact("incarnation") or 0) + 1
@@ -137,12 +145,16 @@ class MemoryJournal:
     def pending_evaluations(self) -> list[Evaluation]:
         return [evaluation for _, (evaluation, done) in sorted(self._tables["evaluation"].items()) if done is None]
 
-    def best_evaluation(self) -> tuple[int, float, bytes] | None:
-        rows = [
-            (done.mean, -done.generation, each.vector) for each, done in self._tables["evaluation"].values() if done
-        ]
-        best = max(rows, default=None)
-        return None if best is None else (-best[1], best[0], best[2])
+    def finalists(self, count: int) -> list[Finalist]:
+        first: dict[bytes, Finalist] = {}
+        for generation, (each, done) in sorted(self._tables["evaluation"].items()):
+            if done is not None:
+                first.setdefault(each.vector, Finalist(generation, each.vector, done.episodes, done.mean))
+        return sorted(first.values(), key=lambda each: (-each.mean, each.generation))[:count]
+
+    def evaluated_vector(self, generation: int) -> bytes:
+        vector: bytes = self._tables["evaluation"][generation][0].vector
+        return vector
 
     def _insert(self, table: str, key: Any, row: Any) -> None:
         """As a table with a primary key does."""

@@ -16,6 +16,7 @@ from unittest.mock import patch
 from dreamfleet.common.messages import MAX_PART
 from dreamfleet.coordinator import fleet, packing
 from dreamfleet.coordinator.collection import Collections
+from dreamfleet.coordinator.confirmation import Confirmation
 from dreamfleet.coordinator.evaluation import Evaluations
 from dreamfleet.coordinator.fleet import Fleet
 from dreamfleet.coordinator.generation import Generation
@@ -231,6 +232,16 @@ def run_commits_only_what_closes_a_generation(original):
 @mutant(Evaluations, "open", evaluate_every=1)
 def evaluations_forget_the_scores_of_the_life_before(original):
     return lambda self, evaluation, spec, _known: original(self, evaluation, spec, {})
+
+
+@mutant(Confirmation, "record", confirm_episodes=4, evaluate_every=1, heat=1.0, ends=True)
+def confirmation_fills_its_round_in_the_order_in_which_scores_come(original):
+    def record(self, digest, score):
+        still = [each for each in self._digests if each not in self._scores]
+        if digest in still:
+            original(self, still[0], score)
+
+    return record
 
 
 @mutant(Collections, "receive", **COLLECTING)

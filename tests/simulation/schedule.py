@@ -25,6 +25,7 @@ class Shape:
     heat: float = 1.0
     evaluate_every: int = 0
     evaluation_episodes: int = 2
+    confirm_episodes: int = 0  # with which the best evaluated means are confirmed as the run ends
     collect_every: int = 0
     rollout: int = 300  # bytes; more than 40,960 travel in several parts
     turn: float = 0.6  # virtual seconds that a slot's turn takes
@@ -137,6 +138,7 @@ def _draw_shape(source: random.Random) -> Shape:
         racing=source.random() < 0.15,
         heat=1.5 if heated else 1.0,
         evaluate_every=1 if heated else source.choice((0, 0, 1, 2)),
+        confirm_episodes=source.choice((0, 0, 0, 4)),
         collect_every=source.choice((0, 0, 0, 2)),
         rollout=source.choice((300, 300, 90_000)),
         turn=source.choice((0.15, 0.5, 0.5, 1.2)),

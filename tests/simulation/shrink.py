@@ -9,6 +9,11 @@ from tests.simulation.schedule import Fault, Schedule, Shape
 from tests.simulation.world import Outcome, play
 
 MOST_PLAYS = 600
+# What a shape can do without; heat goes before the evaluations that it follows from.
+PLAINER = (
+    "heat", "racing", "width", "parameters", "rollout", "collect_every", "confirm_episodes", "evaluate_every", "slots",
+)  # fmt: skip
+SMALLER = {"generations": 1, "workers": 1, "population": 2, "episodes": 1}
 
 
 class Shrinker:
@@ -41,8 +46,13 @@ class Shrinker:
 
     def _simplify(self) -> None:
         """A plainer fleet, then shorter and weaker faults at rounder times."""
-        for shape in _plainer(self.best.schedule.shape):
-            self._try(replace(self.best.schedule, shape=shape))
+        for name in PLAINER:
+            shape = self.best.schedule.shape
+            self._try(replace(self.best.schedule, shape=replace(shape, **{name: getattr(Shape(), name)})))
+        for name, least in SMALLER.items():
+            shape = self.best.schedule.shape
+            smaller = {name: max(getattr(shape, name) - 1, least)}
+            self._try(replace(self.best.schedule, shape=replace(shape, **smaller)))
         for index in range(len(self.best.schedule.faults)):
             for fault in _weaker(self.best.schedule.faults[index]):
                 faults = list(self.best.schedule.faults)
@@ -50,7 +60,8 @@ class Shrinker:
                 self._try(replace(self.best.schedule, faults=tuple(faults)))
 
     def _try(self, schedule: Schedule) -> bool:
-        if schedule == self.best.schedule or self._plays >= MOST_PLAYS:
+        heated_blindly = schedule.shape.heat != 1.0 and not schedule.shape.evaluate_every
+        if schedule == self.best.schedule or heated_blindly or self._plays >= MOST_PLAYS:
             return False
         self._plays += 1
         outcome = play(schedule)
@@ -58,15 +69,6 @@ class Shrinker:
         if smaller:
             self.best = outcome
         return smaller
-
-
-def _plainer(shape: Shape) -> Iterator[Shape]:
-    plain = Shape()
-    for name in ("heat", "racing", "width", "parameters", "rollout", "collect_every", "evaluate_every", "slots"):
-        yield replace(shape, **{name: getattr(plain, name)})
-    for name in ("generations", "workers", "population", "episodes"):
-        if (value := getattr(shape, name)) > 1 + (name == "population"):
-            yield replace(shape, **{name: value - 1})
 
 
 def _weaker(fault: Fault) -> Iterator[Fault]:

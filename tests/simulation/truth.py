@@ -70,6 +70,7 @@ def settings_of(shape: Shape) -> RunSettings:
         evaluate_every=shape.evaluate_every,
         evaluation_episodes=shape.evaluation_episodes,
         racing=shape.racing,
+        confirm_episodes=shape.confirm_episodes,
         collect_every=shape.collect_every,
         heat=shape.heat,
         optimiser=TASK,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dreamfleet.common.messages import Job, JobBatch, Result
+from dreamfleet.common.seeds import validation_seeds
 from tests.simulation.disk import Disk
 from tests.simulation.schedule import Shape
 from tests.simulation.truth import fitness_of_job, truth_of
@@ -50,6 +51,12 @@ class Witness:
             if counts and verdict.digest not in disk.tables["result"]:
                 raise Violation("durability", f"a result was called {verdict.verdict} before it was on the disk")
 
+    def confirmed(self, disk: Disk, calm: Disk) -> None:
+        """What is reported, and the tracks that it was confirmed on, are those of the play without faults."""
+        facts = [each.tables["fact"].get("confirmed") for each in (disk, calm)]
+        if facts[0] != facts[1] or disk.tables["result"].keys() != calm.tables["result"].keys():
+            raise Violation("fitness", f"confirmed is {facts[0]}, without faults {facts[1]}")
+
     def finished(self, disk: Disk) -> None:
         """All that was wanted is there, once."""
         closed = [number for number, row in disk.tables["generation"].items() if "closed" in row]
@@ -57,7 +64,8 @@ class Witness:
             raise Violation("liveness", f"generations {closed} are closed, of {self._shape.generations}")
         if not self._shape.ends:
             return
-        counted = len(disk.tables["result"])
+        confirming = [job for job, _ in disk.tables["result"].values() if _confirms(job, self._shape)]
+        counted = len(disk.tables["result"]) - len(confirming)
         if counted != self.truth.jobs:
             raise Violation("count", f"{counted} results are counted, of {self.truth.jobs} jobs")
         evaluated = {number: done for number, (_, done) in disk.tables["evaluation"].items()}
@@ -65,6 +73,11 @@ class Witness:
             raise Violation("fitness", f"evaluations are {evaluated}, without faults {self.truth.evaluations}")
         if disk.files != self.truth.rollouts:
             raise Violation("content", f"kept rollouts are {_sizes(disk.files)}, not {_sizes(self.truth.rollouts)}")
+
+
+def _confirms(job: Job, shape: Shape) -> bool:
+    """Whether an evaluation is on other tracks than the schedule's."""
+    return job.kind == "evaluate" and job.seeds[0] not in validation_seeds(shape.evaluation_episodes)
 
 
 def _sizes(files: dict[str, Any]) -> dict[str, int]:

@@ -1,9 +1,11 @@
 """Real coordinators and workers as child processes, and waiting for what they do."""
 
+import fcntl
 import json
 import os
 import socket
 import subprocess
+import threading
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -35,13 +37,29 @@ class Process(Child):
     """A verb running; its stderr lines can be waited for."""
 
     def __init__(self, arguments, cache, inside=()):
+        self._reading = threading.Event()
+        self._reading.set()
         super().__init__(*arguments, environment=environment(cache), inside=inside)
+
+    def freeze(self, size=4096):
+        """Read its stderr no more, of which so many bytes still fit into the pipe."""
+        fcntl.fcntl(self.popen.stderr, fcntl.F_SETPIPE_SZ, size)
+        self._reading.clear()
+
+    def thaw(self):
+        """Read on; nothing is lost."""
+        self._reading.set()
+
+    def _hear(self, line):
+        self._reading.wait()
+        super()._hear(line)
 
     def finish(self, timeout=DEADLINE):
         return super().finish(timeout)
 
     def end(self, patience=0):
         """At once: no test waits for a verb that it has done with."""
+        self.thaw()
         super().end(patience)
 
 

@@ -16,6 +16,7 @@ class Relay:
 
     def __init__(self, target, address="127.0.0.1"):
         self.delay = 0.0  # seconds that every piece takes
+        self.rate = 0.0  # bytes a second of each connection and way; 0: as fast as they come
         self._target = target
         self._flowing = threading.Event()
         self._flowing.set()
@@ -72,7 +73,7 @@ class Relay:
     def _pump(self, source, sink):
         with source, suppress(OSError):
             while data := source.recv(65536):
-                time.sleep(self.delay)
+                time.sleep(self.delay + (len(data) / self.rate if self.rate else 0.0))
                 self._flowing.wait()
                 sink.sendall(data)
         with suppress(OSError):

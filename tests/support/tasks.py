@@ -1,5 +1,6 @@
 """Small tasks that score in microseconds or on command, for tests of everything around them."""
 
+import hashlib
 import os
 import signal
 import sys
@@ -25,6 +26,7 @@ MODULE = "tests.support.tasks"
 )  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
+ODD_REWARD = "DREAMFLEET_TEST_ODD_REWARD"  # a file that holds a number: the next episode gives it, and the file is gone
 
 
 class ToyEnvironment(gymnasium.Env):
@@ -166,25 +168,79 @@ class Judged(Toy):
 
 
 class Counted(Toy):
-    """Every step that any process ever makes is counted in a file that outlives it."""
+    """Every step that any process ever makes is counted in a file that outlives it; the bundle moves what it gives.
+
+    Now and then an episode's reward is odd, if somebody asks for it.
+    """
 
     name = COUNTED
+    seconds = 0.001
 
     def make_environment(self, assignment):
-        return CountedEnvironment(0.001)
+        return CountedEnvironment(self.seconds, _told_by(assignment.bundle))
+
+
+class Wide(Counted):
+    """A slot scores 256 together."""
+
+    name = f"{MODULE}:Wide"
+    width = 256
+    seconds = 0.0
+
+    def make_batch(self, assignment):
+        return WideBatch(self.make_environment(assignment))
+
+
+class WideBatch:
+    def __init__(self, environment):
+        self._environment = environment
+
+    def score(self, episodes, on_step):
+        scores = []
+        for vector, seed in episodes:
+            self._environment.reset(seed=int(seed))
+            action = vector[:8].astype(np.float64)
+            fitness = sum(self._environment.step(action)[1] for _ in range(10))
+            scores.append(Score(float(fitness), 10))
+            on_step(10 * len(scores))
+        return scores
+
+
+def _told_by(bundle):
+    """A number that another bundle, or a damaged one, would not give."""
+    return 0.0 if bundle is None else hashlib.sha256(bundle.path.read_bytes()).digest()[0] / 2560
+
+
+def _odd_reward():
+    """What an episode is asked to give; one process alone finds it."""
+    asked = Path(os.environ.get(ODD_REWARD, "/nowhere"))
+    taken = asked.with_name(f"{asked.name}.{os.getpid()}")
+    try:
+        asked.rename(taken)
+    except OSError:
+        return None
+    return float(taken.read_text())
 
 
 class CountedEnvironment(ToyEnvironment):
-    def __init__(self, seconds):
+    def __init__(self, seconds, shift=0.0):
         super().__init__(seconds)
+        self._shift, self._odd = shift, None
         file = (Path(os.environ[STEPS_FOLDER]) / f"{os.getpid()}-{time.monotonic_ns()}").open("w+b")
         file.write(bytes(8))
         file.flush()
         self._made = np.memmap(file, np.uint64, "r+", shape=(1,))
 
+    def reset(self, *, seed=None, options=None):
+        made = super().reset(seed=seed)
+        self._target += self._shift
+        self._odd = _odd_reward()
+        return made
+
     def step(self, action):
         self._made[0] += 1
-        return super().step(action)
+        seen, reward, *rest = super().step(action)
+        return seen, reward if self._odd is None else self._odd, *rest
 
 
 class Heavy(Toy):

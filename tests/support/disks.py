@@ -1,0 +1,54 @@
+"""Small disks of their own, which a test can fill: where this process may mount one."""
+
+import os
+import subprocess
+from contextlib import contextmanager
+
+
+class SmallDisk:
+    """So many megabytes at `path`."""
+
+    def __init__(self, path, megabytes):
+        self.path = path
+        self._ballast = path / ".ballast"
+        path.mkdir(parents=True, exist_ok=True)
+        _run("mount", "-t", "tmpfs", "-o", f"size={megabytes}m", "tmpfs", path)
+
+    @property
+    def full(self):
+        return self._ballast.exists()
+
+    def fill(self):
+        """Leave no byte."""
+        with self._ballast.open("wb") as file:
+            for step in (1 << 24, 1 << 16, 1 << 12):
+                try:
+                    while True:
+                        os.posix_fallocate(file.fileno(), file.seek(0, os.SEEK_END), step)
+                except OSError:
+                    continue
+
+    def free(self):
+        """Give back what `fill` took."""
+        self._ballast.unlink(missing_ok=True)
+
+    def remove(self):
+        _run("umount", "--lazy", self.path)
+
+
+@contextmanager
+def small_disk(path, megabytes):
+    """A disk, or `None` where this process may not mount one."""
+    try:
+        disk = SmallDisk(path, megabytes)
+    except (OSError, subprocess.CalledProcessError):
+        yield None
+        return
+    try:
+        yield disk
+    finally:
+        disk.remove()
+
+
+def _run(*words):
+    subprocess.run(list(map(str, words)), check=True, capture_output=True)
