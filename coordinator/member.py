@@ -31,6 +31,7 @@ class Lease:
     in_slack: bool = False
     absent: int = 0  # beats in a row that have seen the batch and do not show the job
     steps: int | None = None  # environment steps that it has made, once a beat has shown it running
+    told: float = 0.0  # when it did
     ended: float | None = None  # when its result first came, of which the upload is still on its way
 
 
@@ -111,7 +112,7 @@ class Member:
         """A job of its is not needed any more."""
         if not lease.handful.alone or self.occupied:
             return
-        self.record.overtaken(lease.handful.before + lease.handful.back + 1, now - lease.handful.given)
+        self.record.overtaken(lease.handful.before + lease.handful.back + 1, now - lease.handful.given, now)
 
     def lose_before(self, batch: int) -> None:
         """What it shows came with this batch: those before it that it has not seen were lost."""
