@@ -91,7 +91,8 @@ class Member:
         late, ahead = [], 0
         for number, sent in self.unseen.items():
             ahead += sent.content.size
-            if now - sent.at > (patience + self.record.delivery(ahead)) * 2 ** min(sent.times - 1, 4):
+            since = sent.at if sent.at == -math.inf else max(sent.at, self.delivered)  # the link is free since then
+            if now - since > (patience + self.record.delivery(ahead)) * 2 ** min(sent.times - 1, 4):
                 late.append(number)
         return late
 

@@ -61,4 +61,4 @@ class Outbox:
 
     def _pause(self, waiting: Waiting) -> float:
         """Twice at the interval, for what is lost is mostly lost once, then twice as long each time."""
-        return self.repeat * min(2 ** max(waiting.times - 2, 0), LONGEST)
+        return float(self.repeat * min(2 ** max(waiting.times - 2, 0), LONGEST))
