@@ -62,7 +62,7 @@ class Choice:
     def _rest(self, name: str) -> float:
         """Seconds that the others need for what they hold and what waits."""
         jobs = self._waiting + self._jobs - self._loads[name]
-        return jobs / (self._rate - self._members[name].record.rate)
+        return jobs / max(self._rate - self._members[name].record.rate, 1e-9)
 
     def _best_beside(self, name: str) -> float:
         """Seconds in which the best of the others brings as many jobs back as this one would hold."""

@@ -146,13 +146,13 @@ class Fleet:
         shown = {self._tags.get(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
         for digest, lease in list(member.leases.items()):
             lease.absent = 0 if digest in shown or lease.batch > beat.seen else lease.absent + 1
-            lease.steps = running.get(digest)
+            lease.steps, lease.told = running.get(digest), now
             if lease.absent >= ABSENT_BEATS:
                 self._drop_lease(member, digest)
         held = Handful(now, len(member.leases), alone=False)
         for found in shown - member.leases.keys():
             if found in self._wanted and len(self._wanted[found].holders) < 2:
-                self._take(member, found, Lease(beat.seen, held, steps=running.get(found)))
+                self._take(member, found, Lease(beat.seen, held, steps=running.get(found), told=now))
         member.lose_before(max((lease.batch for each, lease in member.leases.items() if each in shown), default=0))
 
     def result(self, identity: str, result: Result, now: float) -> tuple[VerdictWord, Work | None]:

@@ -31,6 +31,7 @@ class Lease:
     in_slack: bool = False
     absent: int = 0  # beats in a row that have seen the batch and do not show the job
     steps: int | None = None  # environment steps that it has made, once a beat has shown it running
+    told: float = 0.0  # when it did
     ended: float | None = None  # when its result first came, of which the upload is still on its way
 
 
@@ -92,7 +93,8 @@ class Member:
         late, ahead = [], 0
         for number, sent in self.unseen.items():
             ahead += sent.content.size
-            if now - sent.at > (patience + self.record.delivery(ahead)) * 2 ** min(sent.times - 1, 4):
+            since = sent.at if sent.at == -math.inf else max(sent.at, self.delivered)  # the link is free since then
+            if now - since > (patience + self.record.delivery(ahead)) * 2 ** min(sent.times - 1, 4):
                 late.append(number)
         return late
 
@@ -113,7 +115,7 @@ class Member:
         """A job of its is not needed any more."""
         if not lease.handful.alone or self.occupied:
             return
-        self.record.overtaken(lease.handful.before + lease.handful.back + 1, now - lease.handful.given)
+        self.record.overtaken(lease.handful.before + lease.handful.back + 1, now - lease.handful.given, now)
 
     def lose_before(self, batch: int) -> None:
         """What it shows came with this batch: those before it that it has not seen were lost."""

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 UNKNOWN_LINK = 32_000.0  # bytes a second that a link is thought to carry before it has shown what it does
 FORGOTTEN = 0.95  # of the best rate that a link has shown remains with each new one
 RISING, FALLING = 0.5, 0.2  # weight of a slower and of a faster turnaround
+GROWTH, SHRINKING = 0.9, 0.25  # powers of their number that more jobs than ever, or fewer, should take
+MEMORY = 60.0  # seconds that a turnaround is remembered where there is a newer one
 DEVIATIONS = 2.0  # above the mean that are still expected, as TCP's retransmission timer reckons (RFC 6298: four)
 LIFETIMES = 8.0  # a host that dies is given what it should bring back in this part of a life
 DEATHS = 2  # with jobs in its hands, after which a host counts as one that dies
@@ -21,6 +23,7 @@ class Turnaround:
     """Seconds until so many jobs are back: mean and mean deviation."""
 
     mean: float
+    at: float  # when it was last seen
     deviation: float = 0.0
 
     def learn(self, seconds: float) -> None:
@@ -59,25 +62,25 @@ class HostRecord:
         """So many jobs in its hands were back after so long."""
         self.learned = now
         size = _size(jobs)
-        if size in self.turnarounds:
-            self.turnarounds[size].learn(seconds)
-        else:
-            self.turnarounds[size] = Turnaround(seconds)
+        here = self.turnarounds.setdefault(size, Turnaround(seconds, now))
+        here.learn(seconds)
+        here.at = now
+        self.turnarounds = {other: each for other, each in self.turnarounds.items() if now - each.at < MEMORY}
         for larger, old in self.turnarounds.items():
-            most = self.turnarounds[size].seconds * 2 ** (larger - size)
+            most = here.seconds * 2 ** (larger - size)
             if larger > size and old.seconds > most:  # that was another time
-                self.turnarounds[larger] = Turnaround(most)
+                self.turnarounds[larger] = Turnaround(most, now)
 
-    def overtaken(self, jobs: int, seconds: float) -> None:
+    def overtaken(self, jobs: int, seconds: float, now: float) -> None:
         """A job was not back after so long, when another host's result made it needless."""
         if self.known and seconds > self.expected(jobs):
-            self.turnarounds.setdefault(_size(jobs), Turnaround(seconds)).learn(seconds)
+            self.turnarounds.setdefault(_size(jobs), Turnaround(seconds, now)).learn(seconds)
 
     def expected(self, jobs: int) -> float:
         """Seconds until it has brought so many back, if they are all that it has.
 
-        Of more jobs than it ever had it is expected to take its time for each, of fewer something between that and
-        the same; a host of which nothing is known never brings any back.
+        More jobs than it ever had are expected to take nearly as much longer, fewer somewhat less; a host of which
+        nothing is known never brings any back.
         """
         size = _size(jobs)
         if (exactly := self.turnarounds.get(size)) is not None:
@@ -86,7 +89,7 @@ class HostRecord:
         larger = min((each for each in self.turnarounds if each > size), default=None)
         bounds = [math.inf]
         if smaller is not None:
-            bounds.append(self.turnarounds[smaller].seconds * 2 ** (size - smaller))
+            bounds.append(self.turnarounds[smaller].seconds * 2 ** (GROWTH * (size - smaller)))
         if larger is not None:
             bounds.append(
                 self.turnarounds[larger].seconds * (1.0 if smaller is not None else 2 ** ((size - larger) / 4))

@@ -156,7 +156,8 @@ class Tail:
             return 0.0 if lease.in_slack or not taker.record.known else _overdue(holder, lease, known, now)
         left = _left(holder, lease, now) if holder.record.known and not lease.in_slack else 0.0
         if holder.pace and taker.pace and self._typical:
-            steps = max(self._typical - lease.steps - holder.pace * quiet, self._typical / 10)
+            since = holder.pace * (now - lease.told)
+            steps = max(self._typical - lease.steps - since, self._typical / 10)
             left = max(left, steps / holder.pace)
         return left
 

@@ -1,4 +1,5 @@
 import tracemalloc
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -330,7 +331,7 @@ def test_memory_of_results_is_bounded(count):
         fleet.begin(generation)
         fleet.offer(work(1, generation=generation))
         now = generation / 100
-        fleet.beat(A, beat(4, seen=10**9), now)
+        fleet.beat(A, beat(4, seen=fleet.members[A].number), now)
         for digest in digests(fleet.dispatch(now), A):
             fleet.result(A, result(digest), now)
     assert len(fleet._accepted) <= 2
@@ -351,16 +352,16 @@ def test_memory_stays_flat_through_a_hundred_thousand_generations_of_churn():
         fleet.offer(work(2, generation=generation))
         name = f"w/{random.integers(2**32):08x}"
         fleet.welcome(name, 2, "f", now)
-        fleet.beat(A, beat(4, seen=10**9), now)
-        fleet.beat(name, beat(2, seen=10**9), now)
+        fleet.beat(A, beat(4, seen=fleet.members[A].number), now)
+        fleet.beat(name, beat(2, seen=fleet.members[name].number), now)
         while fleet.open:
             for who in (A, name):
                 for digest in digests(fleet.dispatch(now), who):
                     if random.random() < 0.8:
                         fleet.result(who, result(digest), now)
             now += 0.001
-            fleet.beat(A, beat(4, seen=10**9), now)
-            fleet.beat(name, beat(2, seen=10**9), now)
+            fleet.beat(A, beat(4, seen=fleet.members[A].number), now)
+            fleet.beat(name, beat(2, seen=fleet.members[name].number), now)
         fleet.depart(name, now)
         fleet.tick(now + 0.06)
         fleet.notes.clear()
@@ -401,3 +402,116 @@ def test_a_stranger_who_only_said_hello_keeps_no_failing_job_from_being_tried_ag
     fleet.welcome(B, 4, "f", 0.0)
     fleet.result(A, result(digest, error="killed"), 0.1)
     assert digests(fleet.dispatch(0.2), A) == [digest]
+
+
+def known(fleet, name, seconds=0.1, at=0.0):
+    """Have a worker bring all that it is given back after so long."""
+    while given := digests(fleet.dispatch(at), name):
+        at += seconds
+        for digest in given:
+            fleet.result(name, result(digest), at)
+    return at
+
+
+def test_an_idle_worker_hears_that_it_is_known_and_no_more_often_than_that():
+    fleet = fleet_of(A, jobs=0)
+    heard = []
+    for tenth in range(100):
+        if tenth % 10 == 0:
+            fleet.beat(A, beat(), tenth / 10)
+        heard += [(tenth / 10, send.number) for send in fleet.dispatch(tenth / 10)]
+    assert {number for _, number in heard} == {0}
+    assert 2 <= len(heard) <= 5
+    assert max(late - early for (early, _), (late, _) in pairwise(heard)) < SILENT_BEATS * BEAT
+
+
+def test_a_worker_that_says_nothing_is_told_nothing():
+    fleet = fleet_of(A, jobs=0)
+    fleet.dispatch(3.0)
+    assert fleet.dispatch(9.0) == []
+
+
+def heavy(count):
+    vector = travelling(np.arange(90_000.0))
+    return make_work(SPEC, "score", 0, 0, vector, range(1000, 1000 + count))
+
+
+def test_a_large_batch_has_the_time_that_its_link_takes():
+    fleet = fleet_of(A, jobs=0)
+    fleet.offer(heavy(1))
+    parts = fleet.dispatch(0.0)
+    for second in range(1, 8):  # 360 kB at 50 kB a second
+        fleet.beat(A, beat(seen=second), float(second))
+        assert numbered(fleet.dispatch(second + 0.5)) == []
+    assert len(parts) > 7
+    assert fleet.members[A].record.bandwidth > 35_000
+
+
+def test_what_a_later_batch_has_overtaken_was_lost_and_is_sent_again_at_once():
+    fleet = fleet_of(A, jobs=2)
+    (first,) = fleet.dispatch(0.0)
+    fleet.offer(work(3, generation=1))
+    done = first.content.work[0].job.digest
+    fleet.result(A, result(done), 0.1)
+    (second,) = fleet.dispatch(0.1)
+    fleet.beat(A, beat(seen=0, queued=digests([second], A)), 0.2)
+    assert [send.number for send in fleet.dispatch(0.2)] == [first.number]
+
+
+def test_a_worker_that_did_not_hear_the_answer_to_its_hello_is_given_work_at_once():
+    fleet = fleet_of(A, jobs=4)
+    for _ in range(3):
+        for digest in digests(fleet.dispatch(0.0), A)[:1]:
+            fleet.result(A, result(digest), 0.0)
+    fleet.welcome(A, 1, "f", 1.0)
+    fleet.beat(A, beat(seen=7), 1.1)
+    assert [send.number for send in fleet.dispatch(1.1) if send.content.work] == [8]
+
+
+def test_what_a_host_is_known_for_outlives_its_hello_and_its_worker():
+    fleet = fleet_of(A, jobs=3)
+    known(fleet, A, seconds=0.5)
+    record = fleet.members[A].record
+    assert record.expected(2) >= 0.5
+    fleet.welcome(A, 1, "f", 5.0)
+    assert fleet.members[A].record is record
+    fleet.depart(A, 6.0)
+    fleet.tick(7.0)
+    fleet.welcome("a/00000009", 1, "f", 8.0)
+    assert fleet.members["a/00000009"].record == record
+
+
+def test_a_newcomer_beside_a_known_worker_gets_a_copy_for_which_nobody_waits():
+    fleet = fleet_of(A, jobs=3)
+    now = known(fleet, A)
+    fleet.welcome(B, 1, "f", now)
+    fleet.beat(B, beat(), now)
+    fleet.offer(work(6, generation=1))
+    held = digests(fleet.dispatch(now), A)
+    (copied,) = digests(fleet.dispatch(now), B)
+    assert copied == held[-1], "of what begins last where it is"
+    for digest in held:
+        assert fleet.result(A, result(digest), now + 0.2)[0] == "accepted"
+    assert cancelled(fleet.dispatch(now + 0.2), B) == [], "it shows how soon it is, late or not"
+    assert fleet.result(B, result(copied), now + 3.0)[0] == "duplicate"
+    fleet.dispatch(now + 3.0)
+    assert fleet.members[B].record.expected(1) == pytest.approx(3.0)
+
+
+def test_a_host_that_dies_again_and_again_is_given_what_it_brings_back_in_time():
+    fleet = fleet_of(A, jobs=3)
+    now = known(fleet, A, seconds=1.0)
+    for life in range(3):
+        name = f"b/{life:08x}"
+        fleet.welcome(name, 1, "f", now)
+        fleet.beat(name, beat(), now)
+        fleet.offer(work(4, generation=life + 1))
+        fleet.dispatch(now)
+        fleet.dispatch(now)
+        fleet.depart(name, now + 1.5)
+        fleet.tick(now + 1.6)
+        now += 2.0
+    assert fleet._records["b"].deaths == 3
+    fleet._records["b"].learn(1, 1.0, now)
+    assert fleet._records["b"].risky(1, age=0.0)
+    assert not fleet._records["b"].risky(1, age=60.0)

@@ -35,6 +35,7 @@ class Host:
     heard: float = 0.0
     busy_until: float = 0.0  # its link
     joins: int = 0
+    until: float = 0.0  # its turn ends
 
 
 class Played:
@@ -134,6 +135,7 @@ class Played:
         for digest in host.running:
             del host.queued[digest]
         seconds = host.turn + host.row * len(host.running)
+        host.until = self.now + seconds
         self._at(self.now + seconds, self._finish, host, host.identity, host.running, seconds)
 
     def _finish(self, host, identity, turn, seconds):
@@ -170,13 +172,18 @@ class Played:
             **HEAD, nonce="n", seen=seen, capacity=host.width, slots=1, load=0.0, drawn_by="-",
             steps_per_second=10 * len(host.running) / (host.turn + host.row * max(1, len(host.running))),
             queued=tuple(digest[:TAG_BYTES] for digest in host.queued),
-            running=tuple(Running(digest[:TAG_BYTES], 1) for digest in host.running),
+            running=tuple(Running(digest[:TAG_BYTES], self._steps(host)) for digest in host.running),
             unacked=tuple(digest[:TAG_BYTES] for digest in host.unacked),
         )  # fmt: skip
         self._at(self.now + host.delay, self._heard, identity, beat)
         if not host.running and self.now - host.heard > SILENT_BEATS * self._beat:
             self._join(host)
         self._at(self.now + self._beat, self._beat_of, host, identity)
+
+    def _steps(self, host):
+        """Of the ten that an episode has."""
+        left = host.until - self.now
+        return max(0, int(10 * (1 - left / (host.turn + host.row * len(host.running)))))
 
     def _heard(self, identity, beat):
         self.fleet.beat(identity, beat, self.now)

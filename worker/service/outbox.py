@@ -10,6 +10,7 @@ from dreamfleet.common.messages import Result
 
 BATCH = 64  # results of a message
 ROOM = 32 * 1024  # bytes of a message's errors: without one a result is far below a kilobyte
+LONGEST = 8  # intervals between two repetitions at most: a verdict on a slow link takes longer than one
 
 
 @dataclass
@@ -18,10 +19,11 @@ class Waiting:
 
     result: Result
     sent: float | None = None
+    times: int = 0  # that it was sent
 
 
 class Outbox:
-    """Sends each result at once and again every `repeat` seconds until its verdict comes."""
+    """Sends each result at once and again after `repeat` seconds, then ever longer pauses, until its verdict comes."""
 
     def __init__(self, repeat: float) -> None:
         self.repeat = repeat
@@ -47,14 +49,19 @@ class Outbox:
     def resend_all(self) -> None:
         """Send everything again at the next opportunity."""
         for waiting in self._waiting.values():
-            waiting.sent = None
+            waiting.sent, waiting.times = None, 0
 
     def due(self, now: float) -> list[tuple[Result, ...]]:
         """Results to send now, in messages."""
-        due = [each for each in self._waiting.values() if each.sent is None or now - each.sent >= self.repeat]
+        due = [each for each in self._waiting.values() if each.sent is None or now - each.sent >= self._pause(each)]
         for waiting in due:
             waiting.sent = now
+            waiting.times += 1
         return _messages([waiting.result for waiting in due])
+
+    def _pause(self, waiting: Waiting) -> float:
+        """Twice at the interval, for what is lost is mostly lost once, then twice as long each time."""
+        return float(self.repeat * min(2 ** max(waiting.times - 2, 0), LONGEST))
 
 
 def _messages(results: list[Result]) -> list[tuple[Result, ...]]:

@@ -17,6 +17,12 @@ def test_a_result_leaves_at_once_and_again_until_its_verdict():
     assert len(outbox) == 0
 
 
+def test_repetitions_of_what_nobody_answers_become_rarer():
+    outbox = Outbox(repeat=1.0)
+    outbox.add(result(1))
+    assert sum(len(outbox.due(second / 10)) for second in range(600)) < 12
+
+
 def test_many_results_are_cut_into_messages():
     outbox = Outbox(repeat=1.0)
     for number in range(BATCH + 5):

@@ -1,0 +1,128 @@
+"""Generations a second of one good worker alone, and with a bad one beside it, in blocks that take turns.
+
+python -m tests.chaos.bad_worker --json
+"""
+
+import argparse
+import json
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+from dreamfleet.worker.bench.naps import NAPS
+from tests.support.bundles import write_random_bundle
+from tests.support.hosts import new_host
+from tests.support.processes import processes_in
+
+NAPPING = ("--task", NAPS, "--population", "8", "--episodes", "2")  # 16 naps of 50 ms
+DREAMING = ("--preset", "dream", "--population", "32", "--episodes", "4", "--horizon", "300")
+BADS = ("slow_link", "slow_core", "flapping")
+BLOCKS, SECONDS, SETTLING = 5, 12.0, 6.0
+TBF = ("root", "tbf", "rate", "256kbit", "burst", "4kb", "latency", "2s")
+
+
+class Bench:
+    """A coordinator that never ends, a good worker on a core of its own, and what may be added to it."""
+
+    def __init__(self, processes, bundle, settings, host, tasks):
+        self._processes, self._host, self._tasks = processes, host, tasks
+        near = f"tcp/{host.address}:{processes.port}"
+        self._near = near
+        self.coordinator = processes.start(
+            "coordinator", "--run", "run", "--runs-dir", processes.runs, "--listen", processes.endpoint, near,
+            "--bundle", bundle, "--evaluate-every", 0, "--generations", 10**6, *settings,
+        )  # fmt: skip
+        self.coordinator.wait_for("incarnation")
+        self.good = self.worker("good", inside=("taskset", "-c", "0"))
+        self.coordinator.wait_for("generation 2: mean")
+
+    def worker(self, name, **more):
+        return self._processes.worker("--run", "run", "--name", name, *self._tasks, **more)
+
+    def rate(self, seconds):
+        """Generations a second."""
+        before, started = self._closed(), time.monotonic()
+        time.sleep(seconds)
+        return (self._closed() - before) / (time.monotonic() - started)
+
+    def _closed(self):
+        return sum(": mean" in line for line in self.coordinator.lines)
+
+    @contextmanager
+    def slow_link(self):
+        device = f"{self._host.name}-a"
+        for inside, end in (((), device), (self._host.inside, f"{self._host.name}-b")):
+            subprocess.run([*inside, "tc", "qdisc", "replace", "dev", end, *TBF], check=True)
+        with _ending(self.worker("bad", endpoint=self._near, inside=self._host.inside)):
+            yield
+
+    @contextmanager
+    def slow_core(self):
+        busy = subprocess.Popen(["taskset", "-c", "1", sys.executable, "-c", "while True: pass"])
+        try:
+            with _ending(self.worker("bad", inside=("taskset", "-c", "1", "chrt", "--idle", "0"))):
+                yield
+        finally:
+            busy.kill()
+            busy.wait()
+
+    @contextmanager
+    def flapping(self):
+        again = ("sh", "-c", 'while true; do timeout -s KILL 2.5 "$@"; done', "sh")
+        with _ending(self.worker("bad", inside=again)):
+            yield
+
+
+@contextmanager
+def _ending(process):
+    try:
+        yield
+    finally:
+        os.killpg(process.popen.pid, signal.SIGKILL)
+        process.popen.wait()
+        time.sleep(1.0)
+
+
+def measure(folder, kinds, dreaming, blocks, seconds):
+    """The medians of each kind, and their ratio: how many times slower a generation becomes."""
+    figures = {}
+    settings, tasks = (DREAMING, ()) if dreaming else (NAPPING, ("--task", NAPS))
+    bundle = write_random_bundle(folder / "random.zip").path
+    for kind in kinds:
+        with new_host() as host, processes_in(folder / kind) as processes:
+            bench = Bench(processes, bundle, settings, host, tasks)
+            alone, both = [], []
+            for _ in range(blocks):
+                alone.append(bench.rate(seconds))
+                with getattr(bench, kind)():
+                    time.sleep(SETTLING)
+                    both.append(bench.rate(seconds))
+        pair = statistics.median(alone), statistics.median(both)
+        figures[kind] = {"alone": round(pair[0], 3), "both": round(pair[1], 3), "ratio": round(pair[0] / pair[1], 3)}
+        print(kind, figures[kind], file=sys.stderr, flush=True)
+    return figures
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--dream", action="store_true", help="a real dream run, in place of naps")
+    parser.add_argument("--kinds", nargs="+", choices=BADS, default=BADS)
+    parser.add_argument("--blocks", type=int, default=BLOCKS)
+    parser.add_argument("--seconds", type=float, default=SECONDS)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        figures = measure(Path(name), arguments.kinds, arguments.dream, arguments.blocks, arguments.seconds)
+    if arguments.json:
+        print(json.dumps(figures))
+    return 0 if all(each["ratio"] <= 1.05 for each in figures.values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
