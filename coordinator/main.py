@@ -53,7 +53,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         on_stoppable(service.stop)
         try:
             _keep(journal, request)
-            fleet = Fleet(request.network.beat)
+            fleet = Fleet(request.network.beat, request.network.evaluation_share)
             return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), request.start))
         finally:
             journal.close()
