@@ -28,8 +28,8 @@ from dreamfleet.common.threads import pin_thread_pools
 from tests.support.processes import processes_in
 
 SETTINGS = {
-    "preset": "dream", "bundle": "tiny", "population": 32, "episodes": 8, "generations": 12, "evaluate-every": 3,
-    "evaluation-episodes": 4, "confirm-episodes": 16,
+    "preset": "dream", "bundle": "tiny", "population": 32, "episodes": 8, "generations": 10, "evaluate-every": 3,
+    "evaluation-episodes": 4, "confirm-episodes": 24,
 }  # fmt: skip
 TRACKS = TEST[:100]
 PATIENCE = 1800  # seconds of a run at most
