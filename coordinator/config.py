@@ -22,6 +22,7 @@ DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
 
 
 PYTHONS = {"True": True, "False": False, "None": None}
+LARGEST_SHARE = 0.9  # of the fleet's time that evaluations may have: the strategy needs some
 LARGEST_STEP = 1e6  # first step size; parameters travel in single precision
 # What a journal and a message can hold.
 BOUNDS = {
@@ -246,6 +247,7 @@ class NetworkConfig:
     listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
     connect: tuple[str, ...] = option((), "connect to these stand-alone routers, as well where --listen is given")
     beat: float = option(1.0, "seconds between a worker's beats")
+    evaluation_share: float = option(0.25, "of a busy fleet's time that evaluations get; 0: only idle slots")
     mixed: bool = option(
         False,
         "take results of hosts whose CPU features or package versions differ from those of the first accepted result; "
@@ -255,6 +257,8 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         if not 0.05 <= self.beat <= 60:
             raise UsageError(f"--beat must be from 0.05 to 60 seconds, not {self.beat}")
+        if not 0 <= self.evaluation_share <= LARGEST_SHARE:
+            raise UsageError(f"--evaluation-share must be from 0 to {LARGEST_SHARE}, not {self.evaluation_share}")
 
 
 # The paper's own settings, the article's, and what two cores do in minutes.

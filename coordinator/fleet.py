@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dreamfleet.common.messages import MOST_SLOTS, TAG_BYTES, Beat, Kind, Result, Verdict, VerdictWord
@@ -18,6 +18,7 @@ from dreamfleet.coordinator.jobs import Work
 from dreamfleet.coordinator.member import Handful, Lease, Member, Sent
 from dreamfleet.coordinator.packing import Content, pack
 from dreamfleet.coordinator.record import HostRecord
+from dreamfleet.coordinator.share import Share
 from dreamfleet.coordinator.tail import Move, Tail
 
 DEPARTURE_GRACE = 0.05  # seconds: a token's end overtakes results that are still on their way
@@ -46,7 +47,7 @@ class Wanted:
 
     @property
     def in_slack(self) -> bool:
-        """Whether it only fills what scoring leaves idle."""
+        """Whether it fills what scoring leaves idle, and has a share of what it does not."""
         return self.work.job.kind != "score"
 
 
@@ -62,11 +63,13 @@ class Send:
 class Fleet:
     """The workers of one run and the jobs between them."""
 
-    def __init__(self, beat: float) -> None:
+    def __init__(self, beat: float, evaluation_share: float = 0.25) -> None:
         self._beat = beat
         self._wanted: dict[bytes, Wanted] = {}
         self._tags: dict[bytes, bytes] = {}
-        self._queue: list[tuple[bool, int, bytes]] = []  # what waits for slack last, then in order of offer
+        self._queue: list[tuple[int, bytes]] = []  # what is scored, in order of offer
+        self._spare: list[tuple[int, bytes]] = []  # what waits for slack or for its share
+        self._share = Share(evaluation_share)
         self._orders = 0
         self._in_slack = 0  # evaluations and collected rollouts that somebody holds
         self._failing: dict[bytes, Wanted] = {}  # those of the wanted that failed somewhere
@@ -100,16 +103,8 @@ class Fleet:
                 self._unwant(digest)
 
     def begin(self, generation: int) -> None:
-        """A generation opens: copies from before the last one are obsolete, and one job that waits for slack leads it.
-
-        Where results come so fast that slack is never seen, evaluations would wait until the run's end.
-        """
+        """A generation opens: copies from before the last one are obsolete."""
         self._accepted = {digest: number for digest, number in self._accepted.items() if number >= generation - 1}
-        waiting = [entry for entry in self._queue if entry[0]]
-        if waiting and not self._in_slack:
-            _, order, digest = first = min(waiting)
-            self._queue[self._queue.index(first)] = (False, order, digest)
-            heapq.heapify(self._queue)
 
     def welcome(self, identity: str, slots: int, fingerprint: str, now: float) -> None:
         """A worker was admitted; it has credit from its first beat on, and until then it is one of a few guests."""
@@ -298,6 +293,7 @@ class Fleet:
             if member := self.members.get(identity):
                 self._drop_lease(member, result.digest)
             return "refused", None
+        self._share.count(result.digest, result.seconds, in_slack=wanted.in_slack, waiting=bool(self._spare))
         self._unhold(wanted, identity)
         self._unwant(result.digest)
         self._accepted[result.digest] = wanted.work.job.generation
@@ -307,6 +303,7 @@ class Fleet:
         wanted = self._wanted.pop(digest)
         self._failing.pop(digest, None)
         self._tags.pop(digest[:TAG_BYTES], None)
+        self._share.give_back(digest)
         for holder in list(wanted.holders):
             member = self.members[holder]
             lease = member.leases.pop(digest, None)
@@ -405,9 +402,10 @@ class Fleet:
 
     def _enqueue(self, digest: bytes) -> None:
         wanted = self._wanted[digest]
+        self._share.give_back(digest)
         if not wanted.queued:
             wanted.queued = True
-            heapq.heappush(self._queue, (wanted.in_slack, wanted.order, digest))
+            heapq.heappush(self._spare if wanted.in_slack else self._queue, (wanted.order, digest))
 
     def _assign(self, now: float) -> dict[str, list[Work]]:
         """One job at a time to the least loaded worker with credit that helps, so that a tail is spread evenly."""
@@ -415,45 +413,59 @@ class Fleet:
         if self.paused:
             return given
         loads = {name: len(member.leases) for name, member in self.members.items() if member.credit > 0}
-        choice = Choice(self.members, loads, sum(not in_slack for in_slack, *_ in self._queue), now)
+        choice = Choice(self.members, loads, len(self._queue), now)
         passed_over = []
-        while self._queue and loads:
-            entry = heapq.heappop(self._queue)
-            wanted = self._wanted.get(entry[2])
+        while loads and (turn := self._turn(loads)) is not None:
+            queue, by_share = turn
+            _, digest = heapq.heappop(queue)
+            wanted = self._wanted.get(digest)
             if wanted is None:
                 continue  # answered meanwhile
             wanted.queued = False
             if wanted.holders:
                 continue  # adopted again from a worker that came back
-            if entry[0] and not self.hurry and self._in_slack >= self._slack_slots():
-                passed_over.append(entry)
-                break  # what waits for slack is last in the queue
-            able = [name for name in loads if name not in wanted.failed]
-            if not able and all(
-                name in wanted.failed for name, member in self.members.items() if member.present and member.capacity
-            ):
-                able = list(loads)  # nobody else is there: a killed child must not hang a run
+            able = self._able(wanted, loads)
             if not able:
-                passed_over.append(entry)
+                passed_over.append(digest)
                 continue
             name = choice.pick(able)
             if name is None and not wanted.failed:
-                passed_over.append(entry)
+                passed_over.append(digest)
                 break  # nor the jobs after it: they had better wait for whoever is sooner
             name = name or min(able, key=lambda name: loads[name])
             choice.take(name)
+            if by_share:
+                self._share.take(digest)
             given.setdefault(name, []).append(wanted.work)
             self._hold(wanted, name)
             loads[name] += 1
             if len(given[name]) >= self.members[name].credit:
                 del loads[name]
-        for entry in passed_over:
-            self._enqueue(entry[2])
+        for digest in passed_over:
+            self._enqueue(digest)
         return given
 
-    def _slack_slots(self) -> int:
-        """Rollouts of a mean fill the tail of a generation and never more than a quarter of the slots."""
-        return max(1, sum(member.slots for member in self.members.values() if member.present and member.capacity) // 4)
+    def _able(self, wanted: Wanted, loads: Mapping[str, int]) -> list[str]:
+        """Who of these may be given this job: not where it failed, unless nobody else is there.
+
+        A killed child must not hang a run.
+        """
+        able = [name for name in loads if name not in wanted.failed]
+        there = (name for name, member in self.members.items() if member.present and member.capacity)
+        return list(loads) if not able and all(name in wanted.failed for name in there) else able
+
+    def _turn(self, loads: Mapping[str, int]) -> tuple[list[tuple[int, bytes]], bool] | None:
+        """The queue that gives the next job, and whether that job goes by its share; `None` where none may go."""
+        helping = (member for member in self.members.values() if member.present and member.capacity)
+        slots = sum(member.slots for member in helping) if self._spare else 0
+        if self._queue:
+            by_share = bool(self._spare) and self._share.due(slots)
+            return (self._spare, True) if by_share else (self._queue, False)
+        idle = any(load < self.members[name].capacity for name, load in loads.items())
+        most = max(1, int(slots * self._share.share))  # more in idle slots would keep the next generation waiting
+        if self._spare and (self.hurry or (idle and self._in_slack < most)):
+            return self._spare, False
+        return None
 
 
 def _failure(wanted: Wanted) -> Failure:

@@ -188,37 +188,17 @@ def test_a_failed_job_waits_for_another_worker_that_is_busy():
     assert [failure.errors for failure in fleet.failures] == [{A: "boom"}]
 
 
-def test_evaluations_wait_for_slack_and_take_a_quarter_of_the_slots():
-    fleet = fleet_of(A, capacity=4, jobs=3)
-    fleet.offer(work(5, "evaluate"))
-    kinds = [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work]
-    assert kinds == ["score"] * 3 + ["evaluate"]
+@pytest.mark.parametrize(
+    ("share", "kinds"), [(0.25, ["evaluate", *["score"] * 3]), (0.0, [*["score"] * 3, "evaluate"])]
+)
+def test_evaluations_fill_a_quarter_of_the_idle_slots_and_lead_where_they_have_a_share(share, kinds):
+    fleet = Fleet(BEAT, share)
+    fleet.welcome(A, 4, "f", 0.0)
+    fleet.beat(A, beat(4), 0.0)
+    fleet.offer(work(3) + work(5, "evaluate"))
+    assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work] == kinds
     fleet.hurry = True
     assert len(digests(fleet.dispatch(0.1), A)) == 4
-
-
-def test_where_no_slack_is_ever_seen_an_evaluation_leads_each_generation():
-    fleet = fleet_of(A, jobs=0)
-    fleet.offer(work(3, "evaluate"))
-    turns = []
-    for generation in range(1, 4):
-        fleet.begin(generation)
-        fleet.offer(work(3, generation=generation))
-        for _ in range(2):  # two jobs at a time, answered together: none is left when the last two have gone
-            given = [each.job for send in fleet.dispatch(0.0) for each in send.content.work]
-            turns.append([job.kind for job in given])
-            for job in given:
-                fleet.result(A, result(job.digest), 0.0)
-    assert turns == [["evaluate", "score"], ["score", "score"]] * 3
-
-
-def test_an_evaluation_that_is_held_already_is_enough():
-    fleet = fleet_of(A, capacity=4, jobs=0)
-    fleet.offer(work(3, "evaluate"))
-    assert len(digests(fleet.dispatch(0.0), A)) == 1
-    fleet.begin(1)
-    fleet.offer(work(2, generation=1))
-    assert [each.job.kind for send in fleet.dispatch(0.1) for each in send.content.work] == ["score"] * 2
 
 
 def test_evaluations_and_collected_drives_share_the_quarter():

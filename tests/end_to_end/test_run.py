@@ -248,3 +248,16 @@ def test_several_runs_on_one_router_never_see_each_other_and_a_worker_serves_the
     assert [number for number, *_ in history(processes, "second")] == [0, 1, 2]
     with open_run(processes.runs, "first") as one, open_run(processes.runs, "second") as other:
         assert one.results(0, 0)[0].worker != other.results(0, 0)[0].worker
+
+
+def test_on_a_small_busy_fleet_an_evaluation_is_finished_within_two_generations(processes, random_bundle):
+    """Two slots, 64 episodes a generation, and an evaluation of 12 tracks after generation 1."""
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 16, "--episodes", 4,
+        "--evaluate-every", 2, "--evaluation-episodes", 12, "--confirm-episodes", 0, "--generations", 5,
+    )  # fmt: skip
+    for name in ("a", "b"):
+        processes.worker("--task", tasks.SLOW_TOY, "--name", name)
+    coordinator.wait_for("evaluation of generation 1's mean", timeout=200)
+    assert not any("generation 3: mean" in line for line in coordinator.lines)
+    assert coordinator.finish(100)[0] == 0
