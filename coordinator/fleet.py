@@ -217,7 +217,7 @@ class Fleet:
             for move in self._tail.plan(self._wanted, self.members, given, now):
                 self._apply(move, given, now)
         if not self.paused:
-            for move in list(self._tail.trials(self._wanted, self.members, given.keys(), now)):
+            for move in self._tail.trials(self._wanted, self.members, given.keys(), now):
                 self._apply(move, given, now)
         sends: list[Send] = []
         for member in self.members.values():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from dreamfleet.common.messages import TAG_BYTES
 from dreamfleet.coordinator.fleet import Fleet, Send
 from dreamfleet.coordinator.run import Run
@@ -12,15 +14,16 @@ from tests.simulation.worker import Worker
 MOST_HOLDERS = 2
 MOST_ABSENCES = 1  # beats in a row that have seen a lease's batch and do not show it: the next one ends the lease
 # Virtual seconds, each a little longer than the product's own rule, which a wake of either side may overshoot.
-SENT_AGAIN_WITHIN = 3.6  # a batch that was not seen, while its coordinator is awake
-REPEATED_WITHIN = 1.6  # a result without a verdict, while its worker is awake
+SENT_AGAIN_WITHIN = 3.6  # a batch that was not seen, while its coordinator is awake; twice as long each time
+MOST_PATIENCE = 16  # times that
+REPEATED_WITHIN = 8.6  # a result without a verdict, while its worker is awake
 ASKS_WITHIN = 4.0  # a worker that sees another life than it has joined
 
 
 def check_coordinator(fleet: Fleet) -> None:
     """Leases, queue and counts agree with each other, and nothing is kept that nobody needs."""
     wanted, members = fleet._wanted, fleet.members
-    queued = [digest for *_, digest in fleet._queue if digest in wanted]
+    queued = [digest for *_, digest in (*fleet._queue, *fleet._spare) if digest in wanted]
     named = set(queued)
     _require(len(named) == len(queued), "the queue names a job twice")
     in_slack = 0
@@ -67,6 +70,7 @@ class Sendings:
     def __init__(self) -> None:
         self._awake = 0.0
         self._last: dict[tuple[int, int], float] = {}
+        self._times: Counter[tuple[int, int]] = Counter()
 
     def pass_by(self, seconds: float) -> None:
         """It was awake for so long."""
@@ -74,14 +78,18 @@ class Sendings:
 
     def sent(self, fleet: Fleet, send: Send) -> None:
         """A batch has left."""
-        self._last[id(fleet.members[send.identity]), send.number] = self._awake
+        batch = id(fleet.members[send.identity]), send.number
+        self._last[batch] = self._awake
+        self._times[batch] += 1
 
     def check(self, fleet: Fleet) -> None:
         """What a present worker has not seen is sent again before long."""
         for member in fleet.members.values():
             for number in member.unseen if member.present else ():
-                quiet = self._awake - self._last.get((id(member), number), self._awake)
-                _require(quiet <= SENT_AGAIN_WITHIN, "a batch that was not seen is not sent again", "promptness")
+                batch = id(member), number
+                quiet = self._awake - self._last.get(batch, self._awake)
+                patience = SENT_AGAIN_WITHIN * min(2 ** (self._times[batch] - 1), MOST_PATIENCE)
+                _require(quiet <= patience, "a batch that was not seen is not sent again", "promptness")
 
 
 def check_sight(worker: Worker, sees: str | None, since: float, now: float) -> None:
@@ -93,6 +101,9 @@ def check_sight(worker: Worker, sees: str | None, since: float, now: float) -> N
 
 def check_worker(worker: Worker, now: float) -> None:
     """What it keeps is bounded by what it was given, and what it owes is repeated."""
+    held = [job.digest for turn in worker.turns if turn is not None for job, _ in turn.work
+            if job.digest not in turn.unwanted]  # fmt: skip
+    _require(len(held) == len(set(held)), "a worker scores a job in two slots at once", "waste")
     vectors, queued = len(worker.backlog._vectors), len(worker.backlog.queued)
     _require(vectors <= queued + KEPT_VECTORS, "a worker keeps vectors that no job needs", "memory")
     for digest in worker.outbox.digests if worker.nonce is not None and not worker.asking else ():
@@ -112,7 +123,8 @@ def check_rest(fleet: Fleet, run: Run) -> None:
 def check_end(fleet: Fleet, run: Run) -> None:
     """An ended run wants nothing."""
     _require(fleet.open == 0 and fleet.leased == 0, "an ended run wants jobs", "memory")
-    _require(not fleet._queue or not any(digest in fleet._wanted for *_, digest in fleet._queue), "queued at the end")
+    left = [digest for *_, digest in (*fleet._queue, *fleet._spare) if digest in fleet._wanted]
+    _require(not left, "queued at the end")
     _require(not fleet._tags and not fleet._failing, "an ended run keeps books", "memory")
     _require(len(run.slack.collections.uploads) == 0, "an upload is open at the end", "memory")
 

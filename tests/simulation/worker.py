@@ -207,7 +207,9 @@ class Worker:
             return
         self.membership.hear(now)
         self._note(event)
-        for job, why in self.backlog.take_in(event):
+        for digest in event.cancels:
+            self._abandon(digest, now)
+        for job, why in self.backlog.take_in(event, self._held):
             self.outbox.add(Result(job.digest, None, 0, 0.0, why, None))
         judged = [verdict.digest for verdict in event.verdicts]
         owed = self.outbox.digests
@@ -215,10 +217,13 @@ class Worker:
         if self.outbox.digests != [digest for digest in owed if digest not in judged]:
             raise Violation("books", "a verdict does not end the repetition of its own result alone")
         self.uploads.settle(judged)
-        for digest in event.cancels:
-            self._abandon(digest, now)
         if self.membership.draining:
             self.backlog.clear()
+
+    @property
+    def _held(self) -> set[bytes]:
+        turns = [turn for turn in self.turns if turn is not None]
+        return {job.digest for turn in turns for job, _ in turn.work if job.digest not in turn.unwanted}
 
     def _note(self, batch: JobBatch) -> None:
         """A batch counts once in a numbering; so many times may each of its jobs be begun."""

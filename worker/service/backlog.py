@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
+from collections.abc import Collection
 
 from dreamfleet.common.messages import Job, JobBatch, TaskSpec, VectorPart
 
@@ -36,8 +37,12 @@ class Backlog:
         """Digests of the queued jobs."""
         return list(self._jobs)
 
-    def take_in(self, batch: JobBatch) -> list[tuple[Job, str]]:
-        """Queue a batch's jobs once; those whose digest is not theirs come back with what is wrong."""
+    def take_in(self, batch: JobBatch, held: Collection[bytes] = ()) -> list[tuple[Job, str]]:
+        """Queue a batch's jobs once; those whose digest is not theirs come back with what is wrong.
+
+        Those that a slot has in hand (`held`, by digest) are not queued: a coordinator that was killed as it opened a
+        generation gives its jobs again in its next life.
+        """
         if batch.number <= self.seen or batch.number in self._ahead:
             return []
         self._ahead.add(batch.number)
@@ -53,7 +58,7 @@ class Backlog:
             spec = self._spec.at(job.temperature)
             if job.digest != spec.digest(job.kind, job.vector, job.seeds) or job.task != spec.task:
                 refused.append((job, "the job's digest is not of its content"))
-            else:
+            elif job.digest not in held:
                 self._jobs[job.digest] = job
         self._trim()
         return refused

@@ -153,13 +153,13 @@ class JoinedRun:
             self._line.inbox.dropped["foreign coordinator"] += 1
             return
         self._membership.hear(monotonic())
-        for job, why in self._backlog.take_in(batch):
+        for digest in batch.cancels:
+            self._slots.abandon(digest)
+        for job, why in self._backlog.take_in(batch, self._slots.held):
             self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
         judged = [verdict.digest for verdict in batch.verdicts]
         self._outbox.settle(judged)
         self._uploads.settle(judged)
-        for digest in batch.cancels:
-            self._slots.abandon(digest)
         if self._membership.draining:  # jobs that were on their way: the next beat shows that they are not here
             self._backlog.clear()
 

@@ -94,6 +94,11 @@ class Slot:
         return [job for turn in list(self._turns)[1:] for job in turn.jobs]
 
     @property
+    def held(self) -> set[bytes]:
+        """Digests of all its jobs that are wanted."""
+        return {job.digest for turn in self._turns for job in turn.jobs if job.digest not in turn.unwanted}
+
+    @property
     def idle(self) -> bool:
         """Ready, with nothing to do."""
         return self.ready and not self._turns

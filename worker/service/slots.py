@@ -109,6 +109,11 @@ class Slots:
         for slot in self._slots:
             slot.check(now, gap)
 
+    @property
+    def held(self) -> set[bytes]:
+        """Digests of the jobs that lie in a slot, begun or not, and are wanted."""
+        return set().union(*(slot.held for slot in self._slots))
+
     def abandon(self, digest: bytes) -> None:
         """A job is not wanted any more."""
         for slot in self._slots:

@@ -52,6 +52,12 @@ def test_a_cancelled_job_is_not_started():
     assert backlog.take(1) == [(job(1), VECTOR)]
 
 
+def test_a_job_that_a_slot_has_in_hand_is_not_queued_again():
+    backlog = Backlog(SPEC)
+    backlog.take_in(batch(1, (job(0), job(1))), {job(0).digest})
+    assert backlog.take(5) == [(job(1), VECTOR)]
+
+
 def test_a_job_whose_digest_is_of_something_else_is_refused():
     backlog = Backlog(SPEC)
     wrong = dataclasses.replace(job(0), seeds=(5,))
