@@ -11,6 +11,7 @@ from tests.simulation.disk import MemoryJournal
 from tests.simulation.mutants import MUTANTS
 from tests.simulation.schedule import KINDS, Schedule, Shape, draw
 from tests.simulation.shrink import Shrinker
+from tests.simulation.truth import STEPS
 from tests.simulation.world import play
 
 
@@ -49,7 +50,8 @@ def test_a_fleet_that_nobody_disturbs_wastes_next_to_nothing():
         calm = replace(draw(1, number), faults=())
         outcome = play(replace(calm, shape=replace(calm.shape, ends=True)))
         assert outcome.violation is None
-        assert outcome.scored <= 1.01 * outcome.counted
+        tried = STEPS * (calm.shape.workers - 1)  # a copy of a job each, for it shows how soon a newcomer is
+        assert outcome.scored <= 1.01 * outcome.counted + tried
 
 
 def test_what_fails_is_cut_down_to_the_faults_that_it_takes():
@@ -71,5 +73,6 @@ def test_what_the_product_raises_is_a_violation_with_its_place(monkeypatch):
 
 
 def test_the_simulated_journal_has_all_that_the_real_one_has():
-    real = {name for name in vars(Journal) if not name.startswith("_")} - {"create"}
+    on_disk = {"create", "save_copy", "overwritten", "check_incarnation"}
+    real = {name for name in vars(Journal) if not name.startswith("_")} - on_disk
     assert real <= set(vars(MemoryJournal))
