@@ -43,7 +43,7 @@ def open_regular(path: Path, most: int = sys.maxsize) -> Iterator[BufferedReader
     except ValueError as error:  # a NUL, or half a surrogate pair
         raise OSError(errno.EINVAL, "no file can have this name") from error
     with open(number, "rb") as file:  # noqa: PTH123 - it is open
-        _check_regular(os.fstat(number), most)
+        _check(os.fstat(number), most)
         yield file
 
 
@@ -55,11 +55,22 @@ def open_growing(path: Path) -> BinaryIO:
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     file = open(os.open(path, flags, 0o666), "ab")  # noqa: SIM115, PTH123 - it is open, and the caller's
     try:
-        _check_regular(os.fstat(file.fileno()), sys.maxsize)
+        _check(os.fstat(file.fileno()), sys.maxsize)
     except OSError:
         file.close()
         raise
     return file
+
+
+def check_regular(path: Path) -> None:
+    """`OSError` for what is no file that can be read to its end; it is looked at, and not opened.
+
+    Where SQLite has a file open, closing another descriptor of it would end SQLite's locks.
+    """
+    try:
+        _check(path.stat(), sys.maxsize)
+    except ValueError as error:  # a NUL, or half a surrogate pair
+        raise OSError(errno.EINVAL, "no file can have this name") from error
 
 
 def read_regular(path: Path, most: int) -> bytes:
@@ -94,7 +105,7 @@ def is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112 - as above
 
 
-def _check_regular(found: os.stat_result, most: int) -> None:
+def _check(found: os.stat_result, most: int) -> None:
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, "it is a folder")
     if not stat.S_ISREG(found.st_mode):

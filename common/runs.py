@@ -22,7 +22,7 @@ from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.fields import OPTIONAL, written
-from dreamfleet.common.files import is_file, is_folder, open_regular
+from dreamfleet.common.files import check_regular, is_file, is_folder
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import Between, Count, Packages, TaskSpec
@@ -363,8 +363,8 @@ def _connect_read_only(path: Path) -> sqlite3.Connection:
     # A finished journal on a read-only disk has no shared-memory file to map; nobody writes it either.
     immutable = "" if os.access(path.parent, os.W_OK) else "&immutable=1"
     try:
-        with open_regular(path):  # SQLite would wait for what a pipe says
-            connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{immutable}", uri=True)
+        check_regular(path)  # SQLite would wait for what a pipe says
+        connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{immutable}", uri=True)
     except (sqlite3.Error, OSError) as error:
         raise JournalError(f"{path} cannot be read: {error}") from error
     try:
