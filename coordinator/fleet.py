@@ -446,12 +446,12 @@ class Fleet:
         return given
 
     def _able(self, wanted: Wanted, loads: Mapping[str, int]) -> list[str]:
-        """Who of these may be given this job: not where it failed, unless nobody else is there.
+        """Who of these may be given this job: not where it failed, unless nobody else is there or about to be.
 
-        A killed child must not hang a run.
+        A killed child must not hang a run, nor may a stranger who only said hello.
         """
         able = [name for name in loads if name not in wanted.failed]
-        there = (name for name, member in self.members.items() if member.present and member.capacity)
+        there = (name for name, member in self.members.items() if member.present and member.known)
         return list(loads) if not able and all(name in wanted.failed for name in there) else able
 
     def _turn(self, loads: Mapping[str, int]) -> tuple[list[tuple[int, bytes]], bool] | None:

@@ -59,8 +59,8 @@ class Judging(Bench):
     def tracks(self):
         """The validation tracks that each generation's mean was driven on."""
         found = {}
-        for job in self.judged:
-            found.setdefault(job.generation, []).append(job.seeds[0] - VALIDATION.start)
+        for job in self.judged:  # one may be given twice, to a worker that shows so how soon it is
+            found.setdefault(job.generation, set()).add(job.seeds[0] - VALIDATION.start)
         return found
 
     def outcome(self):

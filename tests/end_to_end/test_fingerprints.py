@@ -30,7 +30,8 @@ def stranger(processes, tmp_path):
     script.write_text(
         "import sys\nimport dreamfleet.worker.service.admission as admission, dreamfleet.worker.service.post as post\n"
         f"admission.fingerprint = post.fingerprint = lambda *_: {OTHER!r}\n"
-        "from dreamfleet.common.cli import main\nsys.exit(main(sys.argv[1:]))\n"
+        "from dreamfleet.common.cli import main\n"
+        "if __name__ == '__main__':\n    sys.exit(main(sys.argv[1:]))\n"  # its children import it too
     )
 
     def start(*more):

@@ -53,7 +53,7 @@ def test_the_mean_is_evaluated_on_schedule_and_at_the_end_and_the_target_ends_th
         assert max(each.mean for each in evaluations) >= -4
         assert "reached" in run.ended
         seeds = [each.seed for each in run.results(4, 0, "evaluate")]
-    assert seeds == [20000, 20001, 20002]
+    assert seeds[:3] == [20000, 20001, 20002], "those that confirm come later"
     assert "reached" in out
 
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
+from functools import cache
 from time import monotonic
 
 import numpy as np
@@ -27,8 +28,13 @@ from tests.support.samples import VECTOR, job
 TIMEOUT = 60
 
 
+@cache
+def hash_of(bundle):
+    return hash_file(bundle)
+
+
 def spec(task, bundle):
-    return TaskSpec(task=task, bundle=hash_file(bundle), horizon=100, patience=0)
+    return TaskSpec(task=task, bundle=hash_of(bundle), horizon=100, patience=0)
 
 
 class Harness:
@@ -267,8 +273,9 @@ def test_a_child_that_is_stopped_as_it_starts_is_replaced_after_a_generous_while
     assert slot.slot.pid != pid
 
 
-def test_a_slot_waits_a_while_for_descriptors_and_then_says_what_is_lacking(harness):
+def test_a_slot_waits_a_while_for_descriptors_and_then_says_what_is_lacking(harness, random_bundle):
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    hash_of(random_bundle.path)
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
     try:
         slot = harness(tasks.TOY)
