@@ -251,10 +251,10 @@ def test_several_runs_on_one_router_never_see_each_other_and_a_worker_serves_the
 
 
 def test_on_a_small_busy_fleet_an_evaluation_is_finished_within_two_generations(processes, random_bundle):
-    """Two slots, 64 episodes a generation, and an evaluation of 12 tracks after generation 1."""
+    """Two slots, 32 episodes a generation, and an evaluation of 6 tracks after generation 1."""
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 16, "--episodes", 4,
-        "--evaluate-every", 2, "--evaluation-episodes", 12, "--confirm-episodes", 0, "--generations", 5,
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 8, "--episodes", 4,
+        "--evaluate-every", 2, "--evaluation-episodes", 6, "--confirm-episodes", 0, "--generations", 4,
     )  # fmt: skip
     for name in ("a", "b"):
         processes.worker("--task", tasks.SLOW_TOY, "--name", name)
