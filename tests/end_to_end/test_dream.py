@@ -20,8 +20,8 @@ HEATED_GENERATIONS = 14
 def begin(processes, bundle, name):
     return processes.coordinator(
         "--preset", "dream", "--bundle", bundle.path, "--population", POPULATION, "--episodes", EPISODES,
-        "--horizon", 300, "--generations", GENERATIONS, "--evaluate-every", 2, "--evaluation-episodes", 2, "--confirm-episodes", 2,
-        name=name,
+        "--horizon", 300, "--generations", GENERATIONS, "--evaluate-every", 2, "--evaluation-episodes", 2,
+        "--confirm-episodes", 2, name=name,
     )  # fmt: skip
 
 
