@@ -15,15 +15,17 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+from dreamfleet.common.client import Client
 from dreamfleet.worker.bench.naps import NAPS
 from tests.support.bundles import write_random_bundle
 from tests.support.hosts import new_host
 from tests.support.processes import processes_in
 
 NAPPING = ("--task", NAPS, "--population", "8", "--episodes", "2")  # 16 naps of 50 ms
-DREAMING = ("--preset", "dream", "--population", "32", "--episodes", "4", "--horizon", "300")
+DREAMING = ("--preset", "dream", "--population", "16", "--episodes", "4", "--horizon", "200")
 BADS = ("slow_link", "slow_core", "flapping")
-BLOCKS, SECONDS, SETTLING = 5, 12.0, 6.0
+BLOCKS, SECONDS, SETTLING = 5, 20.0, 6.0
+LIFE = 6  # seconds of a flapping host: it joins after about three
 TBF = ("root", "tbf", "rate", "256kbit", "burst", "4kb", "latency", "2s")
 
 
@@ -59,30 +61,45 @@ class Bench:
         device = f"{self._host.name}-a"
         for inside, end in (((), device), (self._host.inside, f"{self._host.name}-b")):
             subprocess.run([*inside, "tc", "qdisc", "replace", "dev", end, *TBF], check=True)
-        with _ending(self.worker("bad", endpoint=self._near, inside=self._host.inside)):
+        with _ending(self.worker("bad", endpoint=self._near, inside=self._host.inside)) as bad:
+            bad.wait_for("joined run")
             yield
 
     @contextmanager
     def slow_core(self):
-        busy = subprocess.Popen(["taskset", "-c", "1", sys.executable, "-c", "while True: pass"])
-        try:
-            with _ending(self.worker("bad", inside=("taskset", "-c", "1", "chrt", "--idle", "0"))):
-                yield
-        finally:
-            busy.kill()
-            busy.wait()
+        with _ending(self.worker("bad", inside=("taskset", "-c", "1", "chrt", "--idle", "0"))) as bad:
+            bad.wait_for("joined run", timeout=120)
+            yield
 
     @contextmanager
     def flapping(self):
-        again = ("sh", "-c", 'while true; do timeout -s KILL 2.5 "$@"; done', "sh")
-        with _ending(self.worker("bad", inside=again)):
+        again = ("sh", "-c", f'while true; do timeout -s KILL {LIFE} "$@"; done', "sh")
+        with _ending(self.worker("bad", inside=again)) as bad:
+            bad.wait_for("joined run")
             yield
+
+    def finished(self):
+        """Jobs that the bad one has brought back in this life."""
+        with Client((self._processes.endpoint,)) as client:
+            return sum(each.finished for each in client.workers("run") if each.worker.startswith("bad"))
+
+
+@contextmanager
+def busy_core(busy):
+    """Core 1 is busy all the time, in both kinds of blocks: what it costs the coordinator is not the worker's doing."""
+    process = subprocess.Popen(["taskset", "-c", "1", sys.executable, "-c", "while True: pass"]) if busy else None
+    try:
+        yield
+    finally:
+        if process is not None:
+            process.kill()
+            process.wait()
 
 
 @contextmanager
 def _ending(process):
     try:
-        yield
+        yield process
     finally:
         os.killpg(process.popen.pid, signal.SIGKILL)
         process.popen.wait()
@@ -95,16 +112,18 @@ def measure(folder, kinds, dreaming, blocks, seconds):
     settings, tasks = (DREAMING, ()) if dreaming else (NAPPING, ("--task", NAPS))
     bundle = write_random_bundle(folder / "random.zip").path
     for kind in kinds:
-        with new_host() as host, processes_in(folder / kind) as processes:
+        with new_host() as host, processes_in(folder / kind) as processes, busy_core(kind == "slow_core"):
             bench = Bench(processes, bundle, settings, host, tasks)
-            alone, both = [], []
+            alone, both, brought = [], [], []
             for _ in range(blocks):
                 alone.append(bench.rate(seconds))
                 with getattr(bench, kind)():
                     time.sleep(SETTLING)
                     both.append(bench.rate(seconds))
+                    brought.append(bench.finished())
         pair = statistics.median(alone), statistics.median(both)
-        figures[kind] = {"alone": round(pair[0], 3), "both": round(pair[1], 3), "ratio": round(pair[0] / pair[1], 3)}
+        figures[kind] = {"alone": round(pair[0], 3), "both": round(pair[1], 3), "ratio": round(pair[0] / pair[1], 3),
+                         "brought": brought}  # fmt: skip
         print(kind, figures[kind], file=sys.stderr, flush=True)
     return figures
 
