@@ -27,7 +27,7 @@ class LongRun:
         folder.mkdir()
         settings = replace(SETTINGS, population=4, evaluate_every=1, collect_every=0)
         self.run = Run(Journal.create(folder, settings, bundle), settings, LimitsConfig(), Fleet(1.0), 0.0)
-        self.now = 0.0
+        self.now, self.seen = 0.0, 0
         self.run.exchange.admit(HelloRequest(1, 1, "0", A, (settings.task.task,), "f", 1), self.now)
 
     def cost(self):
@@ -37,6 +37,7 @@ class LongRun:
             self.now += 0.01
             self.run.exchange.beat(A, self.beat(), self.now)
             for send in self.run.exchange.dispatch(self.now):
+                self.seen = max(self.seen, send.number)
                 self.answer(send.content.work)
             self.run.advance(self.now)
             self.run.commit()
@@ -48,7 +49,7 @@ class LongRun:
     def beat(self):
         head = {"run_uid": self.run.uid, "incarnation": 1, "nonce": "n", "drawn_by": "-"}
         return Beat(
-            **head, seen=10**9, capacity=8, slots=8, queued=(), running=(), unacked=(), load=0.0, steps_per_second=0.0
+            **head, seen=self.seen, capacity=8, slots=8, queued=(), running=(), unacked=(), load=0.0, steps_per_second=0.0
         )
 
     def answer(self, work):
