@@ -49,7 +49,15 @@ class LongRun:
     def beat(self):
         head = {"run_uid": self.run.uid, "incarnation": 1, "nonce": "n", "drawn_by": "-"}
         return Beat(
-            **head, seen=self.seen, capacity=8, slots=8, queued=(), running=(), unacked=(), load=0.0, steps_per_second=0.0
+            **head,
+            seen=self.seen,
+            capacity=8,
+            slots=8,
+            queued=(),
+            running=(),
+            unacked=(),
+            load=0.0,
+            steps_per_second=0.0,
         )
 
     def answer(self, work):

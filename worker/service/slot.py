@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import queue
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.messages import Job, Result, TaskSpec
 from dreamfleet.common.printable import shortened
 from dreamfleet.worker.service.child import Ready
@@ -61,8 +61,12 @@ class Slot:
         events: queue.SimpleQueue[tuple[str, Any]],
         announced: tuple[str, ...],
         memory_limit: int = 0,
+        renew: Callable[[], object] = lambda: None,
     ) -> None:
-        """`announced` are the tasks that its worker lets itself be asked for; `memory_limit` in bytes; 0: none."""
+        """`announced` are the tasks that its worker lets itself be asked for; `memory_limit` in bytes; 0: none.
+
+        `renew` sees that `bundle` is there and whole, after a child that could not start: others write into the cache.
+        """
         self.number = number
         self.ready = False
         self.drawn_by = "-"
@@ -71,6 +75,7 @@ class Slot:
         self._announced = announced
         self._events = events
         self._memory_limit = memory_limit
+        self._renew = renew
         self._turns: deque[Turn] = deque()
         self._short = False  # the last turn was
         self._progress = (0, 0.0)  # steps, and when they were last seen to grow; while it starts, when that began
@@ -242,12 +247,18 @@ class Slot:
         self._sent = 0
         number, life, events = self.number, self._life, self._events
         try:
+            if self._failed_starts:
+                self._renew()
             self._child = ChildProcess(
                 self._spec,
                 self._bundle,
                 self._announced,
                 lambda word: events.put(("slot", SlotEvent(number, life, word))),
             )
+        except BundleError as error:
+            self._count_failed_start(str(error))
+            self._vacate(RESPITE)
+            return
         except (OSError, RuntimeError) as error:  # no descriptor, process, thread or memory left, no place for a file
             self._count_failed_start(f"{error}; {REMEDY}")
             log.warning("slot %d cannot start a process yet: %s", number, error)

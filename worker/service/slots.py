@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import queue
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ class Slots:
         events: queue.SimpleQueue[tuple[str, Any]],
         announced: tuple[str, ...],
         memory_limit: int,
+        renew: Callable[[], object] = lambda: None,
     ) -> None:
         """`RefusedError` for a task that is not `announced`; `memory_limit` in bytes a slot; 0: none."""
         check_announced(spec.task, announced)
@@ -38,7 +40,7 @@ class Slots:
         self._slots: list[Slot] = []
         try:
             for number in range(count):
-                self._slots.append(Slot(number, spec, bundle, events, announced, memory_limit))
+                self._slots.append(Slot(number, spec, bundle, events, announced, memory_limit, renew))
         except BaseException:
             self.stop()  # children that outlived us here would be waited for at the interpreter's end, and wait too
             raise

@@ -98,7 +98,10 @@ class Worker:
             try:
                 if bundle is not None:
                     check_world(bundle, self._hello.tasks)
-                slots = Slots(self._slot_count, admission.spec, path, self._events, self._hello.tasks, memory)
+                slots = Slots(
+                    self._slot_count, admission.spec, path, self._events, self._hello.tasks, memory,
+                    lambda: self._obtain_bundle(line.session, admission) if bundle else None,
+                )  # fmt: skip
                 stack.callback(slots.stop)
                 JoinedRun(line, admission, self._membership, slots, self._events).serve()
             except RefusedError as error:

@@ -11,6 +11,7 @@ import sys
 import threading
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from time import monotonic
 
 import numpy as np
@@ -40,10 +41,10 @@ def spec(task, bundle):
 class Harness:
     """A slot and its worker's queue."""
 
-    def __init__(self, task, bundle, memory_limit):
+    def __init__(self, task, bundle, memory_limit, **more):
         self.spec = spec(task, bundle)
         self.events = queue.SimpleQueue()
-        self.slot = Slot(0, self.spec, bundle, self.events, tasks.ALL, memory_limit)
+        self.slot = Slot(0, self.spec, bundle, self.events, tasks.ALL, memory_limit, **more)
 
     def wait_ready(self):
         while not self.slot.ready:
@@ -85,8 +86,8 @@ class Harness:
 def harness(random_bundle):
     made = []
 
-    def make(task, bundle=None, memory_limit=0):
-        made.append(Harness(task, bundle or random_bundle.path, memory_limit))
+    def make(task, bundle=None, memory_limit=0, **more):
+        made.append(Harness(task, bundle or random_bundle.path, memory_limit, **more))
         return made[-1]
 
     yield make
@@ -386,3 +387,15 @@ def test_a_bundle_that_was_swapped_is_never_scored_with(harness, random_bundle, 
     slot.slot.handle(slot.gone())  # another child starts
     with pytest.raises(DreamfleetError, match=r"a slot cannot start: BundleError: .*is not the world model that is w"):
         slot.wait_ready()
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(b"no bundle")])
+def test_a_bundle_that_others_took_away_or_damaged_is_obtained_again(harness, random_bundle, tmp_path, damage):
+    path = tmp_path / "cached.zip"
+    shutil.copyfile(random_bundle.path, path)
+    slot = harness(tasks.TOY, path, renew=lambda: shutil.copyfile(random_bundle.path, path))
+    before = slot.score()
+    damage(path)
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    slot.slot.handle(slot.gone())
+    assert slot.score().fitness == before.fitness
