@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import errno
 import logging
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points, version
 from typing import NoReturn, Protocol
 
@@ -64,7 +67,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        return run_verb({point.name: point for point in entry_points(group=GROUP)}, words)
+        code = run_verb({point.name: point for point in entry_points(group=GROUP)}, words)
+        sys.stdout.flush()
+        return code
     except DreamfleetError as error:
         print(f"dreamfleet: {one_line(str(error))}", file=sys.stderr)
         return error.exit_code
@@ -72,8 +77,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("dreamfleet: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # `dreamfleet runs list | head`
-        sys.stderr.close()
+        _forget_stdout()
         return 0
+    except OSError as error:
+        if error.errno != errno.ENOSPC or error.filename is not None:
+            raise
+        _forget_stdout()
+        print("dreamfleet: what this verb prints could not be written: no space left", file=sys.stderr)
+        return 1
+
+
+def _forget_stdout() -> None:
+    """What waits there cannot be written, and the interpreter would try again at its end."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:

@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Collection, Mapping, Sequence
 
-from dreamfleet.common.printable import one_line, printable, printable_lines
+from dreamfleet.common.printable import one_line, printable_lines
 
 WIDEST = 10_000  # columns: where nothing is cut any more
 
@@ -33,7 +33,11 @@ def print_rows(rows: Sequence[Mapping[str, object]], right: Collection[str] = ()
         _print_table(rows, right)
         return
     for line in (list(rows[0]), *(row.values() for row in rows)):
-        print("\t".join(one_line(str(value)) for value in line))  # noqa: T201
+        print("\t".join(_cell(value) for value in line))  # noqa: T201
+
+
+def _cell(value: object) -> str:
+    return "-" if value is None else one_line(str(value))
 
 
 def _print_table(rows: Sequence[Mapping[str, object]], right: Collection[str]) -> None:
@@ -46,7 +50,7 @@ def _print_table(rows: Sequence[Mapping[str, object]], right: Collection[str]) -
     for name in rows[0]:
         table.add_column(name, justify="right" if name in right else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*(Text(printable(str(value))) for value in row.values()))  # no markup: they may come from outside
+        table.add_row(*(Text(_cell(value)) for value in row.values()))  # no markup: they may come from outside
     console = Console()
     needed = Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum
     Console(width=max(console.width, needed)).print(table)

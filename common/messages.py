@@ -21,6 +21,7 @@ MAX_PART = 40 * 1024  # room for the envelope around a part's bytes
 MAX_UPLOAD = 32 << 20  # a rollout of 1000 steps is 12 MB (64x64) or 28 MB (96x96) before it is compressed
 MAX_OPTIONS = 8_000  # characters: a status and a controller carry them too
 MAX_LEASES = 1024  # of one worker: so that a beat, which names them all, stays under MAX_MESSAGE
+MOST_BATCHES = 2**53  # of one life of a coordinator: no worker comes near it
 MOST_SLOTS = 4096  # of one worker
 MAX_TEXT = 2000  # characters: of an error, of why a worker is refused, of a fingerprint
 TAG_BYTES = 8
@@ -188,7 +189,7 @@ class Beat(Message):
     SCHEMA: ClassVar[str] = "beat"
 
     nonce: Word
-    seen: Count  # every batch up to this number has arrived
+    seen: Annotated[int, Between(0, MOST_BATCHES)]  # every batch up to this number has arrived
     capacity: Annotated[int, Between(0, MAX_LEASES)]  # slots x the task's width
     slots: Annotated[int, Between(0, MOST_SLOTS)]
     queued: Annotated[tuple[Tag, ...], Length(0, MAX_LEASES)]

@@ -34,6 +34,7 @@ CONTROLLER = "controller.npz"
 ARCHIVE = "archive"
 ROLLOUTS = "rollouts"
 CONFIRMED = "confirmed"  # the fact's name
+ENDING = "ending"  # the fact's name: the limit that was reached, while the last evaluations are waited for and after
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,7 @@ def told(found: StoredEvaluation | StoredConfirmation | None) -> str:
         return "the last mean; it was not evaluated"
     score = f"generation {found.generation}'s mean scored {found.mean:.1f} ± {found.error:.1f} (standard error)"
     if isinstance(found, StoredConfirmation):
-        return f"{score} on {found.episodes} fresh validation tracks"
+        return f"{score} on {found.episodes} fresh validation tracks; confirmed: they took no part in its choice"
     return f"{score} on {found.episodes} validation tracks; provisional: it is the best of several looks"
 
 
@@ -349,6 +350,23 @@ def open_run(runs_dir: Path, name: str) -> RunFolder:
         names = ", ".join(each.name for each in run_paths(runs_dir)) or "none yet"
         raise JournalError(f"no run {name!r} in {runs_dir}; there are: {names}")
     return RunFolder(path)
+
+
+def check_single(folder: Path) -> None:
+    """`JournalError` for a run's folder that holds other runs, or is a link: neither is moved or deleted."""
+    if folder.is_symlink():
+        raise JournalError(f"{folder} is a link: move or delete what it leads to by hand")
+    if inside := ", ".join(each.name for each in run_paths(folder)):
+        raise JournalError(f"{folder} holds other runs ({inside}): move them away first")
+
+
+@contextmanager
+def translated(folder: Path) -> Iterator[None]:
+    """What the system refuses to do with a run's folder, as one line."""
+    try:
+        yield
+    except OSError as error:
+        raise JournalError(f"{folder} cannot be moved or deleted: {error.strerror or error}") from error
 
 
 def run_paths(runs_dir: Path) -> Iterator[Path]:

@@ -66,8 +66,9 @@ class RunConfig:
     evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation tracks")
     confirm_episodes: int | None = option(
         None,
-        "confirm what is reported as the run ends, on so many fresh tracks (default as many as of an evaluation, 2 at "
-        "least); 0: never",
+        "confirm what is reported as the run ends, after its limits: the best evaluated means drive about twice as "
+        "many tracks in rounds, then the one that is left so many fresh ones, which give its score (default as many "
+        "as of an evaluation, 2 at least); 0: never",
     )
     collect_every: int = option(0, "keep rollouts of the mean for training, every so many generations; 0: never")
     collect_episodes: int = option(8, "drives that are kept each time, on training tracks")
@@ -247,7 +248,7 @@ class NetworkConfig:
     listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
     connect: tuple[str, ...] = option((), "connect to these stand-alone routers, as well where --listen is given")
     beat: float = option(1.0, "seconds between a worker's beats")
-    evaluation_share: float = option(0.25, "of a busy fleet's time that evaluations get; 0: only idle slots")
+    evaluation_share: float = option(0.25, "of a busy fleet's time that evaluations get, 0 to 0.9; 0: only idle slots")
     mixed: bool = option(
         False,
         "take results of hosts whose CPU features or package versions differ from those of the first accepted result; "

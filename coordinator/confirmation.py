@@ -64,6 +64,17 @@ class Confirmation:
         return len(self._scores), len(self._digests)
 
     @property
+    def round(self) -> str:
+        """The open round in words."""
+        tracks = len(self._digests) // len(self._standing)
+        if len(self._standing) == 1:
+            return (
+                f"confirming: generation {self._standing[0].generation}'s mean on {tracks} fresh tracks, for its score"
+            )
+        names = ", ".join(str(each.generation) for each in self._standing)
+        return f"confirming: the means of generations {names} on {tracks} more tracks each; the better half goes on"
+
+    @property
     def in_progress(self) -> bool:
         """Whether the open round still wants scores."""
         return len(self._scores) < len(self._digests)

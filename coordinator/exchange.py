@@ -104,6 +104,10 @@ class Exchange:
             return
         self._uploads.add(worker, part, now)
 
+    def dismiss(self, worker: str) -> None:
+        """Forget a worker; one that lives says hello again."""
+        self._fleet.dismiss(worker)
+
     def tick(self, now: float) -> None:
         """Let time pass: departures, silences, uploads that stopped."""
         self._fleet.tick(now)

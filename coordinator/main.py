@@ -9,10 +9,11 @@ from pathlib import Path
 from time import monotonic
 
 from dreamfleet.common.bundle import Bundle, find_bundle
-from dreamfleet.common.errors import JournalError
+from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import Intervals
-from dreamfleet.common.runs import BUNDLE, JOURNAL, RunSettings, open_run, run_lock
+from dreamfleet.common.processes import spoken
+from dreamfleet.common.runs import ARCHIVE, BUNDLE, JOURNAL, RunSettings, open_run, run_lock
 from dreamfleet.common.session import Network
 from dreamfleet.coordinator.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.custody import Custody
@@ -40,6 +41,8 @@ class RunRequest:
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
     """Serve a new or continued run until it ends or is stopped; `on_stoppable` is handed the way to stop it."""
     folder = request.runs_dir / check_run_name(request.name)
+    if request.config is not None and request.name == ARCHIVE:
+        raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
     settings, bundle = _settle(request, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -54,7 +57,13 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         service = _service(request, custody, served)
         on_stoppable(service.stop)
         fleet, mixed = Fleet(request.network.beat, request.network.evaluation_share), request.network.mixed
-        return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), mixed=mixed))
+        try:
+            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), mixed=mixed))
+        except ConnectionFailedError as error:
+            if request.config is None:
+                raise
+            again = spoken("coordinator", "--resume", request.name, "--runs-dir", request.runs_dir)
+            raise ConnectionFailedError(f"{error}; the run is made, and begins with: {again}") from error
 
 
 def _service(request: RunRequest, custody: Custody, bundle: ServedBundle | None) -> Service:

@@ -6,11 +6,13 @@ of a generation may leave before it: a coordinator that dies in between asks for
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from pathlib import Path
 
 from dreamfleet.common.heat import deciding_evaluation
 from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs import ENDING, RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.exchange import Exchange
@@ -48,7 +50,7 @@ class Run:
         self._untold: list[StoredGeneration] = []
         if dropped := journal.drop_excessive(settings.task.horizon):
             fleet.notes.append(f"{dropped} results of an older version are too large to count: asked for again")
-        self._ending = False  # a limit is reached: only what is in the slack is waited for
+        self._ending = self._reached()  # the limit that is reached: only what is in the slack is waited for
         closed, evaluations = journal.closed()
         self.history = History(closed)
         self.slack = Slack(journal, settings, self.uid, self.history, evaluations)
@@ -150,17 +152,18 @@ class Run:
     def _waiting(self) -> bool:
         """Whether the run is ending, or the next generation's temperature hangs on an evaluation in progress."""
         deciding = deciding_evaluation(self.settings, self.generation.number + 1)
-        return self._ending or (self.slack.evaluations.awaits(deciding) and self.generation.complete)
+        return self._ending is not None or (self.slack.evaluations.awaits(deciding) and self.generation.complete)
 
     def _begin(self, now: float) -> None:
         generation = self.generation
         self.fleet.begin(generation.number)
         work = self.slack.begin(self._generations.mean, now)
-        if self._stop_reason(generation) is None or generation.done:
+        if self._ending is None and not generation.done and (reason := self._stop_reason(generation)):
+            self._end_by(reason)
+        if self._ending is None:
             self._journal.drop_fact("ended")
             self.fleet.offer([*work, *generation.missing])
         else:
-            self._ending = True
             self.fleet.offer(work)
             self._finish()
             if self.ended is not None:
@@ -183,7 +186,7 @@ class Run:
         self.fleet.begin(generation.number)
         if reason:
             self.fleet.withdraw("score")
-            self._ending = True
+            self._end_by(reason)
         else:
             self.fleet.offer(generation.missing)
 
@@ -200,14 +203,25 @@ class Run:
 
     def _finish(self) -> None:
         """Where a limit is reached and its last evaluations are in: confirm what is reported, then end."""
-        if not self._ending or self.slack.in_progress or self.ended is not None:
+        if self._ending is None or self.slack.in_progress or self.ended is not None:
             return
         if work := self.slack.confirm():
+            self.fleet.notes.append(self.slack.round)
             self.fleet.offer(work)
         else:
             self._end()
 
+    def _end_by(self, reason: str) -> None:
+        """A limit is reached. It is written with what reached it: by the last evaluations it may look otherwise."""
+        self._ending = reason
+        self._journal.set_fact(ENDING, json.dumps([reason, asdict(self.limits)]))
+
+    def _reached(self) -> str | None:
+        """The limit that an earlier life reached; `None` where this one has other limits."""
+        reason, limits = json.loads(self._journal.fact(ENDING) or "[null, null]")
+        return reason if limits == asdict(self.limits) else None
+
     def _end(self) -> None:
-        self.ended = self._stop_reason(self.generation) or "stopped"
+        self.ended = self._ending or "stopped"
         self._journal.set_fact("ended", self.ended)
         self.slack.report.finish()

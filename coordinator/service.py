@@ -149,7 +149,13 @@ class Service:
 
     def _put(self, session: zenoh.Session, sends: list[Send]) -> None:
         for send in sends:
-            session.put(keys.job(self._name, send.identity), self._batch(send), encoding=encoding(JobBatch))
+            try:
+                batch = self._batch(send)
+            except MalformedError as error:  # what this worker said led to it
+                self._mishaps.note("batch", error, send.identity)
+                self._exchange.dismiss(send.identity)
+                continue
+            session.put(keys.job(self._name, send.identity), batch, encoding=encoding(JobBatch))
 
     def _write_notes(self) -> None:
         for note in self._exchange.take_notes():

@@ -50,6 +50,11 @@ class Slack:
         """Episodes of the confirmation's open round: done, wanted."""
         return (0, 0) if self._confirmation is None else self._confirmation.progress
 
+    @property
+    def round(self) -> str:
+        """The confirmation's open round, in words."""
+        return "" if self._confirmation is None else self._confirmation.round
+
     def begin(self, mean: bytes, now: float) -> list[Work]:
         """Continue where the last incarnation ended: what is reported, and the missing jobs."""
         if (last := self._history.last) is not None:

@@ -114,7 +114,7 @@ def _check_target(limits: LimitsConfig, evaluate_every: int) -> None:
 
 
 def _refuse_frozen(args: argparse.Namespace) -> None:
-    if flags := [each.name for each in fields(RunConfig) if each.name in args.given]:
+    if flags := [f"--{each.name.replace('_', '-')}" for each in fields(RunConfig) if each.name in args.given]:
         raise UsageError(
             f"{', '.join(flags)}: frozen with run {args.resume}; `dreamfleet fork {args.resume}` begins another run "
             "from it"

@@ -6,7 +6,7 @@ import argparse
 
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.runs import ARCHIVE, open_run, run_lock
+from dreamfleet.common.runs import ARCHIVE, check_single, open_run, run_lock, translated
 from dreamfleet.common.site import offer
 
 SUMMARY = "move a run that nobody serves into the archive"
@@ -26,7 +26,8 @@ def run(args: argparse.Namespace) -> int:
     source, target = args.runs_dir / args.run_name, args.runs_dir / ARCHIVE / args.run_name
     if target.exists():
         raise JournalError(f"{target} exists; rename or delete it first")
-    with run_lock(source):
+    check_single(source)
+    with run_lock(source), translated(source):
         target.parent.mkdir(exist_ok=True)
         source.rename(target)
     answer(args, f"archived as {target}; move it back to use it again", run=args.run_name, archived=target)

@@ -8,7 +8,7 @@ import sys
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.runs import open_run, run_lock
+from dreamfleet.common.runs import check_single, open_run, run_lock, translated
 from dreamfleet.common.site import offer
 
 SUMMARY = "delete a run that nobody serves, with its journal, controller and videos"
@@ -35,7 +35,8 @@ def run(args: argparse.Namespace) -> int:
             answer(args, "kept", run=args.run_name, deleted=None)
             return 1
     folder = args.runs_dir / args.run_name
-    with run_lock(folder):
+    check_single(folder)
+    with run_lock(folder), translated(folder):
         shutil.rmtree(folder)
     answer(args, f"deleted {folder}", run=args.run_name, deleted=folder)
     return 0

@@ -46,11 +46,11 @@ def _row(path: Path) -> dict[str, object]:
                 "created": run.created,
                 "task": run.spec.task,
                 "generations": len(history),
-                "mean": round(history[-1].mean, 1) if history else "-",
-                "evaluated": round(evaluations[-1].mean, 1) if evaluations else "-",
-                "confirmed": round(confirmed.mean, 1) if confirmed else "-",
+                "mean": round(history[-1].mean, 1) if history else None,
+                "evaluated": round(evaluations[-1].mean, 1) if evaluations else None,
+                "confirmed": round(confirmed.mean, 1) if confirmed else None,
                 "state": f"ended: {run.ended}" if run.ended else "open",
             }
     except JournalError as error:
-        return {"run": path.name, "created": "-", "task": "-", "generations": "-", "mean": "-", "evaluated": "-",
-                "confirmed": "-", "state": str(error)}  # fmt: skip
+        return {"run": path.name, "created": None, "task": None, "generations": None, "mean": None,
+                "evaluated": None, "confirmed": None, "state": str(error)}  # fmt: skip

@@ -44,7 +44,7 @@ def test_a_narrow_terminal_cuts_nothing_and_brackets_stay():
 
 def test_a_pipe_gets_tab_separated_lines(capsys):
     print_rows([{"a": "x y", "b": 1}, {"a": "line\nbreak\ttab", "b": None}])
-    assert capsys.readouterr().out == "a\tb\nx y\t1\nline break tab\tNone\n"
+    assert capsys.readouterr().out == "a\tb\nx y\t1\nline break tab\t-\n"
 
 
 def test_an_answer_is_a_sentence_or_json(capsys, tmp_path):

@@ -1,6 +1,7 @@
 """A run's life against its journal, without a transport."""
 
 import hashlib
+import json
 from dataclasses import replace
 
 import pytest
@@ -295,3 +296,28 @@ def test_a_run_whose_population_is_one_point_ends_and_says_so(tmp_path, random_b
         bench.restart()
         assert len(bench.run.history) == closed
         assert bench.run.ended
+
+
+def test_a_limit_that_was_reached_stays_reached_when_the_last_evaluation_says_otherwise(tmp_path, random_bundle):
+    """`--parted` looks at the latest evaluations: the one that the end itself called for may be better again."""
+    settings = replace(SETTINGS, collect_every=0, evaluate_every=1, evaluation_episodes=4, confirm_episodes=8)
+    bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=0)
+    bench.limits = LimitsConfig(parted=1)
+    bench.restart()
+    level = {0: 9.0, 1: 1.0}
+
+    def step():
+        for send in bench.run.fleet.dispatch(bench.now):
+            for work in send.content.work:
+                noise = work.job.digest[0] / 1000
+                fitness = level.get(work.job.generation, 9.0) + noise if work.job.kind == "evaluate" else noise
+                bench.deliver(send.identity, Result(work.job.digest, fitness, 10, 0.1, None, None))
+
+    while bench.journal.fact("ending") is None:
+        step()
+    (ending, _), closed = json.loads(bench.journal.fact("ending")), len(bench.run.history)
+    assert "fell behind" in ending
+    bench.restart()
+    while bench.run.ended is None:
+        step()
+    assert (bench.run.ended, len(bench.run.history)) == (ending, closed)

@@ -107,7 +107,9 @@ class JoinedRun:
     def _shutdown(self, declared: list[Any]) -> None:
         for each in declared:
             each.undeclare()
-        log.info("leaving: %d jobs, %d environment steps", self._finished, self._steps_finished)
+        log.info(
+            "leaving run %s: %d jobs, %d environment steps", self._admission.run, self._finished, self._steps_finished
+        )
 
     def _wait(self) -> None:
         """Handle what has arrived, waiting until the next beat or repetition at most."""
@@ -138,10 +140,8 @@ class JoinedRun:
         nonce = str(event.key_expr).rsplit("/", 1)[-1]
         if event.kind == zenoh.SampleKind.DELETE:
             self._membership.vanish(nonce, monotonic())
-            log.info(
-                "the coordinator of run %s left; this worker waits for it (--any takes another run)",
-                self._admission.run,
-            )
+            then = "it is given up soon" if self._membership.leaves_alone else "this worker waits for it (see --any)"
+            log.info("the coordinator of run %s left; %s", self._admission.run, then)
         else:
             self._membership.appear(nonce)
 

@@ -90,6 +90,11 @@ class Membership:
         return self._told_to_stop > 0 or now >= self._ends_at
 
     @property
+    def leaves_alone(self) -> bool:
+        """Whether it leaves a run whose coordinator is gone."""
+        return self._terms.leaves_alone
+
+    @property
     def draining(self) -> bool:
         """Whether what runs is being finished."""
         return self._drain_until is not None

@@ -48,7 +48,7 @@ def test_told_twice_it_leaves_what_runs(stage, said, cached):
     made.stop()
     made.stop()
     assert served.result(DEADLINE) is None
-    wait_for(said, "leaving: 0 jobs")
+    wait_for(said, ": 0 jobs")
 
 
 def test_told_to_stop_it_leaves_a_download(stage):
