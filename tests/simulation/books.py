@@ -88,7 +88,8 @@ class Sendings:
             for number in member.unseen if member.present else ():
                 batch = id(member), number
                 quiet = self._awake - self._last.get(batch, self._awake)
-                patience = SENT_AGAIN_WITHIN * min(2 ** (self._times[batch] - 1), MOST_PATIENCE)
+                link = member.record.delivery(sum(sent.content.size for sent in member.unseen.values()))
+                patience = (SENT_AGAIN_WITHIN + link) * min(2 ** (self._times[batch] - 1), MOST_PATIENCE)
                 _require(quiet <= patience, "a batch that was not seen is not sent again", "promptness")
 
 
