@@ -38,6 +38,8 @@ class Client:
 
     def __init__(self, connect: tuple[str, ...] | str) -> None:
         connect = (connect,) if isinstance(connect, str) else connect
+        if not connect:
+            raise UsageError("a client needs an address: tcp/HOST:PORT")
         self._where = ", ".join(connect)
         self.session = open_session(Network(connect=connect))  # also for what asks in other words, as for a bundle
 
@@ -150,7 +152,13 @@ class Client:
         """Ask the coordinator to `pause`, `resume`, `drain` or `stop`; `RefusedError` says why it does not."""
         for reply in self.session.get(keys.control(keys.check_run_name(run), verb), timeout=QUERY_TIMEOUT):
             if reply.ok is not None:
-                answer = decode_json(ControlReply, reply.ok.payload.to_bytes())
+                try:
+                    answer = decode_json(ControlReply, reply.ok.payload.to_bytes())
+                except MalformedError as error:
+                    raise MalformedError(
+                        f"what answers for run {run} is no coordinator of this version ({error}): install the same "
+                        "dreamfleet on both sides"
+                    ) from error
                 if not answer.accepted:
                     raise RefusedError(answer.why)
                 return

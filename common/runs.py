@@ -22,7 +22,7 @@ from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.fields import OPTIONAL, written
-from dreamfleet.common.files import check_regular, is_file, is_folder
+from dreamfleet.common.files import check_regular, is_folder, is_there
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import Between, Count, Packages, TaskSpec
@@ -346,7 +346,7 @@ def default_runs_dir() -> Path:
 def open_run(runs_dir: Path, name: str) -> RunFolder:
     """A run by name; `JournalError` names those that exist."""
     path = runs_dir / check_run_name(name)
-    if not is_file(path / JOURNAL):
+    if not is_there(path / JOURNAL):
         names = ", ".join(each.name for each in run_paths(runs_dir)) or "none yet"
         raise JournalError(f"no run {name!r} in {runs_dir}; there are: {names}")
     return RunFolder(path)

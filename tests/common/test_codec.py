@@ -195,3 +195,8 @@ if __name__ == "__main__":
             path = GOLDEN / f"{name}.v1.{kind}"
             if not path.exists():
                 path.write_bytes(write(sample))
+
+
+def test_a_batch_number_that_no_coordinator_reaches_is_refused():
+    with pytest.raises(MalformedError):
+        encode(dataclasses.replace(MSGPACK["beat"], seen=2**63 - 1))

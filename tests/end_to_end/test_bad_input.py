@@ -1,7 +1,9 @@
 """What people get wrong: one clear line that says what to do, an exit code that is not 0, nothing lost."""
 
 import json
+import shutil
 import socket
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 from dreamfleet.common.controller import Controller, ControllerShape
 from tests.support import tasks
+from tests.support.processes import command, environment
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -87,6 +90,54 @@ def test_an_existing_run_is_not_begun_again(processes, random_bundle):
         processes, "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--population", "8",
         says="frozen with run test",
     )  # fmt: skip
+
+
+def test_the_archives_own_name_is_no_runs(processes, random_bundle):
+    complains(
+        processes, "coordinator", "--run", "archive", "--runs-dir", processes.runs, "--bundle", random_bundle.path,
+        says="choose another name",
+    )  # fmt: skip
+
+
+@pytest.fixture
+def odd(processes, random_bundle):
+    """A runs folder in which one run's folder is a link, and another holds a third."""
+    processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY).end()
+    runs = processes.folder / "odd"
+    shutil.copytree(processes.runs / "test", runs / "whole")
+    shutil.copytree(processes.runs / "test", runs / "outer" / "inner")
+    shutil.copy(processes.runs / "test" / "journal.sqlite", runs / "outer")
+    (runs / "link").symlink_to(runs / "whole")
+    (runs / "archive").write_text("no folder")
+    (runs / "strange" / "journal.sqlite").mkdir(parents=True)
+    return runs
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("runs", "delete", "link", "--yes"), "is a link"),
+        (("runs", "delete", "outer", "--yes"), "holds other runs (inner)"),
+        (("runs", "archive", "whole"), "cannot be moved or deleted"),
+        (("runs", "show", "strange"), "it is a folder"),
+    ],
+)
+def test_odd_folders_lose_nothing(processes, odd, words, says):
+    complains(processes, *words, "--runs-dir", odd, says=says)
+    assert (odd / "whole" / "journal.sqlite").exists()
+    assert (odd / "outer" / "inner" / "journal.sqlite").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("more", [(), ("--json",)])
+def test_a_full_stdout_is_one_line(processes, odd, more):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command("runs", "list", "--runs-dir", odd, *more), env=environment(processes.cache), stdout=full,
+            stderr=subprocess.PIPE, check=False, text=True, timeout=60,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.splitlines() == ["dreamfleet: what this verb prints could not be written: no space left"]
 
 
 def test_a_controller_of_another_shape(processes, tmp_path):
