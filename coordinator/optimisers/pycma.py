@@ -16,6 +16,8 @@ from dreamfleet.coordinator.optimisers import pycma_state
 from dreamfleet.coordinator.optimisers.api import Search, State
 from dreamfleet.coordinator.optimisers.normals import Normals
 
+HISTORY = 100  # entries that stay of each of pycma's histories
+
 
 class Pycma:
     """CMA-ES (Hansen 2016, arXiv:1604.00772, algorithm of appendix A) over the whole covariance matrix or its diagonal.
@@ -60,6 +62,8 @@ class Pycma:
         """Update mean, step size and covariance (equations 41 to 47)."""
         self._strategy.tell(self._asked, [-float(value) for value in fitness])
         self._asked = []
+        # Histories by which pycma would stop by itself, which nothing else reads: a state must not grow with the run.
+        del self._strategy.fit.histbest[HISTORY:], self._strategy.fit.histmedian[HISTORY:]
 
     def prepare(self) -> None:
         """Draw the normals of the next `ask`, which do not depend on `tell`."""
