@@ -5,7 +5,7 @@ set -uo pipefail
 source=$(git rev-parse --show-toplevel)
 folder=${DIRECTORY:-$(mktemp -d)}
 mkdir -p "$folder/home"
-git clone --quiet "$source" "$folder/dreamfleet"
+git clone --quiet "$source" "$folder/dreamfleet" || exit 1  # not into what another run left
 failed=0
 for target in ${TARGETS:-demo test}; do
     began=$(date +%s)
