@@ -6,6 +6,7 @@ Life: startup (session, lock on the name, queryables) -> loop (events, advance, 
 from __future__ import annotations
 
 import logging
+import math
 import queue
 import secrets
 from collections.abc import Callable
@@ -46,6 +47,7 @@ TICK = 0.05  # seconds: the longest that a loss waits to be acted upon
 DRAIN = 256  # events that share one commit at most
 LINGER = 0.005  # seconds that a commit waits for more to share it
 SNAPSHOT_INTERVAL = 0.2
+ALONE = 5.0  # seconds without a worker after which the log says so
 _REPEATED: dict[str, type[Message]] = {"result": ResultBatch, "beat": Beat, "upload": UploadPart}
 
 
@@ -80,7 +82,7 @@ class Service:
             self._run = run_maker()
             self._claim.announce(self._run.uid, self._run.incarnation)
             self._exchange = self._run.exchange
-            self._started = monotonic()
+            self._started = self._alone_since = monotonic()
             self._snapshot = self._take_snapshot()
             declared = self._declare(session)
             log.info("run %s, incarnation %d, generation %d", self._name, self._run.incarnation,
@@ -146,6 +148,7 @@ class Service:
             self._claim.look(now)
             if now - taken >= SNAPSHOT_INTERVAL:
                 self._snapshot, taken = self._take_snapshot(), now
+                self._tell_alone(now)
 
     def _put(self, session: zenoh.Session, sends: list[Send]) -> None:
         for send in sends:
@@ -156,6 +159,14 @@ class Service:
                 self._exchange.dismiss(send.identity)
                 continue
             session.put(keys.job(self._name, send.identity), batch, encoding=encoding(JobBatch))
+
+    def _tell_alone(self, now: float) -> None:
+        """Say once that nobody works, when that has lasted a while: a run that stands still should not be silent."""
+        if self._run.state != "waiting for workers":
+            self._alone_since = now
+        elif now - self._alone_since > ALONE:
+            self._alone_since = math.inf
+            log.warning("no worker is there: the run waits for one")
 
     def _write_notes(self) -> None:
         for note in self._exchange.take_notes():

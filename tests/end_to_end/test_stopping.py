@@ -8,6 +8,7 @@ import pytest
 
 from dreamfleet.worker.training.checkpoint import load_progress
 from dreamfleet.worker.training.collect import present
+from tests.support import tasks
 from tests.support.drives import write_drives
 
 pytestmark = pytest.mark.timeout(120)
@@ -57,3 +58,9 @@ def test_a_collection_keeps_its_episodes_and_counts_them(processes, tmp_path, nu
     kept = len(present(tmp_path))
     assert f"stopped: {tmp_path} keeps {kept} new episodes, {kept} of 1000 in all; the same command goes on" in said
     assert [path.name for path in (tmp_path / "episodes").iterdir() if path not in present(tmp_path)] == []
+
+
+def test_a_coordinator_that_waits_for_a_worker_says_so_once(processes, random_bundle):
+    coordinator = processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY)
+    coordinator.wait_for("no worker is there")
+    assert sum("no worker is there" in line for line in coordinator.lines) == 1
