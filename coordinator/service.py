@@ -140,15 +140,16 @@ class Service:
             self._run.commit()
             self._put(session, self._exchange.dispatch(now))
             self._run.prepare()
+            # Before anything is said of it: who hears that a run is paused, and asks, is not told that it runs.
+            if now - taken >= SNAPSHOT_INTERVAL or self._run.state != self._snapshot.status.state:
+                self._snapshot, taken = self._take_snapshot(), now
+                self._tell_alone(now)
             self._publish_closed(session)
             self._write_notes()
             if self._draining and not self._exchange.leased:
                 self.stop()
             self._custody.look(now)
             self._claim.look(now)
-            if now - taken >= SNAPSHOT_INTERVAL:
-                self._snapshot, taken = self._take_snapshot(), now
-                self._tell_alone(now)
 
     def _put(self, session: zenoh.Session, sends: list[Send]) -> None:
         for send in sends:
@@ -248,6 +249,7 @@ class Service:
         with query:
             verb = str(query.key_expr).rsplit("/", 1)[-1]
             verbs.get(verb, lambda: None)()
+            self._snapshot = self._take_snapshot()  # who asks after the answer sees what came of it
             reply = control_reply(self._name, verb, verbs)
             query.reply(query.key_expr, encode_json(reply), encoding="application/json")
 
