@@ -11,17 +11,10 @@ import pytest
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.runs import RunFolder, open_run
 from dreamfleet.common.schema import APPLICATION_ID, VERSION
-from tests.support.mutations import Watched, mutate
+from tests.support.mutations import mutate
 
 RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
 VALUES = [None, "x", b"x", -1, 2**62, 1e308, "1e5", "[" * 3000, "9" * 5000, "\ud7ff"]
-
-
-@pytest.fixture
-def watched():
-    made = Watched()
-    yield made
-    made.check()
 
 
 @pytest.fixture

@@ -17,18 +17,11 @@ from dreamfleet.common.config import load, read_toml
 from dreamfleet.common.controller import Controller, ControllerShape
 from dreamfleet.common.errors import BundleError, ControllerError, DreamfleetError, UsageError
 from tests.support.bundles import npy
-from tests.support.mutations import Watched, archives, mutate, packed, reworded
+from tests.support.mutations import archives, mutate, packed, reworded
 
 COUNT = 2000
 LIMITS = Limits(1 << 20)
 KINDS = ["<f4", ">f8", "<i8", "|u1", "|b1", "<f2", "<U7"]
-
-
-@pytest.fixture
-def watched():
-    made = Watched()
-    yield made
-    made.check()
 
 
 @pytest.fixture
@@ -159,22 +152,21 @@ def test_a_part_that_unpacks_to_much_more_is_refused(bundle, watched):
         Bundle.open(bundle)
 
 
-def test_damaged_controllers(controller, watched):
-    whole, path = controller.read_bytes(), controller.with_name("d.npz")
+def damage(whole, path, watched, error, load, seed):
+    """Some of so many damaged files are read all the same, and the others are one line each."""
     read = 0
-    for data in archives(whole, COUNT, seed=1):
+    for data in archives(whole.read_bytes(), COUNT, seed=seed):
         path.write_bytes(data)
-        read += watched.read(ControllerError, Controller.load, path)
+        read += watched.read(error, load, path)
     assert 0 < read < COUNT
+
+
+def test_damaged_controllers(controller, watched):
+    damage(controller, controller.with_name("d.npz"), watched, ControllerError, Controller.load, seed=1)
 
 
 def test_damaged_bundles(bundle, watched):
-    whole, path = bundle.read_bytes(), bundle.with_name("d.zip")
-    read = 0
-    for data in archives(whole, COUNT, seed=2):
-        path.write_bytes(data)
-        read += watched.read(BundleError, Bundle.open, path)
-    assert 0 < read < COUNT
+    damage(bundle, bundle.with_name("d.zip"), watched, BundleError, Bundle.open, seed=2)
 
 
 def test_damaged_settings(tmp_path, watched):
