@@ -70,20 +70,20 @@ class Exchange:
             return
         errors = []
         for each in batch.results:
-            wanted = self._fleet.wants(each.digest)
+            wanted = each.digest in self._fleet.jobs
             try:
                 self._result(worker, each, batch.fingerprint, now)
             except DreamfleetError:
                 raise
             except Exception as error:
-                if wanted is not None and self._fleet.wants(each.digest) is None:
+                if wanted and each.digest not in self._fleet.jobs:
                     raise _half_counted(error) from error
                 errors.append(error)
         if errors:
             raise errors[0]
 
     def _result(self, worker: str, said: Result, fingerprint: str, now: float) -> None:
-        work = self._fleet.wants(said.digest)
+        work = self._fleet.jobs.work(said.digest)
         each = said if work is None else bounded(said, work.job.kind, self._horizon)
         result = self._slack.collections.receive(worker, each, work)
         if result is None:
@@ -98,8 +98,8 @@ class Exchange:
 
     def upload(self, worker: str, part: UploadPart, now: float) -> None:
         """Take in part of a rollout, from a worker that was given the job and while it is wanted."""
-        work = self._fleet.wants(part.digest)
-        if work is None or work.job.kind != "collect" or not self._fleet.holds(worker, part.digest):
+        wanted = self._fleet.jobs.get(part.digest)
+        if wanted is None or wanted.work.job.kind != "collect" or worker not in wanted.holders:
             self._uploads.dropped["unwanted upload"] += 1
             return
         self._uploads.add(worker, part, now)
@@ -116,7 +116,7 @@ class Exchange:
     @property
     def jobs(self) -> int:
         """Jobs that are wanted."""
-        return self._fleet.open
+        return len(self._fleet.jobs)
 
     @property
     def leased(self) -> int:
@@ -145,7 +145,7 @@ class Exchange:
     @property
     def failures(self) -> list[Failure]:
         """Wanted jobs that failed somewhere."""
-        return self._fleet.failures
+        return self._fleet.jobs.failures
 
     @property
     def dropped(self) -> Counter[str]:

@@ -6,20 +6,18 @@ result; what a beat does not show is dispatched again. Rules 2, 3, 5, 6, 7 and 8
 
 from __future__ import annotations
 
-import heapq
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
-from dreamfleet.common.messages import MOST_SLOTS, TAG_BYTES, Beat, Kind, Result, Verdict, VerdictWord
+from dreamfleet.common.messages import MOST_SLOTS, Beat, Kind, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.choice import Choice
-from dreamfleet.coordinator.failure import Failure
 from dreamfleet.coordinator.jobs import Work
 from dreamfleet.coordinator.member import Handful, Lease, Member, Sent
 from dreamfleet.coordinator.packing import Content, pack
 from dreamfleet.coordinator.record import HostRecord
-from dreamfleet.coordinator.share import Share
 from dreamfleet.coordinator.tail import Move, Tail
+from dreamfleet.coordinator.wanted import Wanted, WantedJobs
 
 DEPARTURE_GRACE = 0.05  # seconds: a token's end overtakes results that are still on their way
 CLOCK_GAP = 2.0  # seconds between ticks that mean a suspended host
@@ -29,26 +27,7 @@ ANSWER_BEATS = 2  # after which a worker that was sent nothing hears that it is 
 FORGOTTEN = 600.0  # seconds of silence after which a worker must say hello again
 VISIT = 60.0  # the same for one that was welcomed and has not beaten yet: a guest
 MOST_GUESTS = 256
-MOST_FAILED = 16  # workers that a job's failures are remembered of; two pause the run
-ATTEMPTS = 3  # of a failing job on one worker, where there is no other
 MOST_RECORDS = 4096  # of hosts, those that joined last
-
-
-@dataclass
-class Wanted:
-    """A job without a result."""
-
-    work: Work
-    order: int
-    queued: bool = False  # whether the queue names it, so that it does so once whatever its workers do
-    holders: set[str] = field(default_factory=set)
-    failed: dict[str, str] = field(default_factory=dict)  # worker -> error
-    attempts: Counter[str] = field(default_factory=Counter)  # worker -> how often it failed there
-
-    @property
-    def in_slack(self) -> bool:
-        """Whether it fills what scoring leaves idle, and has a share of what it does not."""
-        return self.work.job.kind != "score"
 
 
 @dataclass(frozen=True)
@@ -65,46 +44,22 @@ class Fleet:
 
     def __init__(self, beat: float, evaluation_share: float = 0.25) -> None:
         self._beat = beat
-        self._wanted: dict[bytes, Wanted] = {}
-        self._tags: dict[bytes, bytes] = {}
-        self._queue: list[tuple[int, bytes]] = []  # what is scored, in order of offer
-        self._spare: list[tuple[int, bytes]] = []  # what waits for slack or for its share
-        self._share = Share(evaluation_share)
-        self._orders = 0
-        self._in_slack = 0  # evaluations and collected rollouts that somebody holds
-        self._failing: dict[bytes, Wanted] = {}  # those of the wanted that failed somewhere
-        self._accepted: dict[bytes, int] = {}  # digest -> generation, of this one and the last
         self._tail = Tail(beat)
         self._ticked: float | None = None
         self._now = 0.0  # of what is being handled
         self._records: dict[str, HostRecord] = {}  # by name of a host, the one that joined last at the end
         self._guests: dict[str, None] = {}  # identities, oldest first
+        self.jobs = WantedJobs(evaluation_share)
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
         self.notes: list[str] = []  # what happened, for whoever writes it down and clears it
         self.hurry = False  # nothing but evaluations and collected rollouts is left to wait for
         self.paused = False
 
-    def offer(self, work: Iterable[Work]) -> None:
-        """Want these jobs; jobs of generations before the last are forgotten."""
-        for each in work:
-            digest = each.job.digest
-            if digest in self._wanted or digest in self._accepted:
-                continue
-            self._wanted[digest] = Wanted(each, self._orders)
-            self._tags[digest[:TAG_BYTES]] = digest
-            self._orders += 1
-            self._enqueue(digest)
-
     def withdraw(self, kind: Kind) -> None:
         """No longer want jobs of this kind; what runs already becomes obsolete."""
-        for digest, wanted in list(self._wanted.items()):
-            if wanted.work.job.kind == kind:
-                self._unwant(digest)
-
-    def begin(self, generation: int) -> None:
-        """A generation opens: copies from before the last one are obsolete."""
-        self._accepted = {digest: number for digest, number in self._accepted.items() if number >= generation - 1}
+        for digest in self.jobs.of_kind(kind):
+            self._cancel(digest, self.jobs.remove(digest))
 
     def welcome(self, identity: str, slots: int, fingerprint: str, now: float) -> None:
         """A worker was admitted; it has credit from its first beat on, and until then it is one of a few guests."""
@@ -137,8 +92,8 @@ class Fleet:
         if beat.seen > member.number:
             self._count_on(member, beat.seen)
         member.observe(beat, now)
-        running = {self._tags.get(run.tag): run.steps for run in beat.running}
-        shown = {self._tags.get(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
+        running = {self.jobs.named(run.tag): run.steps for run in beat.running}
+        shown = {self.jobs.named(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
         for digest, lease in list(member.leases.items()):
             lease.absent = 0 if digest in shown or lease.batch > beat.seen else lease.absent + 1
             lease.steps, lease.told = running.get(digest), now
@@ -146,7 +101,7 @@ class Fleet:
                 self._drop_lease(member, digest)
         held = Handful(now, len(member.leases), alone=False)
         for found in shown - member.leases.keys():
-            if found in self._wanted and len(self._wanted[found].holders) < 2:
+            if found is not None and len(self.jobs[found].holders) < 2:
                 self._take(member, found, Lease(beat.seen, held, steps=running.get(found), told=now))
         member.lose_before(max((lease.batch for each, lease in member.leases.items() if each in shown), default=0))
 
@@ -167,15 +122,6 @@ class Fleet:
         self.counts["accepted_steps" if verdict == "accepted" else "discarded_steps"] += result.steps
         self.counts[verdict] += 1
         return verdict, work
-
-    def wants(self, digest: bytes) -> Work | None:
-        """The work of a wanted job."""
-        wanted = self._wanted.get(digest)
-        return None if wanted is None else wanted.work
-
-    def holds(self, identity: str, digest: bytes) -> bool:
-        """Whether a worker holds a wanted job."""
-        return digest in self._wanted and identity in self._wanted[digest].holders
 
     def put_off(self, identity: str, digest: bytes, now: float) -> None:
         """A result came whose upload is still on its way: no verdict yet, and the lease stays."""
@@ -213,11 +159,11 @@ class Fleet:
         for member in self.members.values():
             member.learn(now)
         given = self._assign(now)
-        if not self._queue and not self.paused:
-            for move in self._tail.plan(self._wanted, self.members, given, now):
+        if not self.jobs.queued and not self.paused:
+            for move in self._tail.plan(self.jobs, self.members, given, now):
                 self._apply(move, given, now)
         if not self.paused:
-            for move in self._tail.trials(self._wanted, self.members, given.keys(), now):
+            for move in self._tail.trials(self.jobs, self.members, given.keys(), now):
                 self._apply(move, given, now)
         sends: list[Send] = []
         for member in self.members.values():
@@ -231,33 +177,9 @@ class Fleet:
         return sends
 
     @property
-    def open(self) -> int:
-        """Jobs that are wanted."""
-        return len(self._wanted)
-
-    @property
     def leased(self) -> int:
         """Jobs in workers' hands, copies counted."""
         return sum(len(member.leases) for member in self.members.values())
-
-    @property
-    def failures(self) -> list[Failure]:
-        """Wanted jobs that failed somewhere."""
-        return [_failure(wanted) for wanted in self._failing.values()]
-
-    def poison(self) -> Failure | None:
-        """A job that failed on two different workers, or again and again on the only one there is."""
-        for wanted in self._failing.values():
-            if len(wanted.failed) > 1 or any(count >= ATTEMPTS for count in wanted.attempts.values()):
-                return _failure(wanted)
-        return None
-
-    def pardon(self) -> None:
-        """Forget what failed."""
-        for wanted in self._failing.values():
-            wanted.failed.clear()
-            wanted.attempts.clear()
-        self._failing.clear()
 
     def _again(self, member: Member, now: float) -> Iterator[Send]:
         """Batches that were not seen in time."""
@@ -281,33 +203,24 @@ class Fleet:
             member.verdicts = []
 
     def _judge(self, identity: str, result: Result) -> tuple[VerdictWord, Work | None]:
-        wanted = self._wanted.get(result.digest)
-        if wanted is None:
-            return ("duplicate" if result.digest in self._accepted else "obsolete"), None
+        if result.digest not in self.jobs:
+            return ("duplicate" if self.jobs.is_accepted(result.digest) else "obsolete"), None
         if result.fitness is None:
-            self._failing[result.digest] = wanted
-            if identity in wanted.failed or len(wanted.failed) < MOST_FAILED:
-                wanted.attempts[identity] += 1
-                wanted.failed[identity] = result.error or "no fitness and no reason"
+            self.jobs.fail(identity, result)
             self.counts["errors"] += 1
             if member := self.members.get(identity):
                 self._drop_lease(member, result.digest)
             return "refused", None
-        self._share.count(result.digest, result.seconds, in_slack=wanted.in_slack, waiting=bool(self._spare))
-        self._unhold(wanted, identity)
-        self._unwant(result.digest)
-        self._accepted[result.digest] = wanted.work.job.generation
+        wanted = self.jobs.accept(result)
+        wanted.holders.discard(identity)
+        self._cancel(result.digest, wanted)
         return "accepted", wanted.work
 
-    def _unwant(self, digest: bytes) -> None:
-        wanted = self._wanted.pop(digest)
-        self._failing.pop(digest, None)
-        self._tags.pop(digest[:TAG_BYTES], None)
-        self._share.give_back(digest)
-        for holder in list(wanted.holders):
+    def _cancel(self, digest: bytes, wanted: Wanted) -> None:
+        """Whoever holds a job that is wanted no more hears so."""
+        for holder in wanted.holders:
             member = self.members[holder]
             lease = member.leases.pop(digest, None)
-            self._unhold(wanted, holder)
             if lease is not None:
                 member.overtaken(lease, self._now)
             if digest not in member.trials:  # which is worth its end
@@ -350,43 +263,29 @@ class Fleet:
         self._release(member)
 
     def _take(self, member: Member, digest: bytes, lease: Lease) -> None:
-        lease.in_slack = self._wanted[digest].in_slack
+        lease.in_slack = self.jobs[digest].in_slack
         member.leases[digest] = lease
-        self._hold(self._wanted[digest], member.identity)
-
-    def _hold(self, wanted: Wanted, identity: str) -> None:
-        self._in_slack += wanted.in_slack and not wanted.holders
-        wanted.holders.add(identity)
-
-    def _unhold(self, wanted: Wanted, identity: str) -> None:
-        if identity in wanted.holders:
-            wanted.holders.discard(identity)
-            self._in_slack -= wanted.in_slack and not wanted.holders
+        self.jobs.hold(digest, member.identity)
 
     def _apply(self, move: Move, given: dict[str, list[Work]], now: float) -> None:
         """Give a job to an idle slot too, or instead of to a worker that has not begun it."""
-        wanted = self._wanted[move.digest]
         if move.instead_of:
             donor = self.members[move.instead_of]
             donor.leases.pop(move.digest)
             donor.cancels.append(move.digest)
-            self._unhold(wanted, donor.identity)
+            self.jobs.let_go(move.digest, donor.identity)
         if move.trial:
             self.members[move.to].trials[move.digest] = Handful(now, 0)
         self.counts["recalled" if move.instead_of else "copied"] += 1
-        self._hold(wanted, move.to)
-        given.setdefault(move.to, []).append(wanted.work)
+        self.jobs.hold(move.digest, move.to)
+        given.setdefault(move.to, []).append(self.jobs[move.digest].work)
 
     def _drop_lease(self, member: Member, digest: bytes) -> None:
         """End a lease without a result; the job is queued again unless another worker holds it."""
         member.leases.pop(digest, None)
-        wanted = self._wanted.get(digest)
-        if wanted is None or member.identity not in wanted.holders:
-            return
-        self._unhold(wanted, member.identity)
-        if not wanted.holders:
+        if self.jobs.let_go(digest, member.identity):
             self.counts["reissued"] += 1
-            self._enqueue(digest)
+            self.jobs.enqueue(digest)
 
     def _forget(self, member: Member) -> None:
         """It is nobody's member any more; one that lives says hello again, for it is silent to it in turn."""
@@ -400,49 +299,37 @@ class Fleet:
         member.unseen.clear()
         member.trials.clear()
 
-    def _enqueue(self, digest: bytes) -> None:
-        wanted = self._wanted[digest]
-        self._share.give_back(digest)
-        if not wanted.queued:
-            wanted.queued = True
-            heapq.heappush(self._spare if wanted.in_slack else self._queue, (wanted.order, digest))
-
     def _assign(self, now: float) -> dict[str, list[Work]]:
         """One job at a time to the least loaded worker with credit that helps, so that a tail is spread evenly."""
         given: dict[str, list[Work]] = {}
         if self.paused:
             return given
         loads = {name: len(member.leases) for name, member in self.members.items() if member.credit > 0}
-        choice = Choice(self.members, loads, len(self._queue), now)
+        choice = Choice(self.members, loads, self.jobs.queued, now)
+        slots = sum(member.slots for member in self.members.values() if member.present and member.capacity)
         passed_over = []
-        while loads and (turn := self._turn(loads)) is not None:
-            queue, by_share = turn
-            _, digest = heapq.heappop(queue)
-            wanted = self._wanted.get(digest)
-            if wanted is None:
-                continue  # answered meanwhile
-            wanted.queued = False
-            if wanted.holders:
-                continue  # adopted again from a worker that came back
+        while loads:
+            idle = any(load < self.members[name].capacity for name, load in loads.items())
+            if (turn := self.jobs.next(slots, idle=idle, hurry=self.hurry)) is None:
+                break
+            wanted = self.jobs[turn.digest]
             able = self._able(wanted, loads)
             if not able:
-                passed_over.append(digest)
+                passed_over.append(turn.digest)
                 continue
             name = choice.pick(able)
             if name is None and not wanted.failed:
-                passed_over.append(digest)
+                passed_over.append(turn.digest)
                 break  # nor the jobs after it: they had better wait for whoever is sooner
             name = name or min(able, key=lambda name: loads[name])
             choice.take(name)
-            if by_share:
-                self._share.take(digest)
             given.setdefault(name, []).append(wanted.work)
-            self._hold(wanted, name)
+            self.jobs.hold(turn.digest, name, by_share=turn.by_share)
             loads[name] += 1
             if len(given[name]) >= self.members[name].credit:
                 del loads[name]
         for digest in passed_over:
-            self._enqueue(digest)
+            self.jobs.enqueue(digest)
         return given
 
     def _able(self, wanted: Wanted, loads: Mapping[str, int]) -> list[str]:
@@ -453,20 +340,3 @@ class Fleet:
         able = [name for name in loads if name not in wanted.failed]
         there = (name for name, member in self.members.items() if member.present and member.known)
         return list(loads) if not able and all(name in wanted.failed for name in there) else able
-
-    def _turn(self, loads: Mapping[str, int]) -> tuple[list[tuple[int, bytes]], bool] | None:
-        """The queue that gives the next job, and whether that job goes by its share; `None` where none may go."""
-        helping = (member for member in self.members.values() if member.present and member.capacity)
-        slots = sum(member.slots for member in helping) if self._spare else 0
-        if self._queue:
-            by_share = bool(self._spare) and self._share.due(slots)
-            return (self._spare, True) if by_share else (self._queue, False)
-        idle = any(load < self.members[name].capacity for name, load in loads.items())
-        most = max(1, int(slots * self._share.share))  # more in idle slots would keep the next generation waiting
-        if self._spare and (self.hurry or (idle and self._in_slack < most)):
-            return self._spare, False
-        return None
-
-
-def _failure(wanted: Wanted) -> Failure:
-    return Failure(wanted.work, dict(wanted.failed), dict(wanted.attempts))

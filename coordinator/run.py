@@ -110,7 +110,7 @@ class Run:
         closed = len(self.history)
         while self.ended is None and self.paused is None and self.generation.complete and not self._waiting:
             self._close(now)
-        failure = self.fleet.poison()
+        failure = self.fleet.jobs.poison()
         if failure is not None and self.paused is None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
         self.fleet.hurry = self._waiting
@@ -141,7 +141,7 @@ class Run:
         """Go on; what failed is tried again anywhere."""
         self.paused = None
         self.fleet.paused = False
-        self.fleet.pardon()
+        self.fleet.jobs.pardon()
 
     def take_closed(self) -> list[StoredGeneration]:
         """Generations closed since the last call."""
@@ -156,15 +156,15 @@ class Run:
 
     def _begin(self, now: float) -> None:
         generation = self.generation
-        self.fleet.begin(generation.number)
+        self.fleet.jobs.begin(generation.number)
         work = self.slack.begin(self._generations.mean, now)
         if self._ending is None and not generation.done and (reason := self._stop_reason(generation)):
             self._end_by(reason)
         if self._ending is None:
             self._journal.drop_fact("ended")
-            self.fleet.offer([*work, *generation.missing])
+            self.fleet.jobs.offer([*work, *generation.missing])
         else:
-            self.fleet.offer(work)
+            self.fleet.jobs.offer(work)
             self._finish()
             if self.ended is not None:
                 self.commit()
@@ -176,24 +176,24 @@ class Run:
         # Opened also when the run ends here: a later life with wider limits then goes on from it.
         generation = self._generations.open(closed.number + 1)
         reason = self._stop_reason(generation)
-        self.fleet.offer(self.slack.schedule(closed.number, mean, now, last=reason is not None))
+        self.fleet.jobs.offer(self.slack.schedule(closed.number, mean, now, last=reason is not None))
         if generation.spec != self.generation.spec:
             self.fleet.notes.append(
                 f"generation {generation.number} dreams at temperature {generation.spec.temperature:g}: the evaluated "
                 "mean fell"
             )
         self.generation, self.opened = generation, now
-        self.fleet.begin(generation.number)
+        self.fleet.jobs.begin(generation.number)
         if reason:
             self.fleet.withdraw("score")
             self._end_by(reason)
         else:
-            self.fleet.offer(generation.missing)
+            self.fleet.jobs.offer(generation.missing)
 
     def _score(self, result: Result) -> None:
         assert result.fitness is not None
         if self.generation.record(result.digest, result.fitness, result.steps):
-            self.fleet.offer(self.generation.missing)
+            self.fleet.jobs.offer(self.generation.missing)
 
     def _stop_reason(self, generation: Generation) -> str | None:
         """Why the run ends before `generation` is scored; `None` if it goes on."""
@@ -207,7 +207,7 @@ class Run:
             return
         if work := self.slack.confirm():
             self.fleet.notes.append(self.slack.round)
-            self.fleet.offer(work)
+            self.fleet.jobs.offer(work)
         else:
             self._end()
 

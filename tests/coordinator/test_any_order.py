@@ -92,7 +92,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.fleet = Fleet(BEAT)
         self.received, self.judged, self.sent = Counter(), Counter(), []
         for number in range(self.number):
-            self.fleet.offer(work for work in slack_of(number) if work.job.digest not in self.journal)
+            self.fleet.jobs.offer(work for work in slack_of(number) if work.job.digest not in self.journal)
         self.open()
 
     def open(self):
@@ -104,9 +104,9 @@ class AnyOrder(RuleBasedStateMachine):
         for work in self.generation.missing:
             if work.job.digest in self.journal:
                 self.generation.record(work.job.digest, self.journal[work.job.digest], 10)
-        self.fleet.begin(self.number)
-        assert all(generation >= self.number - 1 for generation in self.fleet._accepted.values())
-        self.fleet.offer(self.generation.missing)
+        self.fleet.jobs.begin(self.number)
+        assert all(generation >= self.number - 1 for generation in self.fleet.jobs._accepted.values())
+        self.fleet.jobs.offer(self.generation.missing)
 
     @rule()
     def restart(self):
@@ -226,14 +226,14 @@ class AnyOrder(RuleBasedStateMachine):
             self.journal[result.digest] = result.fitness
             if work.job.kind == "score":
                 self.generation.record(result.digest, result.fitness, result.steps)
-        if self.fleet.poison():
-            self.fleet.pardon()
+        if self.fleet.jobs.poison():
+            self.fleet.jobs.pardon()
         if self.generation.complete and self.number < GENERATIONS:
             self.close()
 
     def close(self):
         self.told.append(self.generation.fitness().tolist())
-        self.fleet.offer(slack_of(self.number))
+        self.fleet.jobs.offer(slack_of(self.number))
         self.number += 1
         self.open()
 
@@ -310,9 +310,9 @@ class AnyOrder(RuleBasedStateMachine):
             results, self.results = self.results, []
             for identity, result in results:
                 self.receive(identity, result)
-            if self.number == GENERATIONS and not self.fleet.open:
+            if self.number == GENERATIONS and not self.fleet.jobs:
                 break
-        assert self.fleet.open == 0
+        assert not self.fleet.jobs
         wanted = [
             work.job.digest
             for number in range(GENERATIONS)
@@ -327,16 +327,16 @@ class AnyOrder(RuleBasedStateMachine):
 
     @invariant()
     def at_most_two_hold_a_job_and_both_sides_agree(self):
-        for digest, wanted in self.fleet._wanted.items():
+        for digest, wanted in self.fleet.jobs.items():
             assert len(wanted.holders) <= 2
             assert all(digest in self.fleet.members[holder].leases for holder in wanted.holders)
         for member in self.fleet.members.values():
-            assert all(member.identity in self.fleet._wanted[digest].holders for digest in member.leases)
+            assert all(member.identity in self.fleet.jobs[digest].holders for digest in member.leases)
 
     @invariant()
     def what_fills_the_slack_is_counted(self):
-        held = [each for each in self.fleet._wanted.values() if each.holders and each.work.job.kind != "score"]
-        assert self.fleet._in_slack == len(held)
+        held = [each for each in self.fleet.jobs.values() if each.holders and each.work.job.kind != "score"]
+        assert self.fleet.jobs._in_slack == len(held)
 
     @invariant()
     def a_result_has_one_verdict_at_most(self):
@@ -345,11 +345,11 @@ class AnyOrder(RuleBasedStateMachine):
     @invariant()
     def memory_is_bounded_by_what_is_wanted(self):
         fleet = self.fleet
-        assert fleet._tags.keys() == {digest[:TAG_BYTES] for digest in fleet._wanted}
-        queued = [digest for *_, digest in fleet._queue]
+        assert fleet.jobs._tags.keys() == {digest[:TAG_BYTES] for digest in fleet.jobs}
+        queued = [digest for *_, digest in fleet.jobs._queue]
         assert len(queued) == len(set(queued))
         assert len(fleet.members) <= self.lives
-        assert set(fleet._failing) <= set(fleet._wanted)
+        assert set(fleet.jobs._failing) <= set(fleet.jobs)
 
 
 LOSSLESS = [lossless(number) for number in range(GENERATIONS)]

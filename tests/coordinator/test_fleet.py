@@ -34,7 +34,7 @@ def result(digest, fitness=1.0, error=None):
 
 def fleet_of(*names, capacity=1, jobs=10):
     fleet = Fleet(BEAT)
-    fleet.offer(work(jobs))
+    fleet.jobs.offer(work(jobs))
     for name in names:
         fleet.welcome(name, capacity, "f", 0.0)
         fleet.beat(name, beat(capacity), 0.0)
@@ -56,7 +56,7 @@ def cancelled(sends, name):
 
 def test_no_work_before_the_first_beat():
     fleet = Fleet(BEAT)
-    fleet.offer(work(3))
+    fleet.jobs.offer(work(3))
     fleet.welcome(A, 2, "f", 0.0)
     assert fleet.dispatch(0.0) == []
 
@@ -165,19 +165,19 @@ def test_an_error_is_no_fitness_and_another_worker_tries():
     (digest,) = digests(fleet.dispatch(0.0), A)
     assert fleet.result(A, result(digest, error="boom"), 0.1) == ("refused", None)
     assert digests(fleet.dispatch(0.1), B) == [digest]
-    assert fleet.poison() is None
+    assert fleet.jobs.poison() is None
     fleet.result(B, result(digest, error="boom"), 0.2)
-    errors = fleet.poison().errors
+    errors = fleet.jobs.poison().errors
     assert errors == {A: "boom", B: "boom"}
 
 
 def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
     fleet = fleet_of(A, jobs=1)
     for attempt in range(3):
-        assert fleet.poison() is None
+        assert fleet.jobs.poison() is None
         (digest,) = digests(fleet.dispatch(attempt), A)
         fleet.result(A, result(digest, error="boom"), attempt)
-    assert fleet.poison().errors == {A: "boom"}
+    assert fleet.jobs.poison().errors == {A: "boom"}
 
 
 def test_a_failed_job_waits_for_another_worker_that_is_busy():
@@ -185,7 +185,7 @@ def test_a_failed_job_waits_for_another_worker_that_is_busy():
     first, *_ = digests(fleet.dispatch(0.0), A)
     fleet.result(A, result(first, error="boom"), 0.1)
     assert digests(fleet.dispatch(0.2), A) == []
-    assert [failure.errors for failure in fleet.failures] == [{A: "boom"}]
+    assert [failure.errors for failure in fleet.jobs.failures] == [{A: "boom"}]
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_evaluations_fill_a_quarter_of_the_idle_slots_and_lead_where_they_have_a
     fleet = Fleet(BEAT, share)
     fleet.welcome(A, 4, "f", 0.0)
     fleet.beat(A, beat(4), 0.0)
-    fleet.offer(work(3) + work(5, "evaluate"))
+    fleet.jobs.offer(work(3) + work(5, "evaluate"))
     assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work] == kinds
     fleet.hurry = True
     assert len(digests(fleet.dispatch(0.1), A)) == 4
@@ -203,7 +203,7 @@ def test_evaluations_fill_a_quarter_of_the_idle_slots_and_lead_where_they_have_a
 
 def test_evaluations_and_collected_drives_share_the_quarter():
     fleet = fleet_of(A, capacity=8, jobs=0)
-    fleet.offer(work(1, "evaluate") + work(5, "collect"))
+    fleet.jobs.offer(work(1, "evaluate") + work(5, "collect"))
     kinds = [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work]
     assert kinds == ["evaluate", "collect"]
 
@@ -211,7 +211,7 @@ def test_evaluations_and_collected_drives_share_the_quarter():
 def uploading():
     """A's only job is done, and its drive is on its way; B is idle."""
     fleet = fleet_of(A, jobs=0)
-    fleet.offer(work(2, "collect"))
+    fleet.jobs.offer(work(2, "collect"))
     fleet.hurry = True
     first, second = digests(fleet.dispatch(0.0), A)
     fleet.welcome(B, 1, "f", 0.0)
@@ -225,7 +225,7 @@ def uploading():
 def test_a_job_whose_upload_is_on_its_way_is_not_taken_away():
     fleet, first, second = uploading()
     assert fleet.dispatch(1.0) == []
-    assert fleet.holds(A, first)
+    assert A in fleet.jobs[first].holders
     assert fleet.result(A, result(first), 2.0)[0] == "accepted"
     assert fleet.result(A, result(second), 2.0)[0] == "accepted"
 
@@ -308,15 +308,15 @@ def test_the_job_of_a_worker_that_has_gone_quiet_is_copied_before_it_counts_as_l
 def test_memory_of_results_is_bounded(count):
     fleet = fleet_of(A, capacity=4, jobs=0)
     for generation in range(count):
-        fleet.begin(generation)
-        fleet.offer(work(1, generation=generation))
+        fleet.jobs.begin(generation)
+        fleet.jobs.offer(work(1, generation=generation))
         now = generation / 100
         fleet.beat(A, beat(4, seen=fleet.members[A].number), now)
         for digest in digests(fleet.dispatch(now), A):
             fleet.result(A, result(digest), now)
-    assert len(fleet._accepted) <= 2
-    assert fleet.open == 0
-    assert len(fleet._tags) == len(fleet._queue) == 0
+    assert len(fleet.jobs._accepted) <= 2
+    assert not fleet.jobs
+    assert len(fleet.jobs._tags) == len(fleet.jobs._queue) == 0
 
 
 @pytest.mark.long
@@ -328,13 +328,13 @@ def test_memory_stays_flat_through_a_hundred_thousand_generations_of_churn():
     held = []
     for generation in range(100_000):
         now = generation / 10
-        fleet.begin(generation)
-        fleet.offer(work(2, generation=generation))
+        fleet.jobs.begin(generation)
+        fleet.jobs.offer(work(2, generation=generation))
         name = f"w/{random.integers(2**32):08x}"
         fleet.welcome(name, 2, "f", now)
         fleet.beat(A, beat(4, seen=fleet.members[A].number), now)
         fleet.beat(name, beat(2, seen=fleet.members[name].number), now)
-        while fleet.open:
+        while fleet.jobs:
             for who in (A, name):
                 for digest in digests(fleet.dispatch(now), who):
                     if random.random() < 0.8:
@@ -418,7 +418,7 @@ def heavy(count):
 
 def test_a_large_batch_has_the_time_that_its_link_takes():
     fleet = fleet_of(A, jobs=0)
-    fleet.offer(heavy(1))
+    fleet.jobs.offer(heavy(1))
     parts = fleet.dispatch(0.0)
     for second in range(1, 8):  # 360 kB at 50 kB a second
         fleet.beat(A, beat(seen=second), float(second))
@@ -430,7 +430,7 @@ def test_a_large_batch_has_the_time_that_its_link_takes():
 def test_what_a_later_batch_has_overtaken_was_lost_and_is_sent_again_at_once():
     fleet = fleet_of(A, jobs=2)
     (first,) = fleet.dispatch(0.0)
-    fleet.offer(work(3, generation=1))
+    fleet.jobs.offer(work(3, generation=1))
     done = first.content.work[0].job.digest
     fleet.result(A, result(done), 0.1)
     (second,) = fleet.dispatch(0.1)
@@ -466,7 +466,7 @@ def test_a_newcomer_beside_a_known_worker_gets_a_copy_for_which_nobody_waits():
     now = known(fleet, A)
     fleet.welcome(B, 1, "f", now)
     fleet.beat(B, beat(), now)
-    fleet.offer(work(6, generation=1))
+    fleet.jobs.offer(work(6, generation=1))
     held = digests(fleet.dispatch(now), A)
     (copied,) = digests(fleet.dispatch(now), B)
     assert copied == held[-1], "of what begins last where it is"
@@ -485,7 +485,7 @@ def test_a_host_that_dies_again_and_again_is_given_what_it_brings_back_in_time()
         name = f"b/{life:08x}"
         fleet.welcome(name, 1, "f", now)
         fleet.beat(name, beat(), now)
-        fleet.offer(work(4, generation=life + 1))
+        fleet.jobs.offer(work(4, generation=life + 1))
         fleet.dispatch(now)
         fleet.dispatch(now)
         fleet.depart(name, now + 1.5)

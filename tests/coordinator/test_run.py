@@ -181,7 +181,7 @@ def test_a_drive_without_its_upload_is_an_error(bench):
     bench.verdicts()
     bench.deliver(name, replace(result_of(job), upload=None))
     assert ("refused" in verdict for *_, verdict in bench.verdicts())
-    assert "not kept" in next(iter(bench.run.fleet.failures[0].errors.values()))
+    assert "not kept" in next(iter(bench.run.fleet.jobs.failures[0].errors.values()))
 
 
 def test_a_restart_in_mid_upload_asks_again_and_what_was_kept_stays(bench):

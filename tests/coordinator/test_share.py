@@ -35,7 +35,7 @@ class Simulated:
         vector = travelling(np.full(4, 1.0 + self.generation))
         work = make_work(SPEC, "evaluate", self.generation, 0, vector, range(5000, 5000 + episodes))
         self._open[self.generation] = {each.job.digest for each in work}
-        self.fleet.offer(work)
+        self.fleet.jobs.offer(work)
 
     def run(self, until):
         """Until so many generations are closed."""
@@ -66,7 +66,7 @@ class Simulated:
             self.closed.append(self.now)
             self.generation += 1
             self.before_next(self.generation)
-            self.fleet.begin(self.generation)
+            self.fleet.jobs.begin(self.generation)
             self._offer()
 
     def before_next(self, generation):
@@ -74,7 +74,7 @@ class Simulated:
 
     def _offer(self):
         vector = travelling(np.arange(4.0) + self.generation)
-        self.fleet.offer(make_work(SPEC, "score", self.generation, 0, vector, range(self.jobs)))
+        self.fleet.jobs.offer(make_work(SPEC, "score", self.generation, 0, vector, range(self.jobs)))
         self._left = self.jobs
 
     def _give(self):
@@ -205,8 +205,8 @@ def test_a_lost_workers_evaluation_goes_again_at_once():
     fleet = Fleet(1.0)
     for name in ("a/00000001", "b/00000002"):
         fleet.welcome(name, 1, "f", 0.0)
-    fleet.offer(make_work(SPEC, "evaluate", 0, 0, travelling(np.zeros(4)), [1]))
-    fleet.offer(make_work(SPEC, "score", 1, 0, travelling(np.ones(4)), range(9)))
+    fleet.jobs.offer(make_work(SPEC, "evaluate", 0, 0, travelling(np.zeros(4)), [1]))
+    fleet.jobs.offer(make_work(SPEC, "score", 1, 0, travelling(np.ones(4)), range(9)))
     head = {**HEAD, "nonce": "n", "seen": 0, "load": 0.0, "steps_per_second": 0.0, "drawn_by": "-"}
     fleet.beat("a/00000001", Beat(**head, capacity=1, slots=1, queued=(), running=(), unacked=()), 0.0)
     assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work] == ["evaluate", "score"]

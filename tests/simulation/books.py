@@ -7,6 +7,7 @@ from collections import Counter
 from dreamfleet.common.messages import TAG_BYTES
 from dreamfleet.coordinator.fleet import Fleet, Send
 from dreamfleet.coordinator.run import Run
+from dreamfleet.coordinator.wanted import WantedJobs
 from dreamfleet.worker.service.backlog import KEPT_VECTORS
 from tests.simulation.violation import Violation
 from tests.simulation.worker import Worker
@@ -22,12 +23,12 @@ ASKS_WITHIN = 4.0  # a worker that sees another life than it has joined
 
 def check_coordinator(fleet: Fleet) -> None:
     """Leases, queue and counts agree with each other, and nothing is kept that nobody needs."""
-    wanted, members = fleet._wanted, fleet.members
-    queued = [digest for *_, digest in (*fleet._queue, *fleet._spare) if digest in wanted]
+    jobs, members = fleet.jobs, fleet.members
+    queued = _queued(jobs)
     named = set(queued)
     _require(len(named) == len(queued), "the queue names a job twice")
     in_slack = 0
-    for digest, each in wanted.items():
+    for digest, each in jobs.items():
         holders = each.holders
         _require(each.queued == (digest in named), "a job and the queue disagree on whether it is queued")
         _require(bool(holders) or digest in named, "a wanted job is neither held nor queued")
@@ -40,21 +41,23 @@ def check_coordinator(fleet: Fleet) -> None:
         _require(name == member.identity, "a member has another's name")
         for digest, lease in member.leases.items():
             _require(lease.absent <= MOST_ABSENCES, "a lease outlives beats that do not show it")
-            _require(digest in wanted, "a lease is on a job that nobody wants")
-            _require(name in wanted[digest].holders, "a lease is on a job that it does not hold")
+            _require(digest in jobs, "a lease is on a job that nobody wants")
+            _require(name in jobs[digest].holders, "a lease is on a job that it does not hold")
         _require(not (member.silent and member.leases), "a silent worker holds leases")
         _require(all(number <= member.number for number in member.unseen), "a batch is unseen that was not sent")
-    _require(fleet._in_slack == in_slack, "what fills the slack is miscounted")
-    _require(fleet._tags.keys() == {digest[:TAG_BYTES] for digest in wanted}, "tags are not those of the wanted jobs")
-    _require(fleet._failing.keys() <= wanted.keys(), "a job fails that nobody wants")
-    _require(not fleet._accepted.keys() & wanted.keys(), "an accepted job is wanted still")
+    _require(jobs._in_slack == in_slack, "what fills the slack is miscounted")
+    _require(jobs._tags.keys() == {digest[:TAG_BYTES] for digest in jobs}, "tags are not those of the wanted jobs")
+    _require(jobs._failing.keys() <= jobs.keys(), "a job fails that nobody wants")
+    _require(not jobs._accepted.keys() & jobs.keys(), "an accepted job is wanted still")
     _require(all(count >= 0 for count in fleet.counts.values()), "a count is negative")
 
 
 def check_opening(fleet: Fleet, run: Run) -> None:
     """As a generation opens, the ones before the last are forgotten."""
     oldest = run.generation.number - 1
-    _require(all(number >= oldest for number in fleet._accepted.values()), "an old acceptance is remembered", "memory")
+    _require(
+        all(number >= oldest for number in fleet.jobs._accepted.values()), "an old acceptance is remembered", "memory"
+    )
 
 
 def check_credit(fleet: Fleet, send: Send) -> None:
@@ -123,10 +126,9 @@ def check_rest(fleet: Fleet, run: Run) -> None:
 
 def check_end(fleet: Fleet, run: Run) -> None:
     """An ended run wants nothing."""
-    _require(fleet.open == 0 and fleet.leased == 0, "an ended run wants jobs", "memory")
-    left = [digest for *_, digest in (*fleet._queue, *fleet._spare) if digest in fleet._wanted]
-    _require(not left, "queued at the end")
-    _require(not fleet._tags and not fleet._failing, "an ended run keeps books", "memory")
+    _require(not fleet.jobs and fleet.leased == 0, "an ended run wants jobs", "memory")
+    _require(not _queued(fleet.jobs), "queued at the end")
+    _require(not fleet.jobs._tags and not fleet.jobs._failing, "an ended run keeps books", "memory")
     _require(len(run.slack.collections.uploads) == 0, "an upload is open at the end", "memory")
 
 
@@ -137,6 +139,10 @@ def at_rest(fleet: Fleet, run: Run) -> bool:
     except Violation:
         return False
     return True
+
+
+def _queued(jobs: WantedJobs) -> list[bytes]:
+    return [digest for *_, digest in (*jobs._queue, *jobs._spare) if digest in jobs]
 
 
 def _require(holds: bool, otherwise: str, rule: str = "books") -> None:

@@ -24,6 +24,7 @@ from dreamfleet.coordinator.generations import Generations
 from dreamfleet.coordinator.member import Member, Sent
 from dreamfleet.coordinator.run import Run
 from dreamfleet.coordinator.uploads import Uploads as Intake
+from dreamfleet.coordinator.wanted import WantedJobs
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.membership import Membership
 from dreamfleet.worker.service.outbox import Outbox
@@ -78,7 +79,7 @@ def mutant(target: Any, attribute: str, **shape: Any) -> Callable[[Callable[...,
     return register
 
 
-# The coordinator: fleet, member, packing.
+# The coordinator: fleet, wanted jobs, member, packing.
 
 
 @mutant(Fleet, "_release")
@@ -93,11 +94,11 @@ def fleet_forgets_to_queue_what_a_lost_worker_held(_original):
 @mutant(Fleet, "_judge")
 def fleet_accepts_what_it_has_accepted_already(original):
     def judge(self, identity, result):
-        wanted = self._wanted.get(result.digest)
+        work = self.jobs.work(result.digest)
         works = self.__dict__.setdefault("mutated", {})
-        if wanted is not None:
-            works[result.digest] = wanted.work
-        elif result.digest in self._accepted and result.digest in works:
+        if work is not None:
+            works[result.digest] = work
+        elif self.jobs.is_accepted(result.digest) and result.digest in works:
             return "accepted", works[result.digest]
         return original(self, identity, result)
 
@@ -107,8 +108,8 @@ def fleet_accepts_what_it_has_accepted_already(original):
 @mutant(Fleet, "_judge")
 def fleet_believes_every_result_of_the_generation_that_is_open(original):
     def judge(self, identity, result):
-        if result.digest not in self._wanted and result.fitness is not None and self._wanted:
-            return original(self, identity, replace(result, digest=next(iter(self._wanted))))
+        if result.digest not in self.jobs and result.fitness is not None and self.jobs:
+            return original(self, identity, replace(result, digest=next(iter(self.jobs))))
         return original(self, identity, result)
 
     return judge
@@ -116,7 +117,7 @@ def fleet_believes_every_result_of_the_generation_that_is_open(original):
 
 @mutant(fleet, "Sent")
 def fleet_never_sends_a_batch_again(_original):
-    return lambda content, _now: Sent(content, math.inf)
+    return lambda content, _at, first: Sent(content, math.inf, first)
 
 
 @mutant(fleet, "ABSENT_BEATS")
@@ -137,9 +138,9 @@ def fleet_sends_verdicts_before_they_are_durable(original):
     return lambda self, now, *, durable=True: original(self, now, durable=True)
 
 
-@mutant(Fleet, "_hold")
-def fleet_does_not_count_what_fills_the_slack(_original):
-    return lambda self, wanted, identity: wanted.holders.add(identity)
+@mutant(WantedJobs, "hold")
+def jobs_that_fill_the_slack_are_not_counted(_original):
+    return lambda self, digest, worker, **_: self[digest].holders.add(worker)
 
 
 @mutant(Fleet, "result")
@@ -153,24 +154,25 @@ def fleet_gives_no_verdict_on_a_duplicate(original):
     return result
 
 
-@mutant(Fleet, "begin")
-def fleet_remembers_every_acceptance(_original):
+@mutant(WantedJobs, "begin")
+def jobs_remember_every_acceptance(_original):
     return lambda self, generation: None
 
 
-@mutant(Fleet, "pardon")
-def fleet_does_not_forget_failures_when_it_is_resumed(_original):
+@mutant(WantedJobs, "pardon")
+def jobs_keep_their_failures_when_the_run_is_resumed(_original):
     return lambda self: None
 
 
-@mutant(Fleet, "_unwant")
-def fleet_keeps_the_tag_of_an_answered_job(original):
-    def unwant(self, digest):
+@mutant(WantedJobs, "remove")
+def jobs_keep_their_tags_when_they_are_answered(original):
+    def remove(self, digest):
         tags = dict(self._tags)
-        original(self, digest)
+        wanted = original(self, digest)
         self._tags = tags
+        return wanted
 
-    return unwant
+    return remove
 
 
 @mutant(Member, "credit")
@@ -268,12 +270,12 @@ def intake_never_lets_go_of_a_file(_original):
 
 @mutant(Backlog, "take_in")
 def backlog_counts_a_batch_twice(original):
-    def take_in(self, batch):
+    def take_in(self, batch, held):
         seen, ahead = self.seen, set(self._ahead)
         if batch.number > seen and batch.number not in ahead:
-            return original(self, batch)
+            return original(self, batch, held)
         self.seen, self._ahead = batch.number - 1, set()
-        refused = original(self, batch)
+        refused = original(self, batch, held)
         self.seen, self._ahead = seen, ahead
         return refused
 
@@ -282,8 +284,8 @@ def backlog_counts_a_batch_twice(original):
 
 @mutant(Backlog, "take_in")
 def backlog_believes_a_digest_that_is_not_of_its_content(original):
-    def take_in(self, batch):
-        self._jobs.update({job.digest: job for job, _ in original(self, batch)})
+    def take_in(self, batch, held):
+        self._jobs.update({job.digest: job for job, _ in original(self, batch, held)})
         return []
 
     return take_in

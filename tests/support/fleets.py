@@ -67,12 +67,12 @@ class Played:
     def _next_generation(self):
         self._number += 1
         self._begun = self.now
-        self.fleet.begin(self._number)
+        self.fleet.jobs.begin(self._number)
         for candidate in range(self._population):
             vector = travelling(np.arange(float(self._size)) + candidate + self._number * 1000)
             work = make_work(SPEC, "score", self._number, candidate, vector, range(1000, 1000 + self._episodes))
             self._open |= {each.job.digest for each in work}
-            self.fleet.offer(work)
+            self.fleet.jobs.offer(work)
 
     def _tick(self):
         self._dispatch()
