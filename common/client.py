@@ -19,9 +19,9 @@ from dreamfleet.common.controller import Controller, ControllerShape
 from dreamfleet.common.errors import ConnectionFailedError, ControllerError, RefusedError, UsageError
 from dreamfleet.common.fields import known
 from dreamfleet.common.messages import ControlReply
-from dreamfleet.common.runs import StoredGeneration
 from dreamfleet.common.session import Network, enqueue_into, open_session
 from dreamfleet.common.status import OVER, Population, Status, WorkerStatus, read_document, read_status
+from dreamfleet.common.stored import StoredGeneration
 
 QUERY_TIMEOUT = 3.0
 PATIENCE = 1.0  # seconds without an answer after which a watched run counts as left

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from dreamfleet.common.messages import HOTTEST, TaskSpec
-from dreamfleet.common.runs import RunFolder, RunSettings, StoredEvaluation
+from dreamfleet.common.runs import RunFolder
+from dreamfleet.common.stored import RunSettings, StoredEvaluation
 
 
 def deciding_evaluation(settings: RunSettings, generation: int) -> int:

@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common import schema
 from dreamfleet.common.bounds import finite, saturated
-from dreamfleet.common.codec import MalformedError, from_plain
-from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
-from dreamfleet.common.fields import OPTIONAL, written
 from dreamfleet.common.files import check_regular, is_folder, is_there
-from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.keys import check_run_name
-from dreamfleet.common.messages import Between, Count, Packages, TaskSpec
+from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.printable import one_line
+from dreamfleet.common.stored import (
+    RunSettings,
+    StoredConfirmation,
+    StoredEvaluation,
+    StoredGeneration,
+    StoredResult,
+    best_of,
+)
 
 JOURNAL = "journal.sqlite"
 BUNDLE = "bundle.zip"
@@ -35,145 +36,6 @@ ARCHIVE = "archive"
 ROLLOUTS = "rollouts"
 CONFIRMED = "confirmed"  # the fact's name
 ENDING = "ending"  # the fact's name: the limit that was reached, while the last evaluations are waited for and after
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """What is frozen with a run; a change asks for another run."""
-
-    task: TaskSpec
-    controller: ControllerShape
-    population: Annotated[int, Between(2, 10**5)]
-    episodes: Annotated[int, Between(1, 10**4)]
-    sigma0: float
-    covariance: Literal["diagonal", "full"]
-    seed: Count
-    evaluate_every: Count  # generations; 0: never
-    evaluation_episodes: Annotated[int, Between(1, 10**4)]
-    # Only the better half of the candidates drives the second half of the episodes.
-    racing: bool = field(default=False, metadata=OPTIONAL)
-    features: Literal["zh", "z"] = field(default="zh", metadata=OPTIONAL)  # what the controller sees
-    collect_every: Count = field(default=0, metadata=OPTIONAL)  # generations; 0: never
-    collect_episodes: Annotated[int, Between(1, 10**4)] = field(default=1, metadata=OPTIONAL)
-    # What a dream's temperature is multiplied by when evaluations fall; 1: never.
-    heat: float = field(default=1.0, metadata=OPTIONAL)
-    packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions its fingerprint names
-    optimiser: str = field(default="cma", metadata=OPTIONAL)  # registered, or module:attribute
-    optimiser_options: tuple[str, ...] = field(default=(), metadata=OPTIONAL)  # each as name=value
-    # Fresh tracks on which the reported mean is driven as the run ends; 0: never, as in runs from before this.
-    confirm_episodes: Annotated[int, Between(0, 10**4)] = field(default=0, metadata=OPTIONAL)
-
-    def to_json(self) -> str:
-        """The text kept in the journal."""
-        return json.dumps(written(self), sort_keys=True)
-
-    @classmethod
-    def from_json(cls, text: str) -> RunSettings:
-        """Read what `to_json` wrote; `JournalError` if it is damaged."""
-        try:
-            return from_plain(cls, json.loads(text))
-        except (ValueError, TypeError, MalformedError, RecursionError) as error:
-            raise JournalError(f"the journal's settings are damaged: {error}") from error
-
-
-@dataclass(frozen=True)
-class StoredResult:
-    """One accepted result."""
-
-    kind: str
-    generation: int
-    candidate: int
-    episode: int
-    seed: int
-    fitness: float
-    steps: int
-    seconds: float
-    worker: str
-    fingerprint: str
-
-
-@dataclass(frozen=True)
-class StoredGeneration:
-    """Statistics of a closed generation over its candidates' fitness."""
-
-    number: int
-    mean: float
-    std: float
-    best: float
-    worst: float
-    sigma: float
-    steps: int
-    seconds: float
-
-
-@dataclass(frozen=True)
-class StoredEvaluation:
-    """A finished evaluation of a generation's mean on validation tracks."""
-
-    generation: int
-    episodes: int
-    mean: float
-    std: float
-
-    @property
-    def error(self) -> float:
-        """Standard error of the mean."""
-        return self.std / math.sqrt(self.episodes)
-
-    def behind(self, other: StoredEvaluation) -> bool:
-        """Whether it lies below the other one by more than two standard errors of the difference."""
-        return other.mean - self.mean > 2 * math.hypot(other.error, self.error)
-
-
-@dataclass(frozen=True)
-class StoredConfirmation:
-    """What a run reports as it ends: `generation`'s mean on fresh validation tracks, which took no part in any choice.
-
-    It was chosen among the evaluated means by other tracks. So `mean` is not the best of many looks but one look, and
-    its expected value is what the controller is worth.
-    """
-
-    generation: int
-    episodes: int
-    mean: float
-    std: float  # of the sample: `episodes - 1` in the denominator
-    closed: int  # generations that were closed by then: the evaluations of these were chosen among
-
-    @property
-    def error(self) -> float:
-        """Standard error of the mean."""
-        return self.std / math.sqrt(self.episodes)
-
-    def covers(self, best: StoredEvaluation | None) -> bool:
-        """Whether the best evaluated mean was among those that were chosen among; else the run went on and is ahead."""
-        return best is None or best.generation < self.closed
-
-    def to_json(self) -> str:
-        """The text kept in the journal."""
-        return json.dumps(asdict(self), allow_nan=False)
-
-    @classmethod
-    def from_json(cls, text: str) -> StoredConfirmation:
-        """Read what `to_json` wrote; `JournalError` if it is damaged."""
-        try:
-            return from_plain(cls, json.loads(text))
-        except (ValueError, TypeError, MalformedError) as error:
-            raise JournalError(f"the journal's confirmed score is damaged: {error}") from error
-
-
-def best_of(evaluations: Iterable[StoredEvaluation]) -> StoredEvaluation | None:
-    """The one of the highest mean; of equals the first."""
-    return max(evaluations, key=lambda each: each.mean, default=None)
-
-
-def told(found: StoredEvaluation | StoredConfirmation | None) -> str:
-    """A mean's score in words, and whether it can be trusted."""
-    if found is None:
-        return "the last mean; it was not evaluated"
-    score = f"generation {found.generation}'s mean scored {found.mean:.1f} ± {found.error:.1f} (standard error)"
-    if isinstance(found, StoredConfirmation):
-        return f"{score} on {found.episodes} fresh validation tracks; confirmed: they took no part in its choice"
-    return f"{score} on {found.episodes} validation tracks; provisional: it is the best of several looks"
 
 
 class RunFolder:

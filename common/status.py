@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.fields import OPTIONAL, known
 from dreamfleet.common.messages import MAX_MESSAGE, Count, Length, Seconds, Text, Word
-from dreamfleet.common.runs import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 
 SCHEMA = 2
 PARTS = ("", "generation", "workers", "history", "candidates", "best")

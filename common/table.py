@@ -12,8 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from dreamfleet.common.printable import printable
-from dreamfleet.common.runs import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.status import FailureStatus, OpenGeneration, Progress, Status, WorkerStatus
+from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 
 STATE_STYLES = {
     "running": "green",

@@ -11,8 +11,8 @@ from typing import Any, Protocol, TypeVar
 from dreamfleet.common.codec import encode_json
 from dreamfleet.common.fields import written
 from dreamfleet.common.messages import MAX_MESSAGE
-from dreamfleet.common.runs import StoredGeneration
 from dreamfleet.common.status import SCHEMA, Population, WorkerStatus
+from dreamfleet.common.stored import StoredGeneration
 from dreamfleet.coordinator.generation import Standing
 from dreamfleet.coordinator.status import Snapshot
 

@@ -15,7 +15,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import COLDEST, HOTTEST, MAX_OPTIONS, TaskSpec
 from dreamfleet.common.presets import check_preset, preset_help
-from dreamfleet.common.runs import RunSettings
+from dreamfleet.common.stored import RunSettings
 from dreamfleet.common.tasks import GYM, check_task, describe_task, describes_itself
 
 DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"

@@ -17,8 +17,8 @@ from math import fsum
 import numpy as np
 
 from dreamfleet.common.messages import TaskSpec
-from dreamfleet.common.runs import StoredConfirmation
 from dreamfleet.common.seeds import CHOOSING, CONFIRMING, validation_seeds
+from dreamfleet.common.stored import StoredConfirmation
 from dreamfleet.coordinator.jobs import Work, make_work
 
 FINALISTS = 4

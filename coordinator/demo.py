@@ -25,7 +25,8 @@ from dreamfleet.common.client import Client
 from dreamfleet.common.config import option
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.processes import Child, ask, call, spoken
-from dreamfleet.common.runs import CONTROLLER, best_of, open_run
+from dreamfleet.common.runs import CONTROLLER, open_run
+from dreamfleet.common.stored import best_of
 from dreamfleet.common.table import run_panel
 
 REFRESH = 0.5

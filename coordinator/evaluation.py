@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dreamfleet.common.messages import TaskSpec
-from dreamfleet.common.runs import StoredEvaluation
 from dreamfleet.common.seeds import validation_seeds
+from dreamfleet.common.stored import StoredEvaluation
 from dreamfleet.coordinator.jobs import Work, make_work
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DreamfleetError, JournalError, UsageError
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.runs import RunSettings
+from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.checkpoint import PREFIX, Checkpoint, Head
 from dreamfleet.coordinator.optimisers.api import Search
 from dreamfleet.coordinator.optimisers.registry import build_optimiser

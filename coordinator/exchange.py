@@ -10,7 +10,7 @@ from dreamfleet.common.bounds import LONGEST_EPISODE, excess, most_steps
 from dreamfleet.common.errors import DreamfleetError, InternalError
 from dreamfleet.common.messages import Beat, HelloRequest, Kind, Result, ResultBatch, UploadPart
 from dreamfleet.common.printable import shortened
-from dreamfleet.common.runs import RunSettings
+from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.admission import Refusals, differ, refusal
 from dreamfleet.coordinator.failure import LONGEST_ERROR, Failure
 from dreamfleet.coordinator.fleet import Fleet, Send

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.heat import Heat
-from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.seeds import training_seed
+from dreamfleet.common.stored import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.evolution import Evolution
 from dreamfleet.coordinator.generation import Generation, Standing
 from dreamfleet.coordinator.history import History

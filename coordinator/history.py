@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from dreamfleet.common.bounds import finite, saturated
-from dreamfleet.common.runs import StoredGeneration
+from dreamfleet.common.stored import StoredGeneration
 
 
 class History:

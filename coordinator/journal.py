@@ -23,7 +23,8 @@ from dreamfleet.common.bounds import LARGEST_FITNESS, LONGEST_EPISODE, finite, m
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.files import sync_folder, write_aside
 from dreamfleet.common.messages import Job, Result
-from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder
+from dreamfleet.common.stored import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.collection import Collection
 from dreamfleet.coordinator.confirmation import Finalist

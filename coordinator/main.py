@@ -13,8 +13,9 @@ from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageE
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import Intervals
 from dreamfleet.common.processes import spoken
-from dreamfleet.common.runs import ARCHIVE, BUNDLE, JOURNAL, RunSettings, open_run, run_lock
+from dreamfleet.common.runs import ARCHIVE, BUNDLE, JOURNAL, open_run, run_lock
 from dreamfleet.common.session import Network
+from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.custody import Custody
 from dreamfleet.coordinator.fleet import Fleet

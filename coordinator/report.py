@@ -13,7 +13,7 @@ import numpy as np
 
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import JournalError
-from dreamfleet.common.runs import RunSettings, StoredConfirmation, StoredEvaluation
+from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation
 
 PACE = 5.0  # seconds between two writings of a mean that was not evaluated: each waits for the disk
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from dreamfleet.common.heat import deciding_evaluation
 from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import ENDING, RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs import ENDING
+from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.exchange import Exchange

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import CONFIRMED, CONTROLLER, RunSettings, StoredConfirmation, StoredEvaluation
+from dreamfleet.common.runs import CONFIRMED, CONTROLLER
+from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.coordinator.collection import Collection, Collections
 from dreamfleet.coordinator.confirmation import FINALISTS, Confirmation
 from dreamfleet.coordinator.evaluation import Evaluation, Evaluations

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
 from dreamfleet.common.files import is_file, is_there
-from dreamfleet.common.runs import JOURNAL, RunFolder, RunSettings, open_run
+from dreamfleet.common.runs import JOURNAL, RunFolder, open_run
 from dreamfleet.common.shelf import find_controller
+from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.config import RunConfig
 from dreamfleet.coordinator.journal import Journal

@@ -146,7 +146,8 @@ def _end_on_signals() -> None:
 
 def _report(args: argparse.Namespace, run: Run, request: RunRequest, *, nothing_new: bool) -> None:
     from dreamfleet.common.processes import spoken
-    from dreamfleet.common.runs import CONTROLLER, told
+    from dreamfleet.common.runs import CONTROLLER
+    from dreamfleet.common.stored import told
 
     again = spoken("coordinator", "--resume", request.name, "--runs-dir", request.runs_dir)
     path = request.runs_dir / request.name / CONTROLLER

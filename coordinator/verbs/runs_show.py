@@ -8,8 +8,9 @@ import sys
 from dataclasses import asdict
 
 from dreamfleet.common.listing import add_json, print_rows
-from dreamfleet.common.runs import RunSettings, StoredGeneration, best_of, open_run, told
+from dreamfleet.common.runs import open_run
 from dreamfleet.common.site import offer
+from dreamfleet.common.stored import RunSettings, StoredGeneration, best_of, told
 
 SUMMARY = "show one run from its journal: settings, history, evaluations"
 EXTRAS = ()

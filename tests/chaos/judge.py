@@ -22,8 +22,9 @@ import numpy as np
 
 from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.runs import best_of, open_run
+from dreamfleet.common.runs import open_run
 from dreamfleet.common.seeds import TEST
+from dreamfleet.common.stored import best_of
 from dreamfleet.common.threads import pin_thread_pools
 from tests.support.processes import processes_in
 

@@ -6,7 +6,7 @@ import pytest
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.heat import deciding_evaluation, spec_at
 from dreamfleet.common.messages import HOTTEST
-from dreamfleet.common.runs import RunSettings, StoredEvaluation
+from dreamfleet.common.stored import RunSettings, StoredEvaluation
 from tests.support.samples import SPEC
 
 EVERY = 5

@@ -6,7 +6,7 @@ import pytest
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.fields import written
 from dreamfleet.common.messages import TaskSpec
-from dreamfleet.common.runs import RunSettings
+from dreamfleet.common.stored import RunSettings
 from dreamfleet.common.tasks import Description
 from dreamfleet.coordinator.config import RunConfig, settings_of
 from dreamfleet.coordinator.start import Start

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import CONTROLLER, RunFolder, StoredEvaluation
+from dreamfleet.common.runs import CONTROLLER, RunFolder
 from dreamfleet.common.seeds import CHOOSING, CONFIRMING, VALIDATION
+from dreamfleet.common.stored import StoredEvaluation
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.confirmation import FINALISTS, Confirmation, Finalist
 from tests.coordinator.test_run import SETTINGS, A, Bench

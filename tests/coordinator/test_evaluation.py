@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dreamfleet.common.runs import StoredEvaluation
+from dreamfleet.common.stored import StoredEvaluation
 from dreamfleet.coordinator.evaluation import Evaluation, Evaluations
 from tests.support.samples import SPEC
 

@@ -6,7 +6,8 @@ import pytest
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import RunFolder, RunSettings, StoredGeneration, open_run, run_lock
+from dreamfleet.common.runs import RunFolder, open_run, run_lock
+from dreamfleet.common.stored import RunSettings, StoredGeneration
 from dreamfleet.coordinator.confirmation import Finalist
 from dreamfleet.coordinator.evaluation import Evaluation
 from dreamfleet.coordinator.generation import Generation

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.messages import MAX_PART, TAG_BYTES, Beat, HelloRequest, Result, ResultBatch, UploadPart
-from dreamfleet.common.runs import RunFolder, RunSettings
+from dreamfleet.common.runs import RunFolder
+from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.fleet import Fleet
 from dreamfleet.coordinator.journal import Journal

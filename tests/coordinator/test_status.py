@@ -9,8 +9,8 @@ import pytest
 
 from dreamfleet.common.codec import from_plain
 from dreamfleet.common.messages import MAX_MESSAGE, MAX_OPTIONS, Result
-from dreamfleet.common.runs import StoredGeneration
 from dreamfleet.common.status import PARTS, Population, read_document, read_status
+from dreamfleet.common.stored import StoredGeneration
 from dreamfleet.coordinator import answers
 from dreamfleet.coordinator.generation import Standing
 from dreamfleet.coordinator.history import History

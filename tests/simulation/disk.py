@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from dreamfleet.common.messages import Job, Result
-from dreamfleet.common.runs import JOURNAL, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs import JOURNAL
+from dreamfleet.common.stored import StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.collection import Collection
 from dreamfleet.coordinator.confirmation import Finalist
 from dreamfleet.coordinator.evaluation import Evaluation

@@ -16,8 +16,8 @@ import numpy as np
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.heat import spec_at
 from dreamfleet.common.messages import Job, TaskSpec
-from dreamfleet.common.runs import RunSettings, StoredEvaluation
 from dreamfleet.common.seeds import collection_seed, training_seed, validation_seeds
+from dreamfleet.common.stored import RunSettings, StoredEvaluation
 from dreamfleet.coordinator.optimisers.api import Search
 from tests.simulation.schedule import Shape
 

@@ -23,7 +23,6 @@ from dreamfleet.common.messages import (
     Verdict,
     ViewFrame,
 )
-from dreamfleet.common.runs import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.status import (
     FailureStatus,
     OpenGeneration,
@@ -35,6 +34,7 @@ from dreamfleet.common.status import (
     WorkerCount,
     WorkerStatus,
 )
+from dreamfleet.common.stored import RunSettings, StoredEvaluation, StoredGeneration
 
 UID = "0123456789abcdef" * 2
 SPEC = TaskSpec(task="car-racing", bundle="ab" * 32, horizon=1000, patience=100)

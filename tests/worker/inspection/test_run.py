@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.runs import CONTROLLER, RunSettings, StoredGeneration, run_paths
+from dreamfleet.common.runs import CONTROLLER, run_paths
+from dreamfleet.common.stored import RunSettings, StoredGeneration
 from dreamfleet.coordinator.evaluation import Evaluation
 from dreamfleet.coordinator.jobs import travelling
 from dreamfleet.coordinator.journal import Journal
