@@ -89,7 +89,7 @@ class Fleet:
             return
         self._hear(member, now)
         self._guests.pop(identity, None)
-        if beat.seen > member.number:
+        if beat.seen > member.number or beat.seen < member.first:
             self._count_on(member, beat.seen)
         member.observe(beat, now)
         running = {self.jobs.named(run.tag): run.steps for run in beat.running}
@@ -239,9 +239,13 @@ class Fleet:
         member.put_off(gap)
 
     def _count_on(self, member: Member, seen: int) -> None:
-        """It counts batches as of before its last hello, whose answer it did not hear: what it is given follows on."""
+        """It counts batches otherwise than this side does: what it is given follows on from what it has seen.
+
+        It says hello and may not hear the answer, so that it counts as before; or a beat from before its hello was
+        late, and what was believed then, `member.first`, is more than it has ever seen since.
+        """
         self._release(member)
-        member.number = seen
+        member.number = member.first = seen
 
     def _recall_record(self, identity: str, old: Member | None) -> HostRecord:
         """What is known of this worker's host, which every life of it goes on from."""

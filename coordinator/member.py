@@ -60,6 +60,7 @@ class Member:
     silent: bool = False
     known: bool = False  # by a beat: anybody can say hello
     number: int = 0
+    first: int = 0  # batches that it had seen when they were first counted
     seen: int = 0
     load: float = 0.0
     steps_per_second: float = 0.0

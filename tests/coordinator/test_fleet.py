@@ -448,6 +448,19 @@ def test_a_worker_that_did_not_hear_the_answer_to_its_hello_is_given_work_at_onc
     assert [send.number for send in fleet.dispatch(1.1) if send.content.work] == [8]
 
 
+def test_a_late_beat_from_before_its_hello_does_not_leave_a_worker_counting_otherwise_for_good():
+    fleet = fleet_of(A, jobs=4)
+    fleet.welcome(A, 1, "f", 1.0)
+    fleet.beat(A, beat(), 1.1)
+    fleet.dispatch(1.1)
+    fleet.beat(A, beat(seen=7), 1.2)
+    assert [send.number for send in fleet.dispatch(1.2) if send.content.work] == [8]
+    fleet.beat(A, beat(seen=1), 1.3)
+    assert [send.number for send in fleet.dispatch(1.3) if send.content.work] == [2]
+    fleet.beat(A, beat(seen=2), 1.4)
+    assert not fleet.members[A].unseen
+
+
 def test_what_a_host_is_known_for_outlives_its_hello_and_its_worker():
     fleet = fleet_of(A, jobs=3)
     known(fleet, A, seconds=0.5)

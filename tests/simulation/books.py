@@ -61,9 +61,9 @@ def check_opening(fleet: Fleet, run: Run) -> None:
 
 
 def check_credit(fleet: Fleet, send: Send) -> None:
-    """A batch with new work fits the credit of its worker."""
+    """A batch with new work fits the credit of its worker; one that is sent again was within it then."""
     member = fleet.members[send.identity]
-    if send.content.work and send.number == member.number:
+    if send.content.work and send.number == member.number and member.unseen[send.number].times == 1:
         _require(len(member.leases) <= 2 * member.capacity, "a worker was given more than its credit", "credit")
 
 
@@ -74,6 +74,7 @@ class Sendings:
         self._awake = 0.0
         self._last: dict[tuple[int, int], float] = {}
         self._times: Counter[tuple[int, int]] = Counter()
+        self._arrived: dict[int, tuple[int, float]] = {}  # member -> batches that it has seen, and since when
 
     def pass_by(self, seconds: float) -> None:
         """It was awake for so long."""
@@ -88,9 +89,12 @@ class Sendings:
     def check(self, fleet: Fleet) -> None:
         """What a present worker has not seen is sent again before long."""
         for member in fleet.members.values():
+            if self._arrived.get(id(member), (-1, 0.0))[0] != member.seen:
+                self._arrived[id(member)] = member.seen, self._awake
+            _, free = self._arrived[id(member)]  # its link, of what was sent before
             for number in member.unseen if member.present else ():
                 batch = id(member), number
-                quiet = self._awake - self._last.get(batch, self._awake)
+                quiet = self._awake - max(self._last.get(batch, self._awake), free)
                 link = member.record.delivery(sum(sent.content.size for sent in member.unseen.values()))
                 patience = (SENT_AGAIN_WITHIN + link) * min(2 ** (self._times[batch] - 1), MOST_PATIENCE)
                 _require(quiet <= patience, "a batch that was not seen is not sent again", "promptness")
