@@ -1,4 +1,4 @@
-"""Key expressions of protocol version 1, and the names that may stand in them."""
+"""Key expressions of protocol version 2, and the names that may stand in them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import socket
 
 from dreamfleet.common.errors import UsageError
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 ROOT = "dreamfleet"
 _PREFIX = f"{ROOT}/v{PROTOCOL_VERSION}"
 _RUN = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")

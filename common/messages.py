@@ -1,4 +1,4 @@
-"""Every message of protocol version 1, as frozen dataclasses.
+"""Every message of protocol version 2, as frozen dataclasses.
 
 The annotations are the schema: `dreamfleet.common.codec` derives its checks from them. A message is at
 most `MAX_MESSAGE` bytes; batches split, long vectors and files travel in parts.
@@ -140,11 +140,12 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class JobBatch(Message):
-    """Coordinator to one worker; numbers count from 1 without a gap for one worker's life and one coordinator's."""
+    """Coordinator to one worker; each `numbering` counts from 1 without a gap."""
 
     SCHEMA: ClassVar[str] = "job"
 
     nonce: Word
+    numbering: Count
     number: Count
     vectors: tuple[VectorPart, ...]
     jobs: tuple[Job, ...]
@@ -189,7 +190,8 @@ class Beat(Message):
     SCHEMA: ClassVar[str] = "beat"
 
     nonce: Word
-    seen: Annotated[int, Between(0, MOST_BATCHES)]  # every batch up to this number has arrived
+    numbering: Count
+    seen: Annotated[int, Between(0, MOST_BATCHES)]  # every batch of this numbering up to this number has arrived
     capacity: Annotated[int, Between(0, MAX_LEASES)]  # slots x the task's width
     slots: Annotated[int, Between(0, MOST_SLOTS)]
     queued: Annotated[tuple[Tag, ...], Length(0, MAX_LEASES)]
@@ -277,6 +279,7 @@ class HelloReply:
     packages: Packages = field(
         default=NUMERIC_PACKAGES, metadata=OPTIONAL
     )  # whose versions the run's fingerprint names
+    numbering: Count = field(default=0, metadata=OPTIONAL)  # of the batches that follow; it rises
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -47,10 +47,13 @@ class Exchange:
             self._fleet.notes.append(f"refused worker {request.worker}: {found[0]}")
         return found
 
-    def admit(self, request: HelloRequest, now: float) -> None:
-        """Welcome a worker; what it computes is compared with the run's fingerprint once there is one."""
+    def admit(self, request: HelloRequest, now: float) -> int:
+        """Welcome a worker; what it computes is compared with the run's fingerprint once there is one.
+
+        Its batches are counted anew, under the number that is returned.
+        """
         self.refusals.admitted(request.worker)
-        self._fleet.welcome(request.worker, request.slots, request.fingerprint, now)
+        return self._fleet.welcome(request.worker, request.slots, request.fingerprint, now)
 
     def beat(self, worker: str, beat: Beat, now: float) -> None:
         """A worker says what it holds."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dreamfleet.common.messages import MOST_SLOTS, Beat, Kind, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.choice import Choice
@@ -35,6 +35,7 @@ class Send:
     """A numbered batch for one worker; 0 is an empty one that only says that the worker is known."""
 
     identity: str
+    numbering: int
     number: int
     content: Content
 
@@ -45,6 +46,7 @@ class Fleet:
     def __init__(self, beat: float, evaluation_share: float = 0.25) -> None:
         self._beat = beat
         self._tail = Tail(beat)
+        self._numberings = 0  # that were begun
         self._ticked: float | None = None
         self._now = 0.0  # of what is being handled
         self._records: dict[str, HostRecord] = {}  # by name of a host, the one that joined last at the end
@@ -61,8 +63,11 @@ class Fleet:
         for digest in self.jobs.of_kind(kind):
             self._cancel(digest, self.jobs.remove(digest))
 
-    def welcome(self, identity: str, slots: int, fingerprint: str, now: float) -> None:
-        """A worker was admitted; it has credit from its first beat on, and until then it is one of a few guests."""
+    def welcome(self, identity: str, slots: int, fingerprint: str, now: float) -> int:
+        """A worker was admitted; it has credit from its first beat on, and until then it is one of a few guests.
+
+        Its batches are counted anew, under the number that is returned.
+        """
         old = self.members.get(identity)
         if old is not None:
             self._forget(old)
@@ -70,7 +75,10 @@ class Fleet:
             self._forget(self.members[next(iter(self._guests))])
         self._guests[identity] = None
         slots, born = min(slots, MOST_SLOTS), now if old is None else old.born
-        self.members[identity] = Member(identity, slots, fingerprint, now, born, self._recall_record(identity, old))
+        record = self._recall_record(identity, old)
+        member = Member(identity, slots, fingerprint, self._next_numbering(), now, born, record)
+        self.members[identity] = member
+        return member.numbering
 
     def depart(self, identity: str, now: float) -> None:
         """A worker's token vanished."""
@@ -89,8 +97,9 @@ class Fleet:
             return
         self._hear(member, now)
         self._guests.pop(identity, None)
-        if beat.seen > member.number or beat.seen < member.first:
-            self._count_on(member, beat.seen)
+        if beat.numbering != member.numbering:
+            # It was late, or its worker has not heard of the welcome: what it had queued, it will then forget.
+            beat = replace(beat, seen=0, queued=())
         member.observe(beat, now)
         running = {self.jobs.named(run.tag): run.steps for run in beat.running}
         shown = {self.jobs.named(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
@@ -149,6 +158,7 @@ class Fleet:
             elif not member.silent and now - member.heard > SILENT_BEATS * self._beat:
                 member.silent = True
                 self._lose(member, now, "is silent")
+                member.begin_numbering(self._next_numbering())  # what it has not seen is not sent again
                 self.counts["silences"] += 1
 
     def dispatch(self, now: float, *, durable: bool = True) -> list[Send]:
@@ -171,7 +181,7 @@ class Fleet:
                 continue
             said = [*self._again(member, now), *self._news(member, given.get(member.identity, ()), durable, now)]
             if not said and member.awaits_word(now, ANSWER_BEATS * self._beat):
-                said = [Send(member.identity, 0, Content())]
+                said = [Send(member.identity, member.numbering, 0, Content())]
             member.spoken = now if said else member.spoken
             sends += said
         return sends
@@ -187,7 +197,7 @@ class Fleet:
             sent = member.unseen[number]
             sent.at, sent.times = now, sent.times + 1
             self.counts["resent_batches"] += 1
-            yield Send(member.identity, number, sent.content)
+            yield Send(member.identity, member.numbering, number, sent.content)
 
     def _news(self, member: Member, given: Sequence[Work], durable: bool, now: float) -> Iterator[Send]:
         """Batches that it was not sent yet."""
@@ -197,7 +207,7 @@ class Fleet:
             member.unseen[member.number] = Sent(content, now, now)
             for work in content.work:
                 self._take(member, work.job.digest, Lease(member.number, handful))
-            yield Send(member.identity, member.number, content)
+            yield Send(member.identity, member.numbering, member.number, content)
         member.cancels = []
         if durable:
             member.verdicts = []
@@ -227,6 +237,10 @@ class Fleet:
                 member.cancels.append(digest)
             self.counts["discarded_steps"] += (lease and lease.steps) or 0
 
+    def _next_numbering(self) -> int:
+        self._numberings += 1
+        return self._numberings
+
     def _hear(self, member: Member, now: float) -> None:
         member.heard = now
         member.silent = False
@@ -237,15 +251,6 @@ class Fleet:
         for sent in member.unseen.values():
             sent.at += gap
         member.put_off(gap)
-
-    def _count_on(self, member: Member, seen: int) -> None:
-        """It counts batches otherwise than this side does: what it is given follows on from what it has seen.
-
-        It says hello and may not hear the answer, so that it counts as before; or a beat from before its hello was
-        late, and what was believed then, `member.first`, is more than it has ever seen since.
-        """
-        self._release(member)
-        member.number = member.first = seen
 
     def _recall_record(self, identity: str, old: Member | None) -> HostRecord:
         """What is known of this worker's host, which every life of it goes on from."""

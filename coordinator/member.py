@@ -52,6 +52,7 @@ class Member:
     identity: str
     slots: int
     fingerprint: str
+    numbering: int  # of its batches
     heard: float
     born: float = 0.0
     record: HostRecord = field(default_factory=HostRecord)
@@ -60,7 +61,6 @@ class Member:
     silent: bool = False
     known: bool = False  # by a beat: anybody can say hello
     number: int = 0
-    first: int = 0  # batches that it had seen when they were first counted
     seen: int = 0
     load: float = 0.0
     steps_per_second: float = 0.0
@@ -74,6 +74,11 @@ class Member:
     unseen: dict[int, Sent] = field(default_factory=dict)
     verdicts: list[Verdict] = field(default_factory=list)
     cancels: list[bytes] = field(default_factory=list)
+
+    def begin_numbering(self, numbering: int) -> None:
+        """What it is given is counted from 1 again."""
+        self.numbering, self.number, self.seen = numbering, 0, 0
+        self.unseen.clear()
 
     def observe(self, beat: Beat, now: float) -> None:
         """Take what a beat says of the worker itself."""

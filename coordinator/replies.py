@@ -18,8 +18,10 @@ from dreamfleet.coordinator.run import Run
 LONGEST_VERB = 60  # characters of a verb that nobody knows
 
 
-def hello_reply(run: Run, name: str, nonce: str, intervals: Intervals, why: str = "", remedy: str = "") -> HelloReply:
-    """Welcome to a worker; with `why`, a refusal."""
+def hello_reply(
+    run: Run, name: str, nonce: str, intervals: Intervals, why: str = "", remedy: str = "", numbering: int = 0
+) -> HelloReply:
+    """Welcome to a worker, whose batches have this `numbering`; with `why`, a refusal."""
     return HelloReply(
         accepted=not why,
         protocol_min=keys.PROTOCOL_VERSION,
@@ -34,6 +36,7 @@ def hello_reply(run: Run, name: str, nonce: str, intervals: Intervals, why: str 
         spec={} if why else written(run.settings.task),
         intervals={} if why else asdict(intervals),
         packages=run.settings.packages,
+        numbering=numbering,
     )
 
 

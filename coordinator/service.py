@@ -234,9 +234,11 @@ class Service:
             refusal = misunderstanding(request)
             if request is not None and refusal is None:
                 refusal = self._exchange.refusal(request, self._run.settings)
-                if refusal is None:
-                    self._exchange.admit(request, now)
-            reply = hello_reply(self._run, self._name, self._nonce, self._intervals, *(refusal or ()))
+            numbering = 0
+            if request is not None and refusal is None:
+                numbering = self._exchange.admit(request, now)
+            why, remedy = refusal or ("", "")
+            reply = hello_reply(self._run, self._name, self._nonce, self._intervals, why, remedy, numbering)
             query.reply(keys.hello(self._name), encode_json(reply), encoding="application/json")
 
     def _control(self, query: zenoh.Query) -> None:
@@ -268,6 +270,7 @@ class Service:
                 run_uid=self._run.uid,
                 incarnation=self._run.incarnation,
                 nonce=self._nonce,
+                numbering=send.numbering,
                 number=send.number,
                 vectors=tuple(content.vectors),
                 jobs=tuple(work.job for work in content.work),

@@ -1,4 +1,4 @@
-"""The codec and the golden fixtures: each message as the first version wrote it, decoded for ever.
+"""The codec and the golden fixtures: each message as its protocol version first wrote it, each document for ever.
 
 A new message's fixture is written by `python -m tests.common.test_codec`; one that exists is never written again.
 """
@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dreamfleet.common.codec import Inbox, MalformedError, decode, decode_json, encode, encode_json, encoding
+from dreamfleet.common.keys import PROTOCOL_VERSION
 from dreamfleet.common.messages import MAX_MESSAGE, WIRE, Beat, HelloRequest, JobBatch, ResultBatch
 from tests.support.mutations import mutations
 from tests.support.samples import JSON, MSGPACK, VECTOR_ID
@@ -24,8 +25,8 @@ GOLDEN = Path(__file__).parent / "golden"
 
 
 @pytest.mark.parametrize("name", MSGPACK)
-def test_golden_messages_decode_for_ever(name):
-    sample, payload = MSGPACK[name], (GOLDEN / f"{name}.v1.msgpack").read_bytes()
+def test_golden_messages_decode_as_long_as_their_version_is_spoken(name):
+    sample, payload = MSGPACK[name], (GOLDEN / f"{name}.v{PROTOCOL_VERSION}.msgpack").read_bytes()
     assert decode(type(sample), payload) == sample
     assert encode(sample) == payload
 
@@ -42,7 +43,7 @@ def test_every_wire_message_has_a_fixture():
 
 
 def test_the_encoding_names_the_schema():
-    assert encoding(JobBatch) == "application/msgpack;dreamfleet.job.v1"
+    assert encoding(JobBatch) == "application/msgpack;dreamfleet.job.v2"
 
 
 def damaged(name="result", **changes):
@@ -67,7 +68,7 @@ def result_with(**changes):
         (b"\x91" * 5000, "not msgpack"),
         (msgpack.packb([1]), "not a message"),
         (msgpack.packb({1: 2}), "not msgpack"),
-        (damaged(v=2), "unknown version"),
+        (damaged(v=1), "unknown version"),
         (damaged(v=None), "unknown version"),
         (damaged(extra=1), "wrong fields"),
         (damaged(run_uid="short"), "wrong length"),
@@ -190,9 +191,10 @@ def test_half_a_surrogate_pair_is_no_text_in_json_or_out():
 
 
 if __name__ == "__main__":
-    for kind, samples, write in (("msgpack", MSGPACK, encode), ("json", JSON, encode_json)):
+    messages, documents = ("msgpack", PROTOCOL_VERSION, MSGPACK, encode), ("json", 1, JSON, encode_json)
+    for kind, version, samples, write in (messages, documents):
         for name, sample in samples.items():
-            path = GOLDEN / f"{name}.v1.{kind}"
+            path = GOLDEN / f"{name}.v{version}.{kind}"
             if not path.exists():
                 path.write_bytes(write(sample))
 

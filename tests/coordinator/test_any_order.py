@@ -57,13 +57,23 @@ class Worker:
     def take(self, send):
         content = send.content
         batch = JobBatch(
-            **HEAD, nonce="n", number=send.number, vectors=tuple(content.vectors), cancels=tuple(content.cancels),
+            **HEAD, nonce="n", numbering=send.numbering, number=send.number,
+            vectors=tuple(content.vectors), cancels=tuple(content.cancels),
             jobs=tuple(work.job for work in content.work), verdicts=tuple(content.verdicts),
         )  # fmt: skip
+        if batch.numbering < self.backlog.numbering:
+            return
+        if batch.numbering > self.backlog.numbering:
+            self.begin(batch.numbering)
         assert not self.backlog.take_in(batch)
         self.outbox.settle(verdict.digest for verdict in batch.verdicts)
         self.running = [digest for digest in self.running if digest not in batch.cancels]
         self.fill()
+
+    def begin(self, numbering):
+        self.backlog.begin(numbering)
+        self.backlog.clear()
+        self.outbox.resend_all()
 
     def fill(self):
         while len(self.running) < SLOTS and len(self.outbox) <= 4 * SLOTS and (work := self.backlog.take(1)):
@@ -133,17 +143,16 @@ class AnyOrder(RuleBasedStateMachine):
         if name in self.hosts:
             self.fleet.depart(self.hosts[name], self.now)
 
-    @rule(name=names)
-    def hello(self, name):
+    @rule(name=names, heard=st.booleans())
+    def hello(self, name, heard=True):
+        """The answer may be lost, if it is not the first of this life of the coordinator."""
         identity = self.hosts.get(name)
         if identity is not None:
             worker = self.workers[identity]
-            self.fleet.welcome(identity, SLOTS, "f", self.now)
-            worker.joined = self.life
-            worker.backlog.begin()
-            worker.backlog.clear()
-            worker.outbox.resend_all()
-            self.batches = [each for each in self.batches if each[0] != identity]  # as `_drop_batches` does
+            numbering = self.fleet.welcome(identity, SLOTS, "f", self.now)
+            if worker.joined != self.life or heard:
+                worker.joined = self.life
+                worker.begin(numbering)
 
     @rule(name=names, steps=st.integers(0, 2000), rate=st.sampled_from([0.0, 1.0, 1000.0]))
     def beat(self, name, steps=5, rate=100.0):
@@ -152,7 +161,8 @@ class AnyOrder(RuleBasedStateMachine):
             return  # the service drops what another life was told
         worker = self.workers[identity]
         beat = Beat(
-            **HEAD, nonce="n", seen=worker.backlog.seen, capacity=SLOTS, slots=SLOTS, load=0.0, drawn_by="-",
+            **HEAD, nonce="n", numbering=worker.backlog.numbering, seen=worker.backlog.seen, capacity=SLOTS,
+            slots=SLOTS, load=0.0, drawn_by="-",
             queued=tuple(digest[:TAG_BYTES] for digest in worker.backlog.queued), steps_per_second=rate,
             running=tuple(Running(digest[:TAG_BYTES], steps) for digest in worker.running),
             unacked=tuple(digest[:TAG_BYTES] for digest in worker.outbox.digests),

@@ -1,14 +1,25 @@
 import tracemalloc
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from dreamfleet.common.messages import TAG_BYTES, Beat, Result, Running
-from dreamfleet.coordinator.fleet import DEPARTURE_GRACE, FORGOTTEN, MOST_GUESTS, MOST_SLOTS, SILENT_BEATS, VISIT, Fleet
+from dreamfleet.coordinator.fleet import DEPARTURE_GRACE, FORGOTTEN, MOST_GUESTS, MOST_SLOTS, SILENT_BEATS, VISIT
+from dreamfleet.coordinator.fleet import Fleet as _Fleet
 from dreamfleet.coordinator.jobs import make_work, travelling
 from dreamfleet.coordinator.tail import UPLOAD_SECONDS
 from tests.support.samples import HEAD, SPEC
+
+
+class Fleet(_Fleet):
+    """Beats are of the numbering that their worker was welcomed with, if they name no other."""
+
+    def beat(self, identity, beat, now):
+        member = self.members.get(identity)
+        super().beat(identity, replace(beat, numbering=beat.numbering or (member.numbering if member else 0)), now)
+
 
 A, B = "a/00000001", "b/00000002"
 BEAT = 1.0
@@ -19,9 +30,10 @@ def work(count, kind="score", generation=0):
     return make_work(SPEC, kind, generation, 0, vector, range(1000, 1000 + count))
 
 
-def beat(capacity=1, seen=0, queued=(), running=(), unacked=(), rate=0.0, steps=5):
+def beat(capacity=1, seen=0, numbering=0, queued=(), running=(), unacked=(), rate=0.0, steps=5):
     return Beat(
-        **HEAD, nonce="n", seen=seen, capacity=capacity, slots=capacity, load=0.0, steps_per_second=rate, drawn_by="-",
+        **HEAD, nonce="n", numbering=numbering, seen=seen, capacity=capacity, slots=capacity, load=0.0,
+        steps_per_second=rate, drawn_by="-",
         queued=tuple(digest[:TAG_BYTES] for digest in queued),
         running=tuple(Running(digest[:TAG_BYTES], steps) for digest in running),
         unacked=tuple(digest[:TAG_BYTES] for digest in unacked),
@@ -443,22 +455,40 @@ def test_a_worker_that_did_not_hear_the_answer_to_its_hello_is_given_work_at_onc
     for _ in range(3):
         for digest in digests(fleet.dispatch(0.0), A)[:1]:
             fleet.result(A, result(digest), 0.0)
-    fleet.welcome(A, 1, "f", 1.0)
-    fleet.beat(A, beat(seen=7), 1.1)
-    assert [send.number for send in fleet.dispatch(1.1) if send.content.work] == [8]
+    first = fleet.members[A].numbering
+    second = fleet.welcome(A, 1, "f", 1.0)
+    fleet.beat(A, beat(seen=7, numbering=first), 1.1)
+    (send,) = [send for send in fleet.dispatch(1.1) if send.content.work]
+    assert (send.numbering, send.number) == (second, 1)
+    assert second > first
+    fleet.beat(A, beat(seen=1, numbering=second), 1.2)
+    assert not fleet.members[A].unseen
 
 
-def test_a_late_beat_from_before_its_hello_does_not_leave_a_worker_counting_otherwise_for_good():
+def test_a_worker_that_was_silent_is_not_waited_for_to_see_what_is_not_sent_again():
     fleet = fleet_of(A, jobs=4)
+    lost = fleet.dispatch(0.0)[0]
+    fleet.tick(0.5)
+    for now in np.arange(1.0, SILENT_BEATS * BEAT + 1.5):
+        fleet.tick(now)
+    assert fleet.members[A].silent
+    fleet.beat(A, beat(numbering=lost.numbering), 7.0)
+    (send,) = [send for send in fleet.dispatch(7.0) if send.content.work]
+    assert send.numbering > lost.numbering
+    assert send.number == 1
+
+
+def test_a_late_beat_from_before_a_hello_says_nothing_of_the_batches_since():
+    fleet = fleet_of(A, jobs=4)
+    first = fleet.members[A].numbering
     fleet.welcome(A, 1, "f", 1.0)
     fleet.beat(A, beat(), 1.1)
-    fleet.dispatch(1.1)
-    fleet.beat(A, beat(seen=7), 1.2)
-    assert [send.number for send in fleet.dispatch(1.2) if send.content.work] == [8]
-    fleet.beat(A, beat(seen=1), 1.3)
-    assert [send.number for send in fleet.dispatch(1.3) if send.content.work] == [2]
-    fleet.beat(A, beat(seen=2), 1.4)
-    assert not fleet.members[A].unseen
+    given = digests(fleet.dispatch(1.1), A)
+    fleet.beat(A, beat(seen=7, numbering=first), 1.2)
+    assert list(fleet.members[A].unseen) == [1]
+    for now in (1.3, 1.4):
+        fleet.beat(A, beat(seen=7, numbering=first), now)
+    assert list(fleet.members[A].leases) == given, "they are not missed in what cannot show them"
 
 
 def test_what_a_host_is_known_for_outlives_its_hello_and_its_worker():

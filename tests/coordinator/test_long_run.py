@@ -47,7 +47,7 @@ class LongRun:
         return process_time() - begun
 
     def beat(self):
-        head = {"run_uid": self.run.uid, "incarnation": 1, "nonce": "n", "drawn_by": "-"}
+        head = {"run_uid": self.run.uid, "incarnation": 1, "nonce": "n", "numbering": 1, "drawn_by": "-"}
         return Beat(
             **head,
             seen=self.seen,

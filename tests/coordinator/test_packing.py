@@ -20,7 +20,8 @@ def work_of(size, candidates, episodes):
 
 def message(content):
     return JobBatch(
-        **HEAD, nonce="n", number=1, vectors=tuple(content.vectors), jobs=tuple(work.job for work in content.work),
+        **HEAD, nonce="n", numbering=1, number=1, vectors=tuple(content.vectors),
+        jobs=tuple(work.job for work in content.work),
         cancels=tuple(content.cancels), verdicts=tuple(content.verdicts),
     )  # fmt: skip
 

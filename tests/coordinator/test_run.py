@@ -53,7 +53,9 @@ class Bench:
         self.begin()
 
     def beat(self, name, unacked=()):
-        head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "drawn_by": "-"}
+        numbering = self.run.fleet.members[name].numbering
+        head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "numbering": numbering,
+                "drawn_by": "-"}  # fmt: skip
         tags = tuple(digest[:TAG_BYTES] for digest in unacked)
         self.run.fleet.beat(
             name,

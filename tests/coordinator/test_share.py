@@ -101,7 +101,8 @@ class Simulated:
             running = tuple(Running(job.digest[:TAG_BYTES], 1) for turn in self._running[name] for job in turn)
             member = self.fleet.members[name]
             beat = Beat(
-                **HEAD, nonce="n", seen=member.number, capacity=self.slots * self.width, slots=self.slots, load=0.0,
+                **HEAD, nonce="n", numbering=member.numbering, seen=member.number,
+                capacity=self.slots * self.width, slots=self.slots, load=0.0,
                 steps_per_second=0.0, drawn_by="-", queued=tuple(job.digest[:TAG_BYTES] for job in backlog),
                 running=running, unacked=(),
             )  # fmt: skip
@@ -207,10 +208,11 @@ def test_a_lost_workers_evaluation_goes_again_at_once():
         fleet.welcome(name, 1, "f", 0.0)
     fleet.jobs.offer(make_work(SPEC, "evaluate", 0, 0, travelling(np.zeros(4)), [1]))
     fleet.jobs.offer(make_work(SPEC, "score", 1, 0, travelling(np.ones(4)), range(9)))
-    head = {**HEAD, "nonce": "n", "seen": 0, "load": 0.0, "steps_per_second": 0.0, "drawn_by": "-"}
+    head = {**HEAD, "nonce": "n", "numbering": 1, "seen": 0, "load": 0.0, "steps_per_second": 0.0, "drawn_by": "-"}
     fleet.beat("a/00000001", Beat(**head, capacity=1, slots=1, queued=(), running=(), unacked=()), 0.0)
     assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work] == ["evaluate", "score"]
     fleet.depart("a/00000001", 0.1)
     fleet.tick(1.0)
+    head["numbering"] = 2
     fleet.beat("b/00000002", Beat(**head, capacity=1, slots=1, queued=(), running=(), unacked=()), 1.0)
     assert [each.job.kind for send in fleet.dispatch(1.0) for each in send.content.work] == ["evaluate", "score"]

@@ -88,7 +88,7 @@ def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
     assert (ours["schema"], ours["run"], ours["state"], ours["slots"]) == (2, "test", "running", 1)
     assert ours["worker_list"][0]["state"] == "present"
     tool = Path(sys.executable).parent / "zenoh"
-    command = [tool, "--mode", "client", "--connect", processes.endpoint, "get", "-s", "dreamfleet/v1/test/status"]
+    command = [tool, "--mode", "client", "--connect", processes.endpoint, "get", "-s", "dreamfleet/v2/test/status"]
     done = subprocess.run([*command, "--decoder", "json"], capture_output=True, check=False, text=True, timeout=60)
     theirs = json.loads(
         done.stdout.strip().splitlines()[-1].split(":", 1)[-1] if done.stdout[:1] != "{" else done.stdout

@@ -66,12 +66,11 @@ class Coordinator:
             assert message == "gone"
             self.exchange.depart(worker, now)
 
-    def welcome(self, request: HelloRequest, now: float) -> bool:
-        """Whether the worker may join."""
+    def welcome(self, request: HelloRequest, now: float) -> int | None:
+        """How its batches are numbered; `None` where the worker may not join."""
         if self.exchange.refusal(request, self.run.settings):
-            return False
-        self.exchange.admit(request, now)
-        return True
+            return None
+        return self.exchange.admit(request, now)
 
     def turn(self, now: float) -> Iterator[Step]:
         """What follows the events in a turn of the loop, step by step: a life may end between any two."""
@@ -95,6 +94,7 @@ class Coordinator:
             run_uid=self.run.uid,
             incarnation=self.run.incarnation,
             nonce=self.nonce,
+            numbering=send.numbering,
             number=send.number,
             vectors=tuple(content.vectors),
             jobs=tuple(work.job for work in content.work),

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.keys import PROTOCOL_VERSION
 from dreamfleet.common.messages import (
     MAX_LEASES,
     TAG_BYTES,
@@ -46,6 +47,7 @@ class Welcome:
 
     nonce: str
     question: int
+    numbering: int
 
 
 @dataclass(frozen=True)
@@ -147,18 +149,23 @@ class Worker:
         self._waits_until = None
         if self.nonce is None:
             self.nonce = welcome.nonce
+            self.backlog.begin(welcome.numbering)
             self.membership.join(welcome.nonce, BEAT, now)
             return
+        if welcome.nonce != self.nonce or welcome.numbering > self.backlog.numbering:
+            self._begin_numbering(welcome.numbering)
         self.nonce = welcome.nonce
-        self.inbox = deque(event for event in self.inbox if not isinstance(event, JobBatch))
-        self.backlog.begin()
+        self.membership.rejoin(welcome.nonce, now)
+
+    def _begin_numbering(self, numbering: int) -> None:
+        self._batches.clear()
+        self.backlog.begin(numbering)
         self.backlog.clear()
         if self.backlog.seen:
             raise Violation("books", f"a worker begins a new numbering with {self.backlog.seen} batches seen")
         self.outbox.resend_all()
         self.uploads.resend_all()
         self._beat_at = 0.0
-        self.membership.rejoin(welcome.nonce, now)
 
     def turn(self, now: float) -> None:
         """A turn of its loop."""
@@ -193,7 +200,9 @@ class Worker:
         self._question += 1
         self.asked_at = now
         self._waits_until = now + HELLO_TIMEOUT
-        request = HelloRequest(1, 1, "0", self.identity, (TASK,), "f", self._shape.slots, NUMERIC_PACKAGES)
+        request = HelloRequest(
+            PROTOCOL_VERSION, PROTOCOL_VERSION, "0", self.identity, (TASK,), "f", self._shape.slots, NUMERIC_PACKAGES
+        )
         self._send((request, self._question))
 
     def _take(self, event: JobBatch | Token, now: float) -> None:
@@ -203,9 +212,11 @@ class Worker:
             else:
                 self.membership.vanish(event.nonce, now)
             return
-        if event.nonce != self.nonce:
+        if event.nonce != self.nonce or event.numbering < self.backlog.numbering:
             return
         self.membership.hear(now)
+        if event.numbering > self.backlog.numbering:
+            self._begin_numbering(event.numbering)
         self._note(event)
         for digest in event.cancels:
             self._abandon(digest, now)
@@ -227,7 +238,7 @@ class Worker:
 
     def _note(self, batch: JobBatch) -> None:
         """A batch counts once in a numbering; so many times may each of its jobs be begun."""
-        name = self._question, batch.number
+        name = batch.numbering, batch.number
         if name not in self._batches:
             self._batches.add(name)
             self._given.update(job.digest for job in batch.jobs)
@@ -292,6 +303,7 @@ class Worker:
             run_uid=UID,
             incarnation=1,
             nonce=self.nonce or "",
+            numbering=self.backlog.numbering,
             seen=self.backlog.seen,
             capacity=0 if self.membership.draining else self.capacity,
             slots=self._shape.slots,

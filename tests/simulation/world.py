@@ -324,8 +324,8 @@ class World:
             self.later(0.1, self._hello, host, request, question)
             return
         self._hear_all(life)
-        if life.welcome(request, self.now):
-            self._transmit_down(host, request.worker, Welcome(life.nonce, question))
+        if (numbering := life.welcome(request, self.now)) is not None:
+            self._transmit_down(host, request.worker, Welcome(life.nonce, question, numbering))
         self.wake_coordinator(LINGER)
 
     def _send_down(self, life: Coordinator, send: Send) -> None:

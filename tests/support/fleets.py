@@ -111,7 +111,7 @@ class Played:
     def _join(self, host):
         host.seen, host.queued, host.heard = set(), {}, self.now
         host.joins += 1
-        self.fleet.welcome(host.identity, 1, "f", self.now)
+        host.numbering = self.fleet.welcome(host.identity, 1, "f", self.now)
 
     def _arrive(self, host, send):
         if host.identity != send.identity:
@@ -169,7 +169,8 @@ class Played:
         while seen + 1 in host.seen:
             seen += 1
         beat = Beat(
-            **HEAD, nonce="n", seen=seen, capacity=host.width, slots=1, load=0.0, drawn_by="-",
+            **HEAD, nonce="n", numbering=host.numbering, seen=seen,
+            capacity=host.width, slots=1, load=0.0, drawn_by="-",
             steps_per_second=10 * len(host.running) / (host.turn + host.row * max(1, len(host.running))),
             queued=tuple(digest[:TAG_BYTES] for digest in host.queued),
             running=tuple(Running(digest[:TAG_BYTES], self._steps(host)) for digest in host.running),

@@ -40,6 +40,7 @@ class Hand:
         self.run = run
         self.spec = TaskSpec(task=task, bundle=bundle.sha256, horizon=100, patience=0)
         self.nonce, self.incarnation, self.run_uid = FIRST, 1, samples.UID
+        self.numbering = 0  # of its batches; each welcome begins one
         self.intervals = Intervals(beat=0.1, repeat=0.1)
         self.refusal = None
         self.packages = NUMERIC_PACKAGES  # that its run's fingerprint names
@@ -123,7 +124,10 @@ class Hand:
 
     def batch(self, number, *jobs, vectors=(WHOLE,), cancels=(), accepted=(), **head):
         verdicts = tuple(Verdict(job.digest, "accepted") for job in accepted)
-        whole = {"run_uid": self.run_uid, "incarnation": self.incarnation, "nonce": self.nonce, **head}
+        whole = {
+            "run_uid": self.run_uid, "incarnation": self.incarnation, "nonce": self.nonce,
+            "numbering": self.numbering, **head,
+        }  # fmt: skip
         return JobBatch(**whole, number=number, vectors=vectors, jobs=jobs, cancels=cancels, verdicts=verdicts)
 
     def send(self, number, *jobs, **content):
@@ -141,11 +145,13 @@ class Hand:
             self.worker = request.worker
             other = request.packages != self.packages
             why, remedy = self.refusal or (("other packages", "say hello again") if other else ("", ""))
+            self.numbering += not why
             reply = HelloReply(
-                accepted=not why, protocol_min=1, protocol_max=1, package="0", run=self.run, run_uid=self.run_uid,
-                incarnation=self.incarnation, nonce=self.nonce, why=why, remedy=remedy,
+                accepted=not why, protocol_min=keys.PROTOCOL_VERSION, protocol_max=keys.PROTOCOL_VERSION, package="0",
+                run=self.run, run_uid=self.run_uid, incarnation=self.incarnation, nonce=self.nonce,
+                why=why, remedy=remedy,
                 spec={} if why else asdict(self.spec), intervals={} if why else asdict(self.intervals),
-                packages=self.packages,
+                packages=self.packages, numbering=self.numbering,
             )  # fmt: skip
             query.reply(keys.hello(self.run), encode_json(reply), encoding="application/json")
         self._said.put(request)

@@ -54,13 +54,14 @@ def job(episode=0, kind="score", candidate=2, spec=SPEC, seed=1048576, temperatu
 
 MSGPACK = {
     "job": JobBatch(
-        **HEAD, nonce="c0ffee00c0ffee00", number=9,
+        **HEAD, nonce="c0ffee00c0ffee00", numbering=3, number=9,
         vectors=(VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR),),
         jobs=(job(), job(1), job(0, "evaluate"), job(0, "collect")), cancels=(b"\x05" * 32,),
         verdicts=tuple(Verdict(bytes([n]) * 32, word) for n, word in enumerate(VERDICTS)),
     ),
     "job-raised": JobBatch(
-        **HEAD, nonce="c0ffee00c0ffee00", number=10, vectors=(), jobs=(job(temperature=1.5),), cancels=(), verdicts=(),
+        **HEAD, nonce="c0ffee00c0ffee00", numbering=3, number=10, vectors=(),
+        jobs=(job(temperature=1.5),), cancels=(), verdicts=(),
     ),
     "result": ResultBatch(
         **HEAD, fingerprint="x86_64 avx2 glibc-2.36 numpy-2.4.6",
@@ -71,7 +72,7 @@ MSGPACK = {
         ),
     ),
     "beat": Beat(
-        **HEAD, nonce="c0ffee00c0ffee00", seen=9, capacity=4, slots=4, queued=(b"abcdefgh",),
+        **HEAD, nonce="c0ffee00c0ffee00", numbering=3, seen=9, capacity=4, slots=4, queued=(b"abcdefgh",),
         running=(Running(b"ABCDEFGH", 412),), unacked=(b"12345678",), load=1.5, steps_per_second=987.5,
         drawn_by="native",
     ),
@@ -86,6 +87,11 @@ JSON = {
     "hello-reply": HelloReply(
         True, 1, 1, "0.1.0", "night", UID, 3, "c0ffee00c0ffee00", "", "",
         {"task": "car-racing", "bundle": "ab" * 32, "horizon": 1000, "patience": 100}, {"beat": 1.0, "repeat": 1.0},
+    ),
+    "hello-reply-numbered": HelloReply(
+        True, 2, 2, "0.1.0", "night", UID, 3, "c0ffee00c0ffee00", "", "",
+        {"task": "car-racing", "bundle": "ab" * 32, "horizon": 1000, "patience": 100}, {"beat": 1.0, "repeat": 1.0},
+        numbering=4,
     ),
     "generation-event": GenerationEvent(
         v=1, run="night", run_uid=UID, incarnation=3, generation=7, mean=100.5, std=20.25, best=150.0, worst=-10.0,

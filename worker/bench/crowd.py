@@ -34,6 +34,7 @@ class Simulated:
 
     def __post_init__(self) -> None:
         self.backlog = Backlog(self.admission.spec)
+        self.backlog.begin(self.admission.numbering)
         self.outbox = Outbox(self.admission.intervals.repeat)
 
     def take(self, batch: JobBatch) -> None:
@@ -47,8 +48,9 @@ class Simulated:
         """What it holds: nothing but results without a verdict."""
         run = self.admission
         return Beat(
-            run_uid=run.run_uid, incarnation=run.incarnation, nonce=run.nonce, seen=self.backlog.seen,
-            capacity=self.slots, slots=self.slots, queued=(), running=(),
+            run_uid=run.run_uid, incarnation=run.incarnation, nonce=run.nonce,
+            numbering=self.backlog.numbering, seen=self.backlog.seen, capacity=self.slots, slots=self.slots, queued=(),
+            running=(),
             unacked=tuple(digest[:TAG_BYTES] for digest in self.outbox.digests), load=0.0, steps_per_second=0.0,
             drawn_by="-",
         )  # fmt: skip

@@ -32,6 +32,7 @@ class Admission:
     spec: TaskSpec
     intervals: Intervals
     packages: tuple[str, ...] = NUMERIC_PACKAGES  # whose versions the run's fingerprint names
+    numbering: int = 0  # of the batches that follow
 
 
 def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> Admission | None:
@@ -105,5 +106,6 @@ def _admission(reply: HelloReply) -> Admission:
             f"({error}); install dreamfleet {reply.package} here"
         ) from error
     return Admission(
-        keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages
-    )
+        keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages,
+        reply.numbering,
+    )  # fmt: skip

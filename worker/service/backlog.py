@@ -1,4 +1,4 @@
-"""What the coordinator has given this worker and no slot has taken yet. Pure.
+"""What the coordinator has given this worker and no slot has taken yet, in one numbering of its batches. Pure.
 
 Batches may come twice, late or out of order; each counts once, and a vector may be spread over several.
 """
@@ -19,17 +19,18 @@ class Backlog:
 
     def __init__(self, spec: TaskSpec) -> None:
         self._spec = spec
-        self.begin()
+        self.begin(0)
         self._jobs: OrderedDict[bytes, Job] = OrderedDict()
         self._vectors: OrderedDict[bytes, bytes | dict[int, bytes]] = OrderedDict()  # identity -> whole, or by offset
 
-    def begin(self) -> None:
-        """A new coordinator's life: its batches count from 1 again."""
+    def begin(self, numbering: int) -> None:
+        """The coordinator counts batches from 1 again, under another number."""
+        self.numbering = numbering
         self.seen = 0
         self._ahead: set[int] = set()
 
     def clear(self) -> None:
-        """Forget what is queued: a new coordinator's life gives it again."""
+        """Forget what is queued: it is given again."""
         self._jobs.clear()
 
     @property

@@ -60,6 +60,7 @@ class JoinedRun:
         self._events = events
         self._post = Post(line.session, line.identity, admission)
         self._backlog = Backlog(admission.spec)
+        self._backlog.begin(admission.numbering)
         self._outbox = Outbox(admission.intervals.repeat)
         self._uploads = Uploads(admission.intervals.repeat)
         self._rate = Rate(monotonic())
@@ -152,7 +153,12 @@ class JoinedRun:
         if (batch.run_uid, batch.nonce) != (self._admission.run_uid, self._admission.nonce):
             self._line.inbox.dropped["foreign coordinator"] += 1
             return
+        if batch.numbering < self._backlog.numbering:  # what it says was said again since
+            self._line.inbox.dropped["earlier numbering"] += 1
+            return
         self._membership.hear(monotonic())
+        if batch.numbering > self._backlog.numbering:  # it was welcomed again, and did not hear so
+            self._begin_numbering(batch.numbering)
         for digest in batch.cancels:
             self._slots.abandon(digest)
         for job, why in self._backlog.take_in(batch, self._slots.held):
@@ -195,6 +201,7 @@ class JoinedRun:
             self._beat_at = now + self._admission.intervals.beat
             self._post.beat(
                 self._slots,
+                numbering=self._backlog.numbering,
                 seen=self._backlog.seen,
                 capacity=0 if self._membership.draining else self._slots.capacity,
                 queued=self._backlog.queued,
@@ -218,22 +225,16 @@ class JoinedRun:
         anew = admission.nonce != self._admission.nonce
         self._admission = admission
         self._post = Post(self._line.session, self._line.identity, admission)
-        self._drop_batches()
-        self._backlog.begin()
-        self._backlog.clear()
-        self._outbox.resend_all()
-        self._uploads.resend_all()
-        self._beat_at = 0.0
+        if anew or admission.numbering > self._backlog.numbering:
+            self._begin_numbering(admission.numbering)
         self._membership.rejoin(admission.nonce, monotonic())
         level = logging.INFO if anew else logging.DEBUG  # an idle worker of a paused run asks again and again
         log.log(level, "joined run %s again, incarnation %d", admission.run, admission.incarnation)
 
-    def _drop_batches(self) -> None:
-        """Batches that wait in the queue are of the numbering that has ended, and would pass for later ones."""
-        kept = []
-        with suppress(queue.Empty):
-            while True:
-                kept.append(self._events.get_nowait())
-        for kind, event in kept:
-            if kind != "job":
-                self._events.put((kind, event))
+    def _begin_numbering(self, numbering: int) -> None:
+        """What was given under the last one is given again; what is unacknowledged is said again."""
+        self._backlog.begin(numbering)
+        self._backlog.clear()
+        self._outbox.resend_all()
+        self._uploads.resend_all()
+        self._beat_at = 0.0

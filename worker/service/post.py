@@ -61,14 +61,16 @@ class Post:
         self._put(keys.upload(self._run.run, self._identity), part)
 
     def beat(
-        self, slots: Slots, *, seen: int, capacity: int, queued: Sequence[bytes], unacked: Sequence[bytes], rate: float
-    ) -> None:
+        self, slots: Slots, *, numbering: int, seen: int, capacity: int, queued: Sequence[bytes],
+        unacked: Sequence[bytes], rate: float,
+    ) -> None:  # fmt: skip
         """What this worker holds: batches up to `seen`, jobs queued and running, results without a verdict."""
         running: list[Running] = slots.running
         beat = Beat(
             run_uid=self._run.run_uid,
             incarnation=self._run.incarnation,
             nonce=self._run.nonce,
+            numbering=numbering,
             seen=seen,
             capacity=capacity,
             slots=len(slots),

@@ -9,7 +9,9 @@ WHOLE = VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR
 
 
 def batch(number, jobs=(), vectors=(WHOLE,), cancels=()):
-    return JobBatch(**HEAD, nonce="n", number=number, vectors=vectors, jobs=jobs, cancels=cancels, verdicts=())
+    return JobBatch(
+        **HEAD, nonce="n", numbering=0, number=number, vectors=vectors, jobs=jobs, cancels=cancels, verdicts=()
+    )
 
 
 def test_jobs_come_out_in_order_with_their_vector():
@@ -97,7 +99,7 @@ def test_vectors_that_no_job_needs_are_let_go():
 def test_a_new_life_of_the_coordinator_counts_from_one_again():
     backlog = Backlog(SPEC)
     backlog.take_in(batch(1, (job(0),)))
-    backlog.begin()
+    backlog.begin(1)
     backlog.clear()
     assert not backlog.take(1)
     backlog.take_in(batch(1, (job(1),)))

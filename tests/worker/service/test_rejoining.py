@@ -33,6 +33,24 @@ def test_it_follows_its_run_into_the_coordinators_next_life(stage, cached):
     assert hand.result(queued).fitness is not None
 
 
+def test_a_worker_that_did_not_hear_that_it_was_welcomed_again_learns_it_by_the_batches(stage, cached):
+    hand = stage.hand(tasks.SLOW_TOY)
+    stage.worker()
+    hand.ready()
+    done, running, queued, later = (hand.job(number) for number in range(4))
+    hand.send(1, done, running, queued)
+    hand.result(done)
+    hand.numbering += 1
+    hand.send(1, later)
+    beat = hand.beat(lambda beat: beat.numbering == hand.numbering and beat.seen == 1)
+    assert tag(queued) not in beat.queued
+    assert hand.results(done, later) >= {done.digest, later.digest}
+    hand.send(2, queued, numbering=hand.numbering - 1)
+    hand.send(2, hand.job(4))
+    assert hand.result(hand.job(4)).fitness is not None
+    assert queued.digest not in hand.results(hand.job(4)), "a batch of the numbering before was late"
+
+
 def test_a_coordinators_next_life_hears_a_drive_from_the_beginning(stage, cached):
     hand = stage.hand(tasks.HEAVY)
     stage.worker()
