@@ -41,18 +41,14 @@ def measure(drives: Sequence[WitnessedDrive], opening: int) -> Knowledge:
 
     Steps on which the road is lost are left out: what the road ahead is like means nothing there.
     """
-    names = [name for name in drives[0].truth if name != OFF] if drives else []
-    kept = [_on_road(drive, opening) for drive in drives]
-    if sum(rows.any() for rows in kept) < 2:
-        raise UsageError(
-            "a probe needs two drives on the road at least, one to fit and one to judge: drive --episodes 6"
-        )
-    truths = [
-        np.stack([drive.truth[name][rows] for name in names], axis=1) for drive, rows in zip(drives, kept, strict=True)
-    ]
+    seen = [(drive, rows) for drive in drives if (rows := _on_road(drive, opening)).any()]
+    if len(seen) < 2:
+        raise UsageError("a probe needs two drives on the road at least, one to fit and one to judge: raise --episodes")
+    names = [name for name in drives[0].truth if name != OFF]
+    truths = [np.stack([drive.truth[name][rows] for name in names], axis=1) for drive, rows in seen]
     found: dict[str, list[Estimate]] = {}
     for inputs, columns in (("z", drives[0].latent.shape[1]), ("zh", None)):
-        features = [drive.features[rows, :columns].astype(np.float64) for drive, rows in zip(drives, kept, strict=True)]
+        features = [drive.features[rows, :columns].astype(np.float64) for drive, rows in seen]
         for kind, fit in PROBES:
             found[f"{inputs}_{kind}"] = explained(truths, _held_out(features, truths, fit))
     deviations = np.concatenate(truths).std(axis=0)
@@ -60,18 +56,26 @@ def measure(drives: Sequence[WitnessedDrive], opening: int) -> Knowledge:
         Known(name, float(deviations[row]), {how: shares[row] for how, shares in found.items()})
         for row, name in enumerate(names)
     )
-    return Knowledge(len(drives), sum(len(each) for each in truths), known)
+    return Knowledge(len(seen), sum(len(each) for each in truths), known)
 
 
 def explained(truths: Sequence[Floats], predictions: Sequence[Floats]) -> list[Estimate]:
-    """R² of each column over all drives' rows; its standard error by leaving out one drive at a time (jackknife)."""
+    """R² of each column over all drives' rows; its standard error by leaving out one drive at a time (jackknife).
+
+    Of a column that never changes nothing can be explained: 0.
+    """
     mean = np.concatenate(truths).mean(axis=0)
     wrong = np.stack([((p - t) ** 2).sum(axis=0) for p, t in zip(predictions, truths, strict=True)])
     spread = np.stack([((t - mean) ** 2).sum(axis=0) for t in truths])
-    whole = 1 - wrong.sum(axis=0) / np.maximum(spread.sum(axis=0), 1e-12)
-    without = 1 - (wrong.sum(axis=0) - wrong) / np.maximum(spread.sum(axis=0) - spread, 1e-12)
+    whole = _share(wrong.sum(axis=0), spread.sum(axis=0))
+    without = _share(wrong.sum(axis=0) - wrong, spread.sum(axis=0) - spread)
     error = np.sqrt((len(truths) - 1) / len(truths) * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     return [Estimate(float(value), float(each)) for value, each in zip(whole, error, strict=True)]
+
+
+def _share(wrong: Floats, spread: Floats) -> Floats:
+    changes = spread > 1e-9
+    return np.where(changes, 1 - wrong / np.where(changes, spread, 1.0), 0.0)
 
 
 def _held_out(features: Sequence[Floats], truths: Sequence[Floats], fit: Fit) -> list[Floats]:

@@ -19,8 +19,8 @@ from dreamfleet.worker.inspection.disturbance import Disturbance
 from dreamfleet.worker.inspection.hand import Hand
 from dreamfleet.worker.inspection.mind import Mind
 from dreamfleet.worker.inspection.rollout import ZOOM
-from dreamfleet.worker.scoring.episode import Course, play
-from dreamfleet.worker.tasks.api import Assignment, Truthful
+from dreamfleet.worker.scoring.episode import Begin, Course, play
+from dreamfleet.worker.tasks.api import Assignment, Collected, Task, Truthful
 from dreamfleet.worker.tasks.registry import find_task
 
 Floats = NDArray[np.float32]
@@ -34,7 +34,8 @@ class WitnessConfig:
 
     `noise` is the standard deviation of what is added to each action, in halves of its range. The road is lost where
     the car is off it for `lasting` steps in a row; a drive goes on `after` steps from the first of them. The first
-    `opening` steps are not measured: in CarRacing's the camera comes down.
+    `opening` steps are not measured: in CarRacing's the camera comes down. `anywhere` begins drives at a random place
+    of their world, for drivers that never come far.
     """
 
     noise: float = 0.3
@@ -43,6 +44,7 @@ class WitnessConfig:
     after: int = 40
     opening: int = ZOOM
     first_seed: int = VALIDATION.start
+    anywhere: bool = False
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class Witness:
     def __init__(self, mind: Mind, hand: Hand, disturbance: Disturbance, truth: Callable[[], dict[str, float]]) -> None:
         self._mind, self._hand, self._disturbance, self._truth = mind, hand, disturbance, truth
         self._minds = [mind] if hand.mind in (None, mind) else [mind, hand.mind]
-        self.notes = Notes()
+        self.notes, self.hidden = Notes(), mind.hidden
 
     def begin(self, _parameters: Any = None) -> None:
         """Begin an episode."""
@@ -135,22 +137,30 @@ def witness(
         raise UsageError(f"task {task.name} tells no truth to compare with: give it a `truth` (docs/tasks.md)")
     if not isinstance(actions := task.world_of(assignment).actions, Continuous):
         raise UsageError(f"task {task.name} has no continuous actions: its drives cannot be disturbed")
+    begin_at = _anywhere(task) if config.anywhere else lambda _seed: None
     environment = task.make_environment(assignment)
     try:
         for seed in count(config.first_seed):
             disturbance = Disturbance(seed, actions, config.noise)
             witness = Witness(mind, hand_of(seed), disturbance, lambda: task.truth(environment))
-            yield _drive(environment, witness, seed, config, mind.hidden)
+            yield _drive(environment, witness, Course(seed, config.steps), config, begin_at(seed))
     finally:
         environment.close()
 
 
+def _anywhere(task: Task) -> Callable[[int], Begin]:
+    if not isinstance(task, Collected):
+        raise UsageError(f"drives of task {task.name} cannot begin anywhere: let a --controller drive")
+    begin = task.begin_anywhere
+    return lambda seed: lambda environment, _seen: begin(environment, np.random.default_rng(seed))
+
+
 def _drive(
-    environment: gymnasium.Env[Any, Any], witness: Witness, seed: int, config: WitnessConfig, hidden: int
+    environment: gymnasium.Env[Any, Any], witness: Witness, course: Course, config: WitnessConfig, begin: Begin | None
 ) -> WitnessedDrive:
     witness.begin()
     notes, rewards, lost, off = witness.notes, [], None, 0
-    for moment in play(environment, witness, Course(seed, config.steps)):
+    for moment in play(environment, witness, course, begin):
         rewards.append(moment.reward)
         off = off + 1 if notes.truth[-1].get(OFF) else 0
         if lost is None and off == config.lasting:
@@ -159,7 +169,7 @@ def _drive(
             break
     columns = {name: np.array([each[name] for each in notes.truth]) for name in notes.truth[0]}
     latent, state, action, push = map(np.stack, (notes.latent, notes.state, notes.action, notes.push))
-    return WitnessedDrive(seed, latent, state, hidden, columns, action, push, np.array(rewards), lost)
+    return WitnessedDrive(course.seed, latent, state, witness.hidden, columns, action, push, np.array(rewards), lost)
 
 
 def first_stays(off: NDArray[np.bool_], lasting: int) -> NDArray[np.int64]:

@@ -42,7 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     figures.add_argument("--probe", action="store_true", help="how much of the simulator's truth [z, h] holds")
     figures.add_argument("--losses", action="store_true", help="whether dreams lose the road where reality lost it")
     figures.add_argument("--controller", help="who drives: a file, a run, or one that ships (default the run's own)")
-    figures.add_argument("--driver", help="who drives for --probe: a random driver of the world by name")
+    figures.add_argument("--driver", help="who drives for --probe: a random driver by name, from anywhere")
     figures.add_argument("--episodes", type=int, help=f"drives of --probe ({DRIVES}), losses of --losses ({LOSSES})")
     figures.add_argument("--noise", type=float, default=0.3, help="added to actions, of half their range (default 0.3)")
     figures.add_argument("--temperature", type=float, default=1.0, help="of the dreams (default 1.0)")
@@ -83,7 +83,7 @@ def _measure(args: argparse.Namespace) -> int:
     _check(args)
     with ExitStack() as held:
         bundle, driving = _choose(args, held)
-        config = WitnessConfig(args.noise, first_seed=args.seed)
+        config = WitnessConfig(args.noise, first_seed=args.seed, anywhere=bool(driving.driver))
         found: dict[str, Any] = {"bundle": bundle.sha256, "noise": args.noise, "first_seed": args.seed}
         found["driver"] = driving.driver or (driving.controller and driving.controller.sha256)
         if args.probe:

@@ -139,3 +139,14 @@ def test_one_drive_is_too_few_to_fit_and_judge(drives):
         measure(drives[:1], DRIVEN.opening)
     with pytest.raises(UsageError, match="two drives on the road"):
         measure([], DRIVEN.opening)
+    with pytest.raises(UsageError, match="two drives on the road"):
+        measure(drives, max(len(each) for each in drives))
+
+
+def test_a_drive_that_ended_in_the_opening_is_no_drive_to_judge(drives, monkeypatch):
+    monkeypatch.setattr(probe, "UPDATES", 30)
+    short = replace(drives[0], truth={name: column[:20] for name, column in drives[0].truth.items()},
+                    action=drives[0].action[:20])  # fmt: skip
+    one, other = (measure(each, DRIVEN.opening) for each in ([short, *drives[:2], short], drives[:2]))
+    assert one.known == other.known
+    assert (one.drives, one.steps) == (other.drives, other.steps)

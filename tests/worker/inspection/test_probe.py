@@ -58,6 +58,11 @@ def test_r_squared_is_one_for_the_truth_and_zero_for_the_mean():
         assert 0 < share.error < 0.05
 
 
+def test_of_what_never_changes_nothing_is_explained():
+    straight = [np.stack([np.zeros(20), np.arange(20.0)], axis=1) for _ in range(3)]
+    assert explained(straight, [each + 0.1 for each in straight])[0] == Estimate(0, 0)
+
+
 def test_an_estimate_is_a_mean_and_its_standard_error():
     assert Estimate.of([1, 2, 3, 4]) == Estimate(2.5, pytest.approx(0.6455, abs=1e-4))
     assert str(Estimate(0.5, 0.049)) == "0.50 ± 0.05"

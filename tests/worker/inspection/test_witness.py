@@ -1,12 +1,13 @@
 """Drives with the truth beside what a world model held."""
 
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
 import pytest
 
 from dreamfleet.common.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.bundle import find_bundle
+from dreamfleet.common.bundle import find_bundle, write_bundle
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.shelf import find_controller
 from dreamfleet.worker.inspection.disturbance import Disturbance, pushed
@@ -106,3 +107,21 @@ def test_tracks_follow_each_other(tiny):
     drives = list(islice(witness(tiny, Mind(tiny), hands, WitnessConfig(steps=3, first_seed=20_007)), 2))
     assert [each.seed for each in drives] == [20_007, 20_008]
     assert not np.array_equal(drives[0].latent, drives[1].latent)
+
+
+def test_a_driver_that_never_comes_far_begins_anywhere(tiny):
+    places = [
+        drive(tiny, drivers("held", tiny), steps=2, first_seed=20_000, anywhere=each) for each in (False, True, True)
+    ]
+    start, one, other = (each.truth for each in places)
+    assert abs(start["lateral_offset"][0]) < 0.01 < abs(one["lateral_offset"][0])
+    assert one["lateral_offset"][0] == other["lateral_offset"][0]
+
+
+def test_a_world_that_tells_no_truth_is_told(tmp_path):
+    small = VAEConfig(latent=5, channels=(4, 4, 4, 8))
+    ours = write_random_bundle(tmp_path / "ours.zip", vae=small, rnn=MDNRNNConfig(latent=5, hidden=8))
+    parts = {name: ours.read(name) for name in ours.manifest.parts}
+    poles = write_bundle(tmp_path / "poles.zip", replace(ours.manifest, task="gym:CartPole-v1"), parts)
+    with pytest.raises(UsageError, match=r"gym:CartPole-v1 tells no truth .*docs/tasks.md"):
+        next(witness(poles, Mind(poles), lambda _seed: None, WitnessConfig()))
