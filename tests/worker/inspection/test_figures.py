@@ -36,12 +36,18 @@ def call(tmp_path, capsys, monkeypatch):
 
 
 def test_a_probe_prints_a_row_a_quantity(call):
-    lines = call("tiny", "--probe", "--driver", "ornstein-uhlenbeck", "--episodes", "2").splitlines()
+    lines = call("tiny", "--probe", "--controller", "tiny", "--episodes", "2").splitlines()
     assert lines[0].split("\t") == [
         "quantity", "deviation", "z, linear", "z, network", "[z, h], linear", "[z, h], network",
     ]  # fmt: skip
     assert {"lateral_offset", "speed", "curvature_40m"} < {line.split("\t")[0] for line in lines}
     assert lines[-1].startswith("R² ± standard error on held-out drives; 2 drives, ")
+
+
+def test_a_driver_drives_without_a_controller(call):
+    found = json.loads(call("tiny", "--probe", "--driver", "ornstein-uhlenbeck", "--episodes", "8", "--json"))
+    assert found["driver"] == "ornstein-uhlenbeck"
+    assert found["probe"]["steps"] > 50
 
 
 def test_as_json_both_tell_counts_values_and_errors(call):
