@@ -17,6 +17,7 @@ from dreamfleet.common.threads import pin_thread_pools
 
 if TYPE_CHECKING:
     from dreamfleet.common.bundle import Bundle
+    from dreamfleet.worker.inspection.inspection import Subject
     from dreamfleet.worker.inspection.measuring import Driving
     from dreamfleet.worker.inspection.witness import WitnessConfig
 
@@ -45,7 +46,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     figures.add_argument("--driver", help="who drives for --probe: a random driver by name, from anywhere")
     figures.add_argument("--episodes", type=int, help=f"drives of --probe ({DRIVES}), losses of --losses ({LOSSES})")
     figures.add_argument("--noise", type=float, default=0.3, help="added to actions, of half their range (default 0.3)")
-    figures.add_argument("--temperature", type=float, default=1.0, help="of the dreams (default 1.0)")
+    figures.add_argument("--temperature", type=float, help="of the dreams (default the run's, else 1.0)")
     offer(parser, "runs_dir")
     add_json(parser)
 
@@ -82,14 +83,15 @@ def _measure(args: argparse.Namespace) -> int:
 
     _check(args)
     with ExitStack() as held:
-        bundle, driving = _choose(args, held)
+        subject = _subject(args, held)
+        bundle, driving = _choose(args, subject)
         config = WitnessConfig(args.noise, first_seed=args.seed, anywhere=bool(driving.driver))
         found: dict[str, Any] = {"bundle": bundle.sha256, "noise": args.noise, "first_seed": args.seed}
         found["driver"] = driving.driver or (driving.controller and driving.controller.sha256)
         if args.probe:
             found["probe"] = _probe(args, bundle, driving, config)
         if args.losses:
-            found["losses"] = _lose(args, bundle, driving, config)
+            found["losses"] = _lose(args, bundle, driving, config, _temperature(args, subject))
     if args.json:
         answer(args, "", **found)
     return 0
@@ -110,13 +112,15 @@ def _probe(args: argparse.Namespace, bundle: Bundle, driving: Driving, config: W
     return asdict(known)
 
 
-def _lose(args: argparse.Namespace, bundle: Bundle, driving: Driving, config: WitnessConfig) -> dict[str, Any]:
+def _lose(
+    args: argparse.Namespace, bundle: Bundle, driving: Driving, config: WitnessConfig, temperature: float
+) -> dict[str, Any]:
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.worker.inspection.losses import LossConfig
     from dreamfleet.worker.inspection.measuring import dream_losses
     from dreamfleet.worker.inspection.tables import loss_rows, loss_text
 
-    wanted = LossConfig(LOSSES if args.episodes is None else args.episodes, temperature=args.temperature)
+    wanted = LossConfig(LOSSES if args.episodes is None else args.episodes, temperature=temperature)
     with progress_bar("losses", wanted.losses, "losses") as bar:
         compared, drives = dream_losses(bundle, driving, config, wanted, bar.move)
     if not args.json:
@@ -137,22 +141,37 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("one drives: give --controller or --driver")
 
 
-def _choose(args: argparse.Namespace, held: ExitStack) -> tuple[Bundle, Driving]:
+def _subject(args: argparse.Namespace, held: ExitStack) -> Subject:
+    from dreamfleet.worker.inspection.inspection import Subject, find_subject
+
+    if not args.subject:
+        return Subject(None)
+    subject = held.enter_context(find_subject(args.subject, args.runs_dir))
+    if subject.bundle is None:
+        raise UsageError(f"run {args.subject} has no world model to measure: name a bundle, or a run with one")
+    return subject
+
+
+def _temperature(args: argparse.Namespace, subject: Subject) -> float:
+    from dreamfleet.worker.dream.batch import DEFAULT_TEMPERATURE
+
+    if args.temperature is not None:
+        return float(args.temperature)
+    return (subject.run.spec.temperature if subject.run else 0.0) or DEFAULT_TEMPERATURE
+
+
+def _choose(args: argparse.Namespace, subject: Subject) -> tuple[Bundle, Driving]:
     """What is measured, and who drives."""
     from dreamfleet.common.shelf import find_controller
-    from dreamfleet.worker.inspection.inspection import find_subject
     from dreamfleet.worker.inspection.measuring import Driving
     from dreamfleet.worker.tools.evaluation import bundle_for
 
-    subject = held.enter_context(find_subject(args.subject, args.runs_dir)) if args.subject else None
-    bundle, controller, own = (subject.bundle, subject.controller, subject.bundle) if subject else (None, None, None)
-    if subject and bundle is None:
-        raise UsageError(f"run {args.subject} has no world model to measure: name a bundle, or a run with one")
+    controller, own = subject.controller, subject.bundle
     if args.controller:
         controller, beside = find_controller(args.controller, args.runs_dir)
-        if bundle is None or controller.bundle != bundle.sha256:
+        if own is None or controller.bundle != own.sha256:
             own = bundle_for(controller, None, beside)
-    bundle = bundle or own
+    bundle = subject.bundle or own
     if bundle is None:
         raise UsageError("give a bundle or a run to measure, or a --controller that has a world model")
     if args.driver:
