@@ -17,6 +17,7 @@ from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.worker.car_racing.check import make_car_racing
 from dreamfleet.worker.car_racing.drivers import DRIVERS
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS
+from dreamfleet.worker.car_racing.truth import truth_of
 from dreamfleet.worker.tasks.api import Assignment, DreamReward, Preprocessing, Task, World
 from dreamfleet.worker.worldmodel.inference import PolicyStep
 
@@ -68,6 +69,10 @@ class CarRacing(Task):
         )
         inner.t = 1.0  # the camera zooms in during the first second
         return environment.step(np.zeros(3, dtype=np.float32))[0]
+
+    def truth(self, environment: gymnasium.Env[Any, Any]) -> dict[str, float]:
+        """Car and road as the simulator knows them; `car_racing.truth` names units and signs."""
+        return truth_of(environment.unwrapped)
 
     def preprocessing(self, bundle: Bundle) -> Preprocessing:
         """What makes the pictures that the bundle was trained on; `BundleError` if this task does not give them."""

@@ -40,6 +40,7 @@ __all__ = [
     "Rewarded",
     "Score",
     "Task",
+    "Truthful",
     "World",
 ]
 
@@ -214,3 +215,14 @@ class Collected(Protocol):
 
     def begin_anywhere(self, environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:
         """Move a reset environment to somewhere else in its world; what is observed there."""
+
+
+@runtime_checkable
+class Truthful(Protocol):
+    """A task whose worlds tell their true state, which `dreamfleet inspect` measures world models against."""
+
+    def truth(self, environment: gymnasium.Env[Any, Any]) -> dict[str, float]:
+        """The true state behind the last observation, the same names at every step.
+
+        A world whose road can be lost names `off_road`, 1 or 0, and how far off it is `lateral_offset`.
+        """

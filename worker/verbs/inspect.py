@@ -1,38 +1,71 @@
-"""`dreamfleet inspect`: a page about a world model."""
+"""`dreamfleet inspect`: a page about a world model, or figures of what it knows and how it dreams."""
 
 from __future__ import annotations
 
 import argparse
 import os
+from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.listing import add_json, answer, print_rows
 from dreamfleet.common.seeds import VALIDATION
 from dreamfleet.common.site import offer
+from dreamfleet.common.threads import pin_thread_pools
 
-SUMMARY = "look into a world model: what it sees, keeps and dreams, as pictures and one page"
+if TYPE_CHECKING:
+    from dreamfleet.common.bundle import Bundle
+    from dreamfleet.worker.inspection.inspection import Subject
+    from dreamfleet.worker.inspection.measuring import Driving
+    from dreamfleet.worker.inspection.witness import WitnessConfig
+
+SUMMARY = "look into a world model: what it sees, keeps and dreams, as pictures and one page, or as figures"
 EXTRAS = ("worker", "views")
 SECTIONS = 10  # at most
+DRIVES, LOSSES = 20, 30
+FEWEST_DRIVES, FEWEST_LOSSES = 2, 4
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("subject", metavar="BUNDLE|RUN", help="a bundle's file, one that ships, or a run")
+    parser.add_argument(
+        "subject", metavar="BUNDLE|RUN", nargs="?",
+        help="a bundle's file, one that ships, or a run; for figures it may be left out: the --controller's",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("inspection"), help="folder to write (default inspection)")
     parser.add_argument("--data", type=Path, help="the data folder that it was trained in, for the loss curves")
     first = VALIDATION.start
-    parser.add_argument("--seed", type=int, default=first, help=f"the track that is driven (default {first})")
-    parser.add_argument("--steps", type=int, default=300, help="steps of the drive (default 300)")
+    parser.add_argument("--seed", type=int, default=first, help=f"the (first) track that is driven (default {first})")
+    parser.add_argument("--steps", type=int, default=300, help="steps of the page's drive (default 300)")
+    figures = parser.add_argument_group("figures, printed instead of the page")
+    figures.add_argument("--probe", action="store_true", help="how much of the simulator's truth [z, h] holds")
+    figures.add_argument("--losses", action="store_true", help="whether dreams lose the road where reality lost it")
+    figures.add_argument("--controller", help="who drives: a file, a run, or one that ships (default the run's own)")
+    figures.add_argument("--driver", help="who drives for --probe: a random driver by name, from anywhere")
+    figures.add_argument("--episodes", type=int, help=f"drives of --probe ({DRIVES}), losses of --losses ({LOSSES})")
+    figures.add_argument("--noise", type=float, default=0.3, help="added to actions, of half their range (default 0.3)")
+    figures.add_argument("--temperature", type=float, help="of the dreams (default the run's, else 1.0)")
     offer(parser, "runs_dir")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw and print where the page lies."""
+    """Draw and print where the page lies, or measure and print figures."""
+    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    if args.probe or args.losses:
+        return _measure(args)
+    if args.controller or args.driver:
+        raise UsageError("--controller and --driver drive for figures: give --probe or --losses too")
+    if not args.subject:
+        raise UsageError("give a bundle or a run to look into")
+    return _draw(args)
+
+
+def _draw(args: argparse.Namespace) -> int:
     if args.steps < 2 or args.seed < 0:
         raise UsageError("--steps must be at least 2 and --seed at least 0")
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.worker.inspection.inspection import find_subject, inspect
     from dreamfleet.worker.inspection.rollout import DriveConfig
@@ -42,3 +75,107 @@ def run(args: argparse.Namespace) -> int:
         bar.move(SECTIONS)
     answer(args, str(page), page=page)
     return 0
+
+
+def _measure(args: argparse.Namespace) -> int:
+    pin_thread_pools()  # of NumPy, which is not loaded yet
+    from dreamfleet.worker.inspection.witness import WitnessConfig
+
+    _check(args)
+    with ExitStack() as held:
+        subject = _subject(args, held)
+        bundle, driving = _choose(args, subject)
+        config = WitnessConfig(args.noise, first_seed=args.seed, anywhere=bool(driving.driver))
+        found: dict[str, Any] = {"bundle": bundle.sha256, "noise": args.noise, "first_seed": args.seed}
+        found["driver"] = driving.driver or (driving.controller and driving.controller.sha256)
+        if args.probe:
+            found["probe"] = _probe(args, bundle, driving, config)
+        if args.losses:
+            found["losses"] = _lose(args, bundle, driving, config, _temperature(args, subject))
+    if args.json:
+        answer(args, "", **found)
+    return 0
+
+
+def _probe(args: argparse.Namespace, bundle: Bundle, driving: Driving, config: WitnessConfig) -> dict[str, Any]:
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.inspection.measuring import probe
+    from dreamfleet.worker.inspection.tables import knowledge_rows, knowledge_text
+
+    drives = DRIVES if args.episodes is None else args.episodes
+    with progress_bar("probe", drives, "drives") as bar:
+        known = probe(bundle, driving, config, drives, bar.move)
+    if not args.json:
+        rows = knowledge_rows(known)
+        print_rows(rows, right=tuple(rows[0])[1:])
+        print(knowledge_text(known))
+    return asdict(known)
+
+
+def _lose(
+    args: argparse.Namespace, bundle: Bundle, driving: Driving, config: WitnessConfig, temperature: float
+) -> dict[str, Any]:
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.inspection.losses import LossConfig
+    from dreamfleet.worker.inspection.measuring import dream_losses
+    from dreamfleet.worker.inspection.tables import loss_rows, loss_text
+
+    wanted = LossConfig(LOSSES if args.episodes is None else args.episodes, temperature=temperature)
+    with progress_bar("losses", wanted.losses, "losses") as bar:
+        compared, drives = dream_losses(bundle, driving, config, wanted, bar.move)
+    if not args.json:
+        rows = loss_rows(compared)
+        print_rows(rows, right=("n", *tuple(rows[0])[3:]))
+        print(loss_text(drives, wanted.dreams, config.lasting))
+    facts = {"drives": drives, "dreams": wanted.dreams, "temperature": wanted.temperature, "lasting": config.lasting}
+    return {**facts, "begun": [asdict(each) for each in compared]}
+
+
+def _check(args: argparse.Namespace) -> None:
+    fewest = FEWEST_LOSSES if args.losses else FEWEST_DRIVES
+    if args.episodes is not None and args.episodes < fewest:
+        raise UsageError(f"--episodes must be at least {FEWEST_DRIVES} to probe, {FEWEST_LOSSES} losses to dream")
+    if args.seed < 0 or not 0 <= args.noise <= 10:
+        raise UsageError("--seed must be at least 0, --noise from 0 to 10")
+    if args.controller and args.driver:
+        raise UsageError("one drives: give --controller or --driver")
+
+
+def _subject(args: argparse.Namespace, held: ExitStack) -> Subject:
+    from dreamfleet.worker.inspection.inspection import Subject, find_subject
+
+    if not args.subject:
+        return Subject(None)
+    subject = held.enter_context(find_subject(args.subject, args.runs_dir))
+    if subject.bundle is None:
+        raise UsageError(f"run {args.subject} has no world model to measure: name a bundle, or a run with one")
+    return subject
+
+
+def _temperature(args: argparse.Namespace, subject: Subject) -> float:
+    from dreamfleet.worker.dream.batch import DEFAULT_TEMPERATURE
+
+    if args.temperature is not None:
+        return float(args.temperature)
+    return (subject.run.spec.temperature if subject.run else 0.0) or DEFAULT_TEMPERATURE
+
+
+def _choose(args: argparse.Namespace, subject: Subject) -> tuple[Bundle, Driving]:
+    """What is measured, and who drives."""
+    from dreamfleet.common.shelf import find_controller
+    from dreamfleet.worker.inspection.measuring import Driving
+    from dreamfleet.worker.tools.evaluation import bundle_for
+
+    controller, own = subject.controller, subject.bundle
+    if args.controller:
+        controller, beside = find_controller(args.controller, args.runs_dir)
+        if own is None or controller.bundle != own.sha256:
+            own = bundle_for(controller, None, beside)
+    bundle = subject.bundle or own
+    if bundle is None:
+        raise UsageError("give a bundle or a run to measure, or a --controller that has a world model")
+    if args.driver:
+        return bundle, Driving(driver=args.driver)
+    if controller is None:
+        raise UsageError("nobody drives: give --controller, or for --probe a --driver")
+    return bundle, Driving(controller, own)

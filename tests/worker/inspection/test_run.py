@@ -1,5 +1,6 @@
 """A run's page: its own world model under its own controller."""
 
+import argparse
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +12,15 @@ from dreamfleet.common.stored import RunSettings, StoredGeneration
 from dreamfleet.coordinator.evaluation import Evaluation
 from dreamfleet.coordinator.jobs import travelling
 from dreamfleet.coordinator.journal import Journal
+from dreamfleet.worker.inspection import measuring
+from dreamfleet.worker.inspection.estimate import Estimate
 from dreamfleet.worker.inspection.inspection import find_subject, inspect
+from dreamfleet.worker.inspection.losses import Compared
 from dreamfleet.worker.inspection.rollout import DriveConfig
+from dreamfleet.worker.verbs import inspect as verb
 from tests.support.samples import SPEC
+
+COMPARED = Compared("40 steps before", 30, {"lost": {"reality": Estimate(1.0, 0.0)}})
 
 
 @pytest.fixture
@@ -21,7 +28,9 @@ def runs_dir(tmp_path, random_bundle):
     path = tmp_path / "runs" / "night"
     path.mkdir(parents=True)
     shape = random_bundle.controller_shape
-    settings = RunSettings(replace(SPEC, bundle=random_bundle.sha256), shape, 2, 1, 0.1, "diagonal", 1, 1, 2)
+    settings = RunSettings(
+        replace(SPEC, bundle=random_bundle.sha256, temperature=1.25), shape, 2, 1, 0.1, "diagonal", 1, 1, 2
+    )
     journal = Journal.create(path, settings, random_bundle.path)
     vectors = [travelling(np.full(shape.size, value)) for value in (0.5, 1.5)]
     for number in range(3):
@@ -50,3 +59,21 @@ def test_a_run_that_has_ended_is_driven_by_its_controller(runs_dir, random_bundl
         assert np.array_equal(subject.controller.parameters, parameters)
         page = inspect(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
     assert "a fresh drive by the run&#x27;s controller" in page
+
+
+def test_a_runs_own_controller_is_measured_at_the_runs_temperature(runs_dir, random_bundle, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(measuring, "dream_losses", lambda *given: asked.append(given) or ([COMPARED], 1))
+    shape = random_bundle.controller_shape
+    Controller(shape, np.zeros(shape.size, np.float32), "dream", random_bundle.sha256).save(
+        next(run_paths(runs_dir)) / CONTROLLER
+    )
+    for flags, temperature in ((), 1.25), (("--temperature", "1.5"), 1.5):
+        parser = argparse.ArgumentParser()
+        verb.configure(parser)
+        args = parser.parse_args(["night", "--losses", *flags])
+        args.runs_dir = runs_dir
+        assert verb.run(args) == 0
+        bundle, driving, _, losses, _ = asked.pop()
+        assert bundle.sha256 == driving.controller.bundle == random_bundle.sha256
+        assert losses.temperature == temperature

@@ -1,0 +1,91 @@
+"""`inspect --probe` and `inspect --losses`: what is printed, and who may drive."""
+
+import argparse
+import json
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.bundle import find_bundle
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.shelf import find_controller
+from dreamfleet.worker.inspection import probe
+from dreamfleet.worker.inspection.losses import LossConfig
+from dreamfleet.worker.inspection.measuring import Driving, dream_losses
+from dreamfleet.worker.inspection.witness import WitnessConfig
+from dreamfleet.worker.verbs import inspect
+
+FOUND = {"z_linear", "z_network", "zh_linear", "zh_network"}
+
+
+@pytest.fixture
+def call(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(probe, "UPDATES", 30)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"):
+        monkeypatch.setenv(name, "1")
+
+    def run(*arguments):
+        parser = argparse.ArgumentParser()
+        inspect.configure(parser)
+        args = parser.parse_args(arguments)
+        args.runs_dir = tmp_path
+        assert inspect.run(args) == 0
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_a_probe_prints_a_row_a_quantity(call):
+    lines = call("tiny", "--probe", "--controller", "tiny", "--episodes", "2").splitlines()
+    assert lines[0].split("\t") == [
+        "quantity", "deviation", "z, linear", "z, network", "[z, h], linear", "[z, h], network",
+    ]  # fmt: skip
+    assert {"lateral_offset", "speed", "curvature_40m"} < {line.split("\t")[0] for line in lines}
+    assert lines[-1].startswith("R² ± standard error on held-out drives; 2 drives, ")
+
+
+def test_a_driver_drives_without_a_controller(call):
+    found = json.loads(call("tiny", "--probe", "--driver", "ornstein-uhlenbeck", "--episodes", "8", "--json"))
+    assert found["driver"] == "ornstein-uhlenbeck"
+    assert found["probe"]["steps"] > 50
+
+
+def test_as_json_both_tell_counts_values_and_errors(call):
+    found = json.loads(call("--controller", "tiny", "--probe", "--losses", "--episodes", "4", "--json"))
+    assert found["bundle"] == find_bundle("tiny").sha256
+    assert found["probe"]["drives"] == 4
+    for known in found["probe"]["known"]:
+        assert set(known["found"]) == FOUND
+        assert set(known["found"]["zh_linear"]) == {"value", "error"}
+    begun = {each["begun"]: each for each in found["losses"]["begun"]}
+    assert {"40 steps before", "20 steps before", "0 steps before"} <= set(begun)
+    assert begun["40 steps before"]["count"] == 4
+    assert begun["40 steps before"]["figures"]["lost"]["reality"] == {"value": 1.0, "error": 0.0}
+    assert found["losses"]["temperature"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ((), "give a bundle or a run to look into"),
+        (("--losses",), "give a bundle or a run to measure"),
+        (("tiny", "--controller", "tiny"), "give --probe or --losses too"),
+        (("tiny", "--probe"), "nobody drives"),
+        (("tiny", "--probe", "--controller", "tiny", "--driver", "held"), "one drives"),
+        (("tiny", "--probe", "--driver", "ghost"), "no driver 'ghost'"),
+        (("tiny", "--losses", "--driver", "held"), "need a --controller that was evolved with this world model"),
+        (("tiny", "--losses", "--controller", "tiny", "--episodes", "3"), "at least 2 to probe, 4 losses to dream"),
+        (("tiny", "--probe", "--controller", "tiny", "--noise", "nan"), "--noise from 0 to 10"),
+        (("tiny", "--losses", "--controller", "tiny", "--temperature", "0"), "temperature must be a positive number"),
+    ],
+)
+def test_what_cannot_be_measured_is_told_before_anything_is_driven(call, arguments, says):
+    with pytest.raises(UsageError, match=says):
+        call(*arguments)
+
+
+def test_a_controller_of_another_world_model_dreams_nothing(tmp_path):
+    bundle, (controller, _) = find_bundle("tiny"), find_controller("tiny", tmp_path)
+    other = Driving(replace(controller, bundle="0" * 64), bundle)
+    with pytest.raises(UsageError, match="evolved with this world model"):
+        dream_losses(bundle, other, WitnessConfig(), LossConfig(), lambda _: None)

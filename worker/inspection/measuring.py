@@ -1,0 +1,64 @@
+"""Figures of a world model, measured on disturbed drives of its world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.inspection.hand import Hand, controllers_hand, drivers_hands
+from dreamfleet.worker.inspection.knowledge import Knowledge, measure
+from dreamfleet.worker.inspection.losses import Compared, LossConfig, compare, gather
+from dreamfleet.worker.inspection.mind import Mind
+from dreamfleet.worker.inspection.witness import WitnessConfig, WitnessedDrive, witness
+
+Told = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Driving:
+    """Who drives: a controller and its own world model, or a random driver of the world by name."""
+
+    controller: Controller | None = None
+    own: Bundle | None = None
+    driver: str = ""
+
+    def hands(self, bundle: Bundle, mind: Mind) -> Callable[[int], Hand]:
+        """The hand of each seed."""
+        if self.controller is None:
+            return drivers_hands(bundle, self.driver)
+        if self.own is None:
+            raise UsageError("this controller sees no world model: give one that was evolved with one")
+        hand = controllers_hand(self.controller, self.own, bundle, mind)
+        return lambda _seed: hand
+
+
+def probe(bundle: Bundle, driving: Driving, config: WitnessConfig, episodes: int, on_drive: Told) -> Knowledge:
+    """What the world model holds of the truth on so many drives."""
+    drives = []
+    for drive in islice(_drives(bundle, driving, config), episodes):
+        drives.append(drive)
+        on_drive(len(drives))
+    return measure(drives, config.opening)
+
+
+def dream_losses(
+    bundle: Bundle, driving: Driving, config: WitnessConfig, losses: LossConfig, on_loss: Told
+) -> tuple[list[Compared], int]:
+    """Dreams begun before real losses of the road, and how many drives it took to find these.
+
+    `UsageError` unless a controller drives that was evolved with this world model: it has to drive on in the dream.
+    """
+    controller = driving.controller
+    if controller is None or controller.bundle != bundle.sha256:
+        raise UsageError("dreams of losses need a --controller that was evolved with this world model: it drives them")
+    drives = gather(_drives(bundle, driving, config), losses, config, on_loss)
+    return compare(drives, bundle, controller, losses, config), len(drives)
+
+
+def _drives(bundle: Bundle, driving: Driving, config: WitnessConfig) -> Iterator[WitnessedDrive]:
+    mind = Mind(bundle)
+    return witness(bundle, mind, driving.hands(bundle, mind), config)

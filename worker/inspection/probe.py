@@ -1,0 +1,139 @@
+"""Maps from what a world model holds to what is true: a linear one and a small network, in NumPy alone.
+
+Looking into a world model needs no torch; a network of one layer is thirty lines without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+STRENGTH = 1e-3  # of the ridge, a sample, on features of variance 1
+UNITS, UPDATES, BATCH, RATE, DECAY = 64, 2000, 256, 2e-3, 1e-2  # of the network
+MOMENTS, SMALL = (0.9, 0.999), 1e-8  # Adam's (Kingma & Ba 2015)
+
+
+class Probe(Protocol):
+    """A map from features `(N, features)` to quantities `(N, quantities)`."""
+
+    def predict(self, features: Any) -> Floats:
+        """The quantities."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Means and deviations of columns, to and from mean 0 and deviation 1; a constant column becomes 0."""
+
+    mean: Floats
+    deviation: Floats
+
+    @classmethod
+    def of(cls, values: Any, weights: Floats | None = None) -> Scale:
+        """The scale of `values` `(N, columns)`, its rows weighted."""
+        mean = np.average(values, axis=0, weights=weights)
+        deviation = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weights))
+        return cls(np.asarray(mean, float), np.asarray(np.where(deviation > 1e-9, deviation, 1.0), float))
+
+    def apply(self, values: Any) -> Floats:
+        """The values in this scale."""
+        scaled: Floats = (values - self.mean) / self.deviation
+        return scaled
+
+    def undo(self, values: Any) -> Floats:
+        """The values out of this scale."""
+        plain: Floats = values * self.deviation + self.mean
+        return plain
+
+
+@dataclass(frozen=True)
+class LinearProbe:
+    """`W x + b` on scaled features."""
+
+    inputs: Scale
+    outputs: Scale
+    weights: Floats
+
+    @classmethod
+    def fit(cls, features: Any, targets: Any, weights: Floats | None = None) -> LinearProbe:
+        """Ridge regression; `weights` `(N,)` of the samples."""
+        inputs, outputs = Scale.of(features, weights), Scale.of(targets, weights)
+        x, y = inputs.apply(features), outputs.apply(targets)
+        weighted = x if weights is None else x * weights[:, None]
+        total = len(x) if weights is None else weights.sum()
+        ridge = STRENGTH * total * np.eye(x.shape[1])
+        found = np.linalg.solve(weighted.T @ x + ridge, weighted.T @ y)
+        return cls(inputs, outputs, np.asarray(found, float))
+
+    def predict(self, features: Any) -> Floats:
+        """The quantities."""
+        return self.outputs.undo(self.inputs.apply(features) @ self.weights)
+
+
+@dataclass(frozen=True)
+class LayeredProbe:
+    """One layer of tanh units on scaled features, by Adam on the squared error; the rate falls to 0 as a cosine."""
+
+    inputs: Scale
+    outputs: Scale
+    layers: tuple[Floats, ...]  # weights and biases of the layer, then of the output
+
+    @classmethod
+    def fit(cls, features: Any, targets: Any, seed: int = 0) -> LayeredProbe:
+        """The same network for the same data and seed."""
+        inputs, outputs = Scale.of(features), Scale.of(targets)
+        x, y = (each.astype(np.float32) for each in (inputs.apply(features), outputs.apply(targets)))
+        random = np.random.default_rng(seed)
+        layers = _begin(x.shape[1], y.shape[1], random)
+        moments = [(np.zeros_like(each), np.zeros_like(each)) for each in layers]
+        for update in range(UPDATES):
+            rows = random.integers(len(x), size=BATCH)
+            rate = RATE * (1 + np.cos(np.pi * update / UPDATES)) / 2
+            _improve(layers, moments, _gradients(layers, x[rows], y[rows]), rate, update + 1)
+        return cls(inputs, outputs, tuple(layers))
+
+    def predict(self, features: Any) -> Floats:
+        """The quantities."""
+        first, offsets, second, last = self.layers
+        hidden = np.tanh(self.inputs.apply(features) @ first + offsets)
+        return self.outputs.undo(hidden @ second + last)
+
+
+def _begin(features: int, quantities: int, random: np.random.Generator) -> list[Any]:
+    first = random.standard_normal((features, UNITS)) / np.sqrt(features)
+    second = random.standard_normal((UNITS, quantities)) / np.sqrt(UNITS)
+    layers = (first, np.zeros(UNITS), second, np.zeros(quantities))
+    return [each.astype(np.float32) for each in layers]
+
+
+def _gradients(layers: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
+    """Of half the mean squared error, and of the decay of weights."""
+    first, offsets, second, last = layers
+    hidden = np.tanh(x @ first + offsets)
+    error = (hidden @ second + last - y) / len(x)
+    back = (error @ second.T) * (1 - hidden**2)
+    return x.T @ back + DECAY * first, back.sum(axis=0), hidden.T @ error + DECAY * second, error.sum(axis=0)
+
+
+def _improve(layers: Sequence[Any], moments: Sequence[Any], gradients: Sequence[Any], rate: float, update: int) -> None:
+    """One step of Adam, in place."""
+    for layer, (mean, square), gradient in zip(layers, moments, gradients, strict=True):
+        mean[...] += (1 - MOMENTS[0]) * (gradient - mean)
+        square[...] += (1 - MOMENTS[1]) * (gradient**2 - square)
+        size = np.sqrt(square / (1 - MOMENTS[1] ** update)) + SMALL
+        layer[...] -= rate * mean / (1 - MOMENTS[0] ** update) / size
+
+
+def folds(drives: int, most: int = 4) -> list[list[int]]:
+    """The drives' rows in parts: a probe that judges one of them is fitted on the others."""
+    parts = min(most, drives)
+    return [list(range(part, drives, parts)) for part in range(parts)]
+
+
+def others(fold: Sequence[int], drives: int) -> list[int]:
+    """The rows that are not in a fold."""
+    return sorted(set(range(drives)) - set(fold))

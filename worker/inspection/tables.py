@@ -1,0 +1,49 @@
+"""Figures as rows of a table for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dreamfleet.worker.inspection.knowledge import Knowledge
+from dreamfleet.worker.inspection.losses import Compared
+
+HELD = {"z": "z", "zh": "[z, h]"}
+WHERE = {"reality": "reality", "foreseen": "reality, foreseen", "dream": "dream", "same_actions": "dream, same actions"}
+WHAT = {"lost": "road lost", "off_at_end": "off at the end", "offset_at_end": "offset at the end", "reward": "reward"}
+
+
+def knowledge_rows(knowledge: Knowledge) -> list[dict[str, str]]:
+    """A row a quantity: its true deviation, and R² by what was seen and how it was mapped."""
+    return [
+        {"quantity": each.quantity, "deviation": f"{each.deviation:.3g}"}
+        | {_column(name): str(share) for name, share in each.found.items()}
+        for each in knowledge.known
+    ]
+
+
+def knowledge_text(knowledge: Knowledge) -> str:
+    """What the rows are of."""
+    return f"R² ± standard error on held-out drives; {knowledge.drives} drives, {knowledge.steps} steps on the road"
+
+
+def loss_rows(compared: Sequence[Compared]) -> list[dict[str, object]]:
+    """A row a kind of beginning and figure: of reality, and of the dreams."""
+    return [
+        {"begun": each.begun, "n": each.count, "mean": WHAT[figure]}
+        | {WHERE[where]: str(estimate) for where, estimate in told.items()}
+        for each in compared
+        for figure, told in each.figures.items()
+    ]
+
+
+def loss_text(drives: int, dreams: int, lasting: int) -> str:
+    """What the rows are of."""
+    return (
+        f"means ± standard errors over n beginnings in {drives} drives, {dreams} dreams of each; the road is lost "
+        f"after {lasting} steps in a row off it, and the end is as long"
+    )
+
+
+def _column(name: str) -> str:
+    held, how = name.split("_")
+    return f"{HELD[held]}, {how}"
