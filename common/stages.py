@@ -8,8 +8,9 @@ on to the bit.
 from __future__ import annotations
 
 from bisect import bisect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 from dreamfleet.common.messages import TaskSpec
@@ -34,6 +35,15 @@ class Stage:
     def anew(self) -> bool:
         """Whether it begins the search anew, from the mean that the stage before it came to."""
         return self.search == self.number
+
+    @property
+    def ending(self) -> str:
+        """What ends it, in words."""
+        end = self.end
+        said = [f"{end.generations} generations"] if end.generations else []
+        said += [f"{end.steps} environment steps"] if end.steps else []
+        said += [f"a score of {end.score:g}"] if end.score is not None else []
+        return f"until {' or '.join(said)}" if said else "to the end"
 
     @property
     def told(self) -> str:
@@ -79,6 +89,20 @@ def _after(before: Stage, each: StageSettings) -> Stage:
     return Stage(number, **named, search=number if anew else before.search, end=each.end)
 
 
+def begun_stages(
+    settings: RunSettings, history: Sequence[StoredGeneration], evaluations: Iterable[StoredEvaluation]
+) -> Sequence[BegunStage]:
+    """The stages that a run has come to, the one of its open generation last."""
+    stages = Stages(settings)
+    stages.at(len(history), history, {each.generation: each for each in evaluations})
+    return stages.begun
+
+
+def in_turn(values: Iterable[str]) -> str:
+    """What counted in one stage after another, in words; what stayed is said once."""
+    return ", then ".join(value for value, _ in groupby(values))
+
+
 def longest_horizon(settings: RunSettings) -> int:
     """Steps of a scored episode at most, in any stage."""
     return max(each.horizon for each in stages_of(settings))
@@ -105,6 +129,11 @@ class Stages:
 
     def __len__(self) -> int:
         return len(self._stages)
+
+    @property
+    def begun(self) -> Sequence[BegunStage]:
+        """Those that had begun by the latest generation that was asked for."""
+        return self._begun
 
     def at(
         self, generation: int, history: Sequence[StoredGeneration], finished: Mapping[int, StoredEvaluation]

@@ -114,7 +114,7 @@ class RunConfig:
     def settings(self, bundle: Bundle | None) -> RunSettings:
         """What the journal keeps: the bundle by its hash, or what a task that needs none says of itself."""
         named, stages = unfold(self.stages)
-        if named:
+        if stages != self.stages:
             with _of_stage(1):
                 own = replace(self, **named, stages=stages)
             return own.settings(bundle)
