@@ -140,7 +140,9 @@ def _tell_frozen(args: argparse.Namespace, stored: RunFolder) -> None:
     said = given(RunConfig, "run", args.sources["file"], args.sources["environment"])
     preset = find_preset(said.pop("preset")) if "preset" in said else {}
     named, stages = unfold(find_schedule(said.pop("schedule", None), args.sources["file"]) or ())
-    said |= {**named, "stages": stages} if stages else {}
+    said |= named
+    if stages and stages != stored.settings.stages:
+        log.warning("run %s keeps its own schedule; the settings say another", stored.name)
     frozen: dict[str, Any] = settings_of(stored.settings, stored.bundle_path)
     for name, value in {**preset, **said}.items():
         if name != "bundle" and frozen.get(name, value) != value:
