@@ -177,7 +177,7 @@ class Fleet:
                 self._apply(move, given, now)
         sends: list[Send] = []
         for member in self.members.values():
-            if member.lost is not None or not member.known:
+            if not (member.present and member.known):
                 continue
             said = [*self._again(member, now), *self._news(member, given.get(member.identity, ()), durable, now)]
             if not said and member.awaits_word(now, ANSWER_BEATS * self._beat):
@@ -193,7 +193,7 @@ class Fleet:
 
     def _again(self, member: Member, now: float) -> Iterator[Send]:
         """Batches that were not seen in time."""
-        for number in [] if member.silent else member.overdue(now, 2 * self._beat):
+        for number in member.overdue(now, 2 * self._beat):
             sent = member.unseen[number]
             sent.at, sent.times = now, sent.times + 1
             self.counts["resent_batches"] += 1

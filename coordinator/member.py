@@ -76,9 +76,10 @@ class Member:
     cancels: list[bytes] = field(default_factory=list)
 
     def begin_numbering(self, numbering: int) -> None:
-        """What it is given is counted from 1 again."""
+        """What it is given is counted from 1 again; it is owed no word, for it will say again what it did."""
         self.numbering, self.number, self.seen = numbering, 0, 0
         self.unseen.clear()
+        self.cancels, self.verdicts = [], []
 
     def observe(self, beat: Beat, now: float) -> None:
         """Take what a beat says of the worker itself."""
