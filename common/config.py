@@ -38,13 +38,14 @@ def add_flags(
 ) -> None:
     """A flag for each field of the sections, or for those named in `only`; absent flags leave no trace.
 
+    A field without a help text has none.
     `texts` replaces a field's help; `default` is shown instead of the defaults, where these are not what counts.
     """
     wanted = None if only is None else frozenset(only)
     for section in sections:
         group = _group(parser, section.__name__.removesuffix("Config").lower())
         hints = get_type_hints(section)
-        for each in fields(section):
+        for each in _said(section):
             if wanted is None or each.name in wanted:
                 text = (texts or {}).get(each.name) or each.metadata["help"] + _shown_default(each, default)
                 group.add_argument(_flag(each), **_flag_options(each, hints[each.name], text))
@@ -94,8 +95,10 @@ def read_table(section: type[Any], where: str, table: Table) -> dict[str, Any]:
     return _from_table(known, where, table)
 
 
-def read_toml(path: Path | None, tables: Iterable[str], top: Iterable[str] = ()) -> dict[str, Any]:
-    """A configuration file: its tables, and the keys before the first of them; others are refused."""
+def read_toml(
+    path: Path | None, tables: Iterable[str], top: Iterable[str] = (), arrays: Iterable[str] = ()
+) -> dict[str, Any]:
+    """A configuration file: its tables, arrays of tables, and the keys before the first of them; others are refused."""
     if path is None:
         return {}
     try:
@@ -104,14 +107,17 @@ def read_toml(path: Path | None, tables: Iterable[str], top: Iterable[str] = ())
         raise UsageError(f"no configuration file at {path}") from None
     except (OSError, ValueError, RecursionError) as error:  # a number of 5,000 digits is no `TOMLDecodeError`
         raise UsageError(f"{path} cannot be read as TOML: {error}") from error
-    known, keys = sorted(tables), sorted(top)
+    known, keys, repeated = sorted(tables), sorted(top), sorted(arrays)
     for name, value in table.items():
         if name in keys:
             continue
-        if name not in known:
+        if name not in (*known, *repeated):
             what = f"table [{name}]" if isinstance(value, dict) else f"key {name!r}"
-            raise UsageError(f"{path}: unknown {what}{nearest(name, [*known, *keys])}")
-        if not isinstance(value, dict):
+            raise UsageError(f"{path}: unknown {what}{nearest(name, [*known, *repeated, *keys])}")
+        if name in repeated:
+            if not (isinstance(value, list) and all(isinstance(each, dict) for each in value)):
+                raise UsageError(f"{path}: {name} must be tables, each written [[{name}]]")
+        elif not isinstance(value, dict):
             raise UsageError(f"{path}: {name} must be a table, written [{name}]")
     return table
 
@@ -220,9 +226,14 @@ class _TupleAction(argparse.Action):
 
 
 def _known(section: type[Any]) -> dict[str, Any]:
-    """The type of each field."""
+    """The type of each field that can be said."""
     hints = get_type_hints(section)
-    return {each.name: hints[each.name] for each in fields(section)}
+    return {each.name: hints[each.name] for each in _said(section)}
+
+
+def _said(section: type[Any]) -> list[Field[Any]]:
+    """The fields that have a help text: others are a caller's alone."""
+    return [each for each in fields(section) if "help" in each.metadata]
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -30,8 +30,11 @@ def _drop_defaults(document: Any, plain: dict[str, Any]) -> None:
         value = getattr(document, each.name)
         if each.name in defaults and value == defaults[each.name]:
             del plain[each.name]
-        elif hasattr(value, "__dataclass_fields__"):
+        elif is_dataclass(value):
             _drop_defaults(value, plain[each.name])
+        elif isinstance(value, tuple) and value and is_dataclass(value[0]):
+            for item, within in zip(value, plain[each.name], strict=True):
+                _drop_defaults(item, within)
 
 
 def _default(each: Field[Any]) -> Any:

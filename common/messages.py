@@ -54,6 +54,8 @@ Word = Annotated[str, Length(1, 128)]
 Text = Annotated[str, Length(0, MAX_TEXT)]
 Part = Annotated[bytes, Length(0, MAX_PART)]
 Temperature = Annotated[float, Between(COLDEST, HOTTEST)]
+Horizon = Annotated[int, Between(1, 10**6)]  # an episode's steps at most, when scored for the strategy
+Patience = Annotated[int, Between(0, 10**6)]  # steps without reward before a scored episode is cut; 0: never
 Packages = Annotated[tuple[Word, ...], Length(0, 64)]
 Kind = Literal["score", "evaluate", "collect"]
 VerdictWord = Literal["accepted", "duplicate", "obsolete", "refused"]
@@ -65,8 +67,8 @@ class TaskSpec:
 
     task: Word
     bundle: Annotated[str, Length(0, 64)]  # SHA-256 of the bundle's file, hexadecimal; empty where there is none
-    horizon: Annotated[int, Between(1, 10**6)]  # an episode's steps at most, when scored for the strategy
-    patience: Annotated[int, Between(0, 10**6)]  # steps without reward before a scored episode is cut; 0: never
+    horizon: Horizon
+    patience: Patience
     controller: ControllerShape | None = field(default=None, metadata=OPTIONAL)  # `None`: linear on z and h
     temperature: Temperature | None = field(default=None, metadata=OPTIONAL)  # of a dream
     # The task's own, as canonical JSON: what its environment is made with, how it normalises what it observes.
@@ -78,9 +80,11 @@ class TaskSpec:
         """One of the task's own options."""
         return json.loads(self.options or "{}").get(name, default)
 
-    def at(self, temperature: float | None) -> TaskSpec:
-        """The same at another temperature; `None`: at its own."""
-        return self if temperature is None else replace(self, temperature=temperature)
+    def at(self, temperature: float | None = None, horizon: int | None = None, patience: int | None = None) -> TaskSpec:
+        """The same at another temperature, horizon or patience; `None`: at its own."""
+        named = {"temperature": temperature, "horizon": horizon, "patience": patience}
+        others: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
+        return replace(self, **others) if others else self
 
     def digest(self, kind: Kind, vector: bytes, seeds: tuple[int, ...]) -> bytes:
         """A job's identity: SHA-256 over its kind, this specification, the parameters' hash and the seeds."""
@@ -127,7 +131,19 @@ class Job:
     vector: Digest
     digest: Digest
     stall: Seconds  # no step for so long: hung
-    temperature: Temperature | None = field(default=None, metadata=OPTIONAL)  # `None`: the specification's own
+    # Under which it is scored where that is not the specification's own; `None`: it is.
+    temperature: Temperature | None = field(default=None, metadata=OPTIONAL)
+    horizon: Horizon | None = field(default=None, metadata=OPTIONAL)
+    patience: Patience | None = field(default=None, metadata=OPTIONAL)
+
+    @property
+    def terms(self) -> tuple[float | None, int | None, int | None]:
+        """What it names of its specification."""
+        return self.temperature, self.horizon, self.patience
+
+    def spec(self, own: TaskSpec) -> TaskSpec:
+        """What it is scored in; `own` is the run's specification."""
+        return own.at(*self.terms)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,14 @@ def collection_seed(run_seed: int, generation: int, episode: int) -> int:
     return _derived(f"dreamfleet collection {run_seed} {generation} {episode}")
 
 
+def search_seed(run_seed: int, stage: int) -> int:
+    """Seed of the search that a stage, counted from 1, begins anew: no stage draws what an earlier one drew.
+
+    The first one's is the run's own; the others' fit any library's 32 bits.
+    """
+    return run_seed if stage == 1 else _derived(f"dreamfleet search {run_seed} {stage}") % 2**32
+
+
 def validation_seeds(episodes: int, first: int = 0) -> tuple[int, ...]:
     """So many validation seeds from the `first` on.
 

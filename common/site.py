@@ -19,6 +19,7 @@ from dreamfleet.common.config import add_flags, load, option, read_toml
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.network import DEFAULT_ENDPOINT, check_endpoint
 
+ARRAYS = ("stage",)  # tables that a file may hold several of
 TABLES = ("run", "limits", "network", "worker", "demo")  # of every verb: one file serves all of them
 OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG")
 PREFIX = "DREAMFLEET_"
@@ -62,7 +63,7 @@ def settle(args: argparse.Namespace, environment: Mapping[str, str] = os.environ
     """
     given = frozenset(vars(args))
     path = args.config or (Path(environment[f"{PREFIX}CONFIG"]) if environment.get(f"{PREFIX}CONFIG") else None)
-    file = read_toml(path, TABLES, top=[each.name for each in fields(SiteConfig)])
+    file = read_toml(path, TABLES, top=[each.name for each in fields(SiteConfig)], arrays=ARRAYS)
     environment = _check_variables(environment)
     site = load(SiteConfig, "", flags=args, environment=environment, file=file)
     args.sources = {"flags": argparse.Namespace(**vars(args)), "environment": environment, "file": file}

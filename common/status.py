@@ -30,6 +30,20 @@ class Progress:
 
 
 @dataclass(frozen=True)
+class StageStatus:
+    """Where a run is in its schedule, and what counts there."""
+
+    number: Count  # from 1
+    total: Count
+    since: Count  # its first generation
+    horizon: Count
+    patience: Count
+    population: Count
+    episodes: Count
+    racing: bool
+
+
+@dataclass(frozen=True)
 class OpenGeneration:
     """The generation that is being scored."""
 
@@ -39,6 +53,7 @@ class OpenGeneration:
     seconds: Seconds  # since it was opened
     sigma: float  # the strategy's step size
     temperature: float | None  # at which it dreams; `None` where a task has none
+    stage: StageStatus | None = field(default=None, metadata=OPTIONAL)  # `None` without a schedule
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,54 @@ import json
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.fields import OPTIONAL, written
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
-from dreamfleet.common.messages import Between, Count, Packages, TaskSpec
+from dreamfleet.common.messages import Between, Count, Horizon, Length, Packages, Patience, TaskSpec
+
+MOST_STAGES = 32  # of a schedule: a status carries them too
+Population = Annotated[int, Between(2, 10**5)]
+Episodes = Annotated[int, Between(1, 10**4)]
+
+
+@dataclass(frozen=True)
+class StageSettings:
+    """One stage of a schedule: when it ends, and what is named anew. What it does not name is as in the one before."""
+
+    # It ends after so many generations or environment steps of its own (0: never by these), or once a mean that was
+    # asked in it is evaluated at this score: by whichever is reached first.
+    generations: Count = field(default=0, metadata=OPTIONAL)
+    steps: Count = field(default=0, metadata=OPTIONAL)
+    score: float | None = field(default=None, metadata=OPTIONAL)
+    horizon: Horizon | None = field(default=None, metadata=OPTIONAL)
+    patience: Patience | None = field(default=None, metadata=OPTIONAL)
+    episodes: Episodes | None = field(default=None, metadata=OPTIONAL)
+    population: Population | None = field(default=None, metadata=OPTIONAL)
+    sigma0: float | None = field(default=None, metadata=OPTIONAL)
+    racing: bool | None = field(default=None, metadata=OPTIONAL)
+
+    @property
+    def named(self) -> dict[str, Any]:
+        """What it names anew, by the names of a run's settings."""
+        plain = {name: getattr(self, name) for name in NAMED}
+        return {name: value for name, value in plain.items() if value is not None}
+
+    @property
+    def end(self) -> StageSettings:
+        """The same without what it names anew."""
+        return StageSettings(self.generations, self.steps, self.score)
+
+    @property
+    def ends(self) -> bool:
+        """Whether anything ends it."""
+        return bool(self.generations or self.steps or self.score is not None)
+
+
+NAMED = ("horizon", "patience", "episodes", "population", "sigma0", "racing")
 
 
 @dataclass(frozen=True)
@@ -22,18 +62,18 @@ class RunSettings:
 
     task: TaskSpec
     controller: ControllerShape
-    population: Annotated[int, Between(2, 10**5)]
-    episodes: Annotated[int, Between(1, 10**4)]
+    population: Population
+    episodes: Episodes
     sigma0: float
     covariance: Literal["diagonal", "full"]
     seed: Count
     evaluate_every: Count  # generations; 0: never
-    evaluation_episodes: Annotated[int, Between(1, 10**4)]
+    evaluation_episodes: Episodes
     # Only the better half of the candidates drives the second half of the episodes.
     racing: bool = field(default=False, metadata=OPTIONAL)
     features: Literal["zh", "z"] = field(default="zh", metadata=OPTIONAL)  # what the controller sees
     collect_every: Count = field(default=0, metadata=OPTIONAL)  # generations; 0: never
-    collect_episodes: Annotated[int, Between(1, 10**4)] = field(default=1, metadata=OPTIONAL)
+    collect_episodes: Episodes = field(default=1, metadata=OPTIONAL)
     # What a dream's temperature is multiplied by when evaluations fall; 1: never.
     heat: float = field(default=1.0, metadata=OPTIONAL)
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions its fingerprint names
@@ -41,6 +81,8 @@ class RunSettings:
     optimiser_options: tuple[str, ...] = field(default=(), metadata=OPTIONAL)  # each as name=value
     # Fresh tracks on which the reported mean is driven as the run ends; 0: never, as in runs from before this.
     confirm_episodes: Annotated[int, Between(0, 10**4)] = field(default=0, metadata=OPTIONAL)
+    # Of a schedule; all of the above is the first one's, which names nothing itself. The last one has no end.
+    stages: Annotated[tuple[StageSettings, ...], Length(0, MOST_STAGES)] = field(default=(), metadata=OPTIONAL)
 
     def to_json(self) -> str:
         """The text kept in the journal."""

@@ -66,16 +66,21 @@ def _facts(status: Status) -> Table:
     grid.add_column()
     temperature = status.generation.temperature
     warm = "" if temperature is None else f", temperature {temperature:g}"
+    stage = status.generation.stage
+    now = task if stage is None else stage
+    size = settings if stage is None else stage
 
     def row(*cells: str) -> None:
         grid.add_row(*(Text(printable(each)) for each in cells))  # texts of others are no markup
 
     row(
         "task",
-        f"{task.task}, {task.horizon} steps{warm}",
+        f"{task.task}, {now.horizon} steps{warm}",
         "population",
-        f"{settings.population} x {settings.episodes}",
+        f"{size.population} x {size.episodes}",
     )
+    if stage is not None:
+        row("stage", f"{stage.number} of {stage.total}, since generation {stage.since}")
     row(
         "last generation", _spread(status.last) if status.last else "-",
         "step size", f"{status.generation.sigma:.4f} ({_optimiser(settings)})",

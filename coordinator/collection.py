@@ -23,10 +23,10 @@ class Collection:
     vector: bytes
     episodes: int
 
-    def work(self, spec: TaskSpec, run_seed: int) -> list[Work]:
-        """Its jobs."""
+    def work(self, spec: TaskSpec, run_seed: int, own: TaskSpec | None = None) -> list[Work]:
+        """Its jobs; `own` is the run's specification where `spec` is another."""
         seeds = [collection_seed(run_seed, self.generation, episode) for episode in range(self.episodes)]
-        return make_work(spec, "collect", self.generation, 0, self.vector, seeds)
+        return make_work(spec, "collect", self.generation, 0, self.vector, seeds, own)
 
 
 class Collections:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,8 +17,10 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import COLDEST, HOTTEST, MAX_OPTIONS, TaskSpec
 from dreamfleet.common.presets import check_preset, preset_help
-from dreamfleet.common.stored import RunSettings
+from dreamfleet.common.stages import Stage, stages_of
+from dreamfleet.common.stored import NAMED, RunSettings, StageSettings
 from dreamfleet.common.tasks import GYM, check_task, describe_task, describes_itself
+from dreamfleet.coordinator.schedule import check_schedule, unfold
 
 DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
 
@@ -72,6 +76,12 @@ class RunConfig:
     )
     collect_every: int = option(0, "keep rollouts of the mean for training, every so many generations; 0: never")
     collect_episodes: int = option(8, "drives that are kept each time, on training tracks")
+    schedule: str | None = option(
+        None,
+        "a TOML file of stages, each a [[stage]] with its end (generations, steps, score) and its own horizon, "
+        "patience, episodes, population, sigma0 and racing (docs/operations.md); none: no stages",
+    )
+    stages: tuple[StageSettings, ...] = ()  # what the schedule, or the configuration file, holds
 
     def __post_init__(self) -> None:
         for name, (least, most) in BOUNDS.items():
@@ -103,6 +113,11 @@ class RunConfig:
 
     def settings(self, bundle: Bundle | None) -> RunSettings:
         """What the journal keeps: the bundle by its hash, or what a task that needs none says of itself."""
+        named, stages = unfold(self.stages)
+        if stages != self.stages:
+            with _of_stage(1):
+                own = replace(self, **named, stages=stages)
+            return own.settings(bundle)
         spec, shape, packages = self._described() if bundle is None else self._on(bundle)
         settings = RunSettings(
             task=spec,
@@ -123,8 +138,14 @@ class RunConfig:
             heat=self.heat,
             optimiser=self.optimiser,
             optimiser_options=tuple(filter(None, self.optimiser_options)),
+            stages=self.stages,
         )
-        _try_optimiser(settings)
+        check_schedule(settings)
+        for stage in stages_of(settings):
+            with _of_stage(stage.number if self.stages else None):
+                replace(self, **{name: getattr(stage, name) for name in NAMED})  # which looks at each value
+                if stage.anew:
+                    _try_optimiser(settings, stage)
         return settings
 
     @property
@@ -205,11 +226,20 @@ def _argument(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def _try_optimiser(settings: RunSettings) -> None:
+@contextmanager
+def _of_stage(number: int | None) -> Iterator[None]:
+    """Say of which stage an error is; `None`: of no schedule's."""
+    try:
+        yield
+    except UsageError as error:
+        raise error if number is None else UsageError(f"stage {number}: {error}") from error
+
+
+def _try_optimiser(settings: RunSettings, stage: Stage) -> None:
     """Build the run's optimiser once, so that what it cannot do is said before there is a run."""
     from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig  # heavy: `--help` reads this module too
 
-    Evolution(EvolutionConfig.of(settings))
+    Evolution(EvolutionConfig.of(settings, stage))
 
 
 def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:

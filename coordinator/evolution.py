@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DreamfleetError, JournalError, UsageError
 from dreamfleet.common.printable import one_line
+from dreamfleet.common.seeds import search_seed
+from dreamfleet.common.stages import Stage
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.checkpoint import PREFIX, Checkpoint, Head
 from dreamfleet.coordinator.optimisers.api import Search
@@ -38,14 +40,14 @@ class EvolutionConfig:
             raise UsageError(f"sigma0 must be a positive number, not {self.sigma0}")
 
     @classmethod
-    def of(cls, settings: RunSettings) -> EvolutionConfig:
-        """As a run's settings say."""
+    def of(cls, settings: RunSettings, stage: Stage) -> EvolutionConfig:
+        """As a run's settings say for the search that goes on in this stage."""
         return cls(
             settings.controller.size,
-            settings.population,
-            settings.sigma0,
+            stage.population,
+            stage.sigma0,
             settings.covariance,
-            settings.seed,
+            search_seed(settings.seed, stage.search),
             settings.optimiser,
             settings.optimiser_options,
         )

@@ -29,7 +29,7 @@ class Exchange:
     ) -> None:  # fmt: skip
         self.refusals = Refusals()
         self.fingerprint = journal.fingerprint()  # of the first accepted result; `None` before it
-        self._horizon = horizon  # of a scored episode
+        self._horizon = horizon  # of a scored episode whose job names none
         self._mixed = mixed
         self._journal = journal
         self._incarnation = incarnation
@@ -87,7 +87,7 @@ class Exchange:
 
     def _result(self, worker: str, said: Result, fingerprint: str, now: float) -> None:
         work = self._fleet.jobs.work(said.digest)
-        each = said if work is None else bounded(said, work.job.kind, self._horizon)
+        each = said if work is None else bounded(said, work.job.kind, work.job.horizon or self._horizon)
         result = self._slack.collections.receive(worker, each, work)
         if result is None:
             self._fleet.put_off(worker, each.digest, now)

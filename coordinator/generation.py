@@ -28,7 +28,7 @@ class Generation:
 
     With `racing` every candidate drives the first half of the episodes, and after this barrier the better half of the
     candidates the others; of equals the one with the lower index goes on. `own` is the run's specification where
-    `spec`, at a raised temperature, is another.
+    `spec`, at a raised temperature or in a later stage, is another.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Generation:
         return self.done == self.total
 
     def record(self, digest: bytes, fitness: float, steps: int) -> bool:
-        """Take one accepted result of this generation; whether it opened the second stage."""
+        """Take one accepted result of this generation; whether it opened the second half."""
         for place in self._places[digest]:
             self._scores[place] = fitness
         self.steps += steps

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from dreamfleet.common.bounds import finite, saturated
 from dreamfleet.common.stored import StoredGeneration
@@ -26,6 +26,11 @@ class History:
 
     def __len__(self) -> int:
         return len(self._rows)
+
+    @property
+    def rows(self) -> Sequence[StoredGeneration]:
+        """All of them, not to be changed; nothing is copied."""
+        return self._rows
 
     @property
     def last(self) -> StoredGeneration | None:

@@ -35,10 +35,10 @@ def make_work(
 
     `own` is the run's specification where `spec` is another.
 
-    A job names its temperature only where that is not the run's own.
+    A job names its temperature, horizon and patience only where they are not the run's own.
     """
     identity = hashlib.sha256(vector).digest()
-    temperature = None if own is None or spec.temperature == own.temperature else spec.temperature
+    own = own or spec
     return [
         Work(
             Job(
@@ -51,7 +51,9 @@ def make_work(
                 vector=identity,
                 digest=spec.digest(kind, identity, (seed,)),
                 stall=STALL_SECONDS,
-                temperature=temperature,
+                temperature=None if spec.temperature == own.temperature else spec.temperature,
+                horizon=None if spec.horizon == own.horizon else spec.horizon,
+                patience=None if spec.patience == own.patience else spec.patience,
             ),
             vector,
         )

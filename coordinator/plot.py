@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from dreamfleet.common.runs import RunFolder
+from dreamfleet.common.stages import begun_stages, in_turn
 
 DREAM = "dream"
 
@@ -28,6 +29,9 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     axes.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label="± 1 standard deviation")
     axes.plot(number, mean, color="tab:blue", label="mean of the population")
     axes.plot(number, [each.best for each in history], color="tab:orange", linewidth=1, label="best candidate")
+    stages = begun_stages(settings, history, evaluations)
+    for each in stages[1:]:
+        axes.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1)
     handles: tuple[Any, ...] = axes.get_legend_handles_labels()
     if evaluations:
         real = axes.twinx() if dreamt else axes
@@ -43,9 +47,11 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
             handles = tuple(a + b for a, b in zip(handles, real.get_legend_handles_labels(), strict=True))
         else:
             handles = axes.get_legend_handles_labels()
-    task, size = settings.task, f"{settings.population} candidates x {settings.episodes} episodes"
-    axes.set(xlabel="generation", ylabel=f"fitness over {task.horizon} {'dreamt ' * dreamt}steps")
-    axes.set_title(f"{run.name}: {task.task}, {size}, seed {settings.seed}", fontsize=11)
+    size = in_turn(f"{each.stage.population} candidates x {each.stage.episodes} episodes" for each in stages)
+    horizon = in_turn(str(each.stage.horizon) for each in stages)
+    axes.set(xlabel="generation", ylabel=f"fitness over {horizon} {'dreamt ' * dreamt}steps")
+    title = f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}"
+    axes.set_title(title, fontsize=11)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)

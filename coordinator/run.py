@@ -10,12 +10,12 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from dreamfleet.common.heat import deciding_evaluation
 from dreamfleet.common.messages import Result
 from dreamfleet.common.runs import ENDING
+from dreamfleet.common.stages import longest_horizon
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.terms import Agenda, Terms
 from dreamfleet.coordinator.config import LimitsConfig
-from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.exchange import Exchange
 from dreamfleet.coordinator.fleet import Fleet
 from dreamfleet.coordinator.generation import Generation, Standing
@@ -24,7 +24,6 @@ from dreamfleet.coordinator.history import History
 from dreamfleet.coordinator.journal import Journal
 from dreamfleet.coordinator.limits import stop_reason
 from dreamfleet.coordinator.slack import Slack
-from dreamfleet.coordinator.start import kept_start
 
 
 class Run:
@@ -49,18 +48,18 @@ class Run:
         self.incarnation = journal.begin_incarnation()
         self._journal = journal
         self._untold: list[StoredGeneration] = []
-        if dropped := journal.drop_excessive(settings.task.horizon):
+        if dropped := journal.drop_excessive(longest_horizon(settings)):
             fleet.notes.append(f"{dropped} results of an older version are too large to count: asked for again")
         self._ending = self._reached()  # the limit that is reached: only what is in the slack is waited for
         closed, evaluations = journal.closed()
         self.history = History(closed)
-        self.slack = Slack(journal, settings, self.uid, self.history, evaluations)
+        self._agenda = Agenda(settings)
+        self.slack = Slack(journal, settings, self.uid, self.history, evaluations, self._agenda)
         self.exchange = Exchange(
             journal, self.incarnation, fleet, self.slack, self._score, horizon=settings.task.horizon, mixed=mixed
         )
-        self._evolution = Evolution(EvolutionConfig.of(settings), kept_start(journal))
         evaluated = self.slack.evaluations.finished
-        self._generations = Generations(journal, settings, self._evolution, self.history, evaluated)
+        self._generations = Generations(journal, settings, self._agenda, self.history, evaluated)
         self.opened = now
         self.generation = self._generations.begin()
         self._begin(now)
@@ -68,12 +67,12 @@ class Run:
     @property
     def sigma(self) -> float:
         """The strategy's overall step size."""
-        return self._evolution.sigma
+        return self._generations.sigma
 
     @property
-    def temperature(self) -> float | None:
-        """At which the open generation dreams; `None` where a task has none."""
-        return self.generation.spec.temperature
+    def terms(self) -> Terms:
+        """Those of the open generation."""
+        return self._generations.terms
 
     @property
     def last(self) -> Standing | None:
@@ -130,7 +129,7 @@ class Run:
 
     def prepare(self) -> None:
         """Work ahead while workers are busy."""
-        self._evolution.prepare()
+        self._generations.prepare()
 
     def pause(self, why: str) -> None:
         """Dispatch nothing more until the run is resumed."""
@@ -151,12 +150,14 @@ class Run:
 
     @property
     def _waiting(self) -> bool:
-        """Whether the run is ending, or the next generation's temperature hangs on an evaluation in progress."""
-        deciding = deciding_evaluation(self.settings, self.generation.number + 1)
+        """Whether the run is ending, or the next generation's terms hang on an evaluation in progress."""
+        deciding = self._agenda.awaited(self.generation.number + 1)
         return self._ending is not None or (self.slack.evaluations.awaits(deciding) and self.generation.complete)
 
     def _begin(self, now: float) -> None:
         generation = self.generation
+        if len(self._agenda.stages) > 1:
+            self.fleet.notes.append(f"generation {generation.number} is in {self._stage_told}")
         self.fleet.jobs.begin(generation.number)
         work = self.slack.begin(self._generations.mean, now)
         if self._ending is None and not generation.done and (reason := self._stop_reason(generation)):
@@ -178,11 +179,7 @@ class Run:
         generation = self._generations.open(closed.number + 1)
         reason = self._stop_reason(generation)
         self.fleet.jobs.offer(self.slack.schedule(closed.number, mean, now, last=reason is not None))
-        if generation.spec != self.generation.spec:
-            self.fleet.notes.append(
-                f"generation {generation.number} dreams at temperature {generation.spec.temperature:g}: the evaluated "
-                "mean fell"
-            )
+        self._tell_changes(generation)
         self.generation, self.opened = generation, now
         self.fleet.jobs.begin(generation.number)
         if reason:
@@ -190,6 +187,19 @@ class Run:
             self._end_by(reason)
         else:
             self.fleet.jobs.offer(generation.missing)
+
+    def _tell_changes(self, generation: Generation) -> None:
+        """Say for the log under which other terms a generation opens, and why."""
+        begun, number, warm = self.terms.begun, generation.number, generation.spec.temperature
+        if begun.since == number:
+            self.fleet.notes.append(f"{self._stage_told} begins with generation {number} after {begun.why}")
+        if warm is not None and warm != self.generation.spec.temperature:
+            self.fleet.notes.append(f"generation {number} dreams at temperature {warm:g}: the evaluated mean fell")
+
+    @property
+    def _stage_told(self) -> str:
+        stage = self.terms.stage
+        return f"stage {stage.number} of {len(self._agenda.stages)} ({stage.told})"
 
     def _score(self, result: Result) -> None:
         assert result.fitness is not None

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dreamfleet.common.messages import Result
 from dreamfleet.common.runs import CONFIRMED, CONTROLLER
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation
+from dreamfleet.common.terms import Agenda
 from dreamfleet.coordinator.collection import Collection, Collections
 from dreamfleet.coordinator.confirmation import FINALISTS, Confirmation
 from dreamfleet.coordinator.evaluation import Evaluation, Evaluations
@@ -21,8 +22,9 @@ class Slack:
 
     def __init__(
         self, journal: Journal, settings: RunSettings, run_uid: str, history: History,
-        evaluations: Iterable[StoredEvaluation],
+        evaluations: Iterable[StoredEvaluation], agenda: Agenda,
     ) -> None:  # fmt: skip
+        """`agenda` knows the terms of each generation before the means after it are wanted."""
         folder = journal.path.parent
         self.evaluations = Evaluations(evaluations)
         self.collections = Collections(folder)
@@ -30,6 +32,7 @@ class Slack:
         self._journal = journal
         self._settings = settings
         self._history = history
+        self._agenda = agenda
         self._confirmation: Confirmation | None = None  # while the run is ending
         text = journal.fact(CONFIRMED)
         self._confirmed = None if text is None else StoredConfirmation.from_json(text)
@@ -129,7 +132,8 @@ class Slack:
 
     def _collect(self, collection: Collection) -> list[Work]:
         known = self._journal.results_of("collect", collection.generation)
-        return self.collections.open(collection.work(self._settings.task, self._settings.seed), known)
+        spec, settings = self._agenda.spec(collection.generation), self._settings
+        return self.collections.open(collection.work(spec, settings.seed, settings.task), known)
 
 
 def _is_due(every: int, generation: int, *, last: bool) -> bool:

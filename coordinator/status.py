@@ -17,6 +17,7 @@ from dreamfleet.common.status import (
     OpenGeneration,
     Population,
     Progress,
+    StageStatus,
     Status,
     Throughput,
     Waste,
@@ -109,8 +110,18 @@ def _open_generation(run: Run, now: float) -> OpenGeneration:
         episodes=run.generation.total,
         seconds=round(max(now - run.opened, 0.0), 1),
         sigma=run.sigma,
-        temperature=run.temperature,
+        temperature=run.generation.spec.temperature,
+        stage=_stage(run),
     )
+
+
+def _stage(run: Run) -> StageStatus | None:
+    total, begun = len(run.settings.stages), run.terms.begun
+    stage = begun.stage
+    if not total:
+        return None
+    within = stage.horizon, stage.patience, stage.population, stage.episodes, stage.racing
+    return StageStatus(stage.number, total, begun.since, *within)
 
 
 def _headless(standing: Standing) -> Population:

@@ -7,7 +7,7 @@ import logging
 import signal
 import sys
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.config import Table, add_flags, given, load
@@ -17,6 +17,7 @@ from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.site import offer
 from dreamfleet.common.unblocked import unblock_stderr
 from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig, RunConfig, find_preset
+from dreamfleet.coordinator.schedule import find_schedule, unfold
 
 if TYPE_CHECKING:
     from dreamfleet.common.runs import RunFolder
@@ -65,10 +66,21 @@ def run(args: argparse.Namespace) -> int:
 
 def serve(args: argparse.Namespace, base: Table, start: Start | None) -> int:
     """Serve a new run, whose settings are those of `base` where nothing else is said."""
-    config = load(RunConfig, "run", base=base, preset=find_preset, **args.sources)
+    config = _scheduled(args, load(RunConfig, "run", base=base, preset=find_preset, **args.sources))
     limits = load(LimitsConfig, "limits", **args.sources)
     _check_target(limits, config.evaluate_every)
     return _serve(args, _request(args, args.run_name, config, limits, {}, start))
+
+
+def _scheduled(args: argparse.Namespace, config: RunConfig) -> RunConfig:
+    """The configuration with the stages that its schedule, or the configuration file, holds."""
+    found = find_schedule(config.schedule, args.sources["file"])
+    if found is None:
+        return config
+    twice = [name for name in unfold(found)[0] if name in args.given]
+    if twice:
+        raise UsageError(f"--{twice[0]} and {twice[0]} of stage 1 are the same setting: leave one of them out")
+    return replace(config, stages=found)
 
 
 def _resume(args: argparse.Namespace) -> int:
@@ -127,6 +139,10 @@ def _tell_frozen(args: argparse.Namespace, stored: RunFolder) -> None:
 
     said = given(RunConfig, "run", args.sources["file"], args.sources["environment"])
     preset = find_preset(said.pop("preset")) if "preset" in said else {}
+    named, stages = unfold(find_schedule(said.pop("schedule", None), args.sources["file"]) or ())
+    said |= named
+    if stages and stages != stored.settings.stages:
+        log.warning("run %s keeps its own schedule; the settings say another", stored.name)
     frozen: dict[str, Any] = settings_of(stored.settings, stored.bundle_path)
     for name, value in {**preset, **said}.items():
         if name != "bundle" and frozen.get(name, value) != value:

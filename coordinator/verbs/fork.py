@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-SUMMARY = "start a new run from another one's mean, step size and temperature; any setting may change"
+SUMMARY = "start a new run from another one's mean, step size, temperature and stage; any setting may change"
 EXTRAS = ()
 
 
@@ -19,15 +19,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the new run until it ends."""
-    from dreamfleet.common.heat import spec_of
     from dreamfleet.common.runs import open_run
+    from dreamfleet.common.terms import terms_of
     from dreamfleet.coordinator.config import settings_of
+    from dreamfleet.coordinator.schedule import remaining
     from dreamfleet.coordinator.start import latest, start_of
     from dreamfleet.coordinator.verbs.coordinator import serve
 
     with open_run(args.runs_dir, args.source) as stored:
         start, (_, sigma) = start_of(stored), latest(stored)
-        present = {"sigma0": sigma, "temperature": spec_of(stored, len(stored.history())).temperature}
+        terms = terms_of(stored, len(stored.history()))
+        present = {**remaining(stored.settings, terms.stage), "sigma0": sigma, "temperature": terms.spec.temperature}
         settings = {**settings_of(stored.settings, stored.bundle_path), **present}
     if {"environment", "normalise"} & args.given:
         settings.pop("task_options", None)  # described anew, and refused if that makes another world of it

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 
 from dreamfleet.common.listing import add_json, print_rows
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.site import offer
+from dreamfleet.common.stages import BegunStage, begun_stages, stages_of
 from dreamfleet.common.stored import RunSettings, StoredGeneration, best_of, told
 
 SUMMARY = "show one run from its journal: settings, history, evaluations"
@@ -31,13 +33,17 @@ def run(args: argparse.Namespace) -> int:
         confirmed = stored.confirmation()
         facts = {"run": stored.name, "run_uid": stored.uid, "created": stored.created, "ended": stored.ended,
                  "fingerprint": stored.fingerprint}  # fmt: skip
+    begun = begun_stages(settings, history, evaluations) if settings.stages else ()
     if args.json:
         rows = {"history": [asdict(each) for each in history], "evaluations": [asdict(each) for each in evaluations]}
+        rows["stages"] = [{"number": each.stage.number, "since": each.since, "after": each.why} for each in begun]
         reported = None if confirmed is None else {**asdict(confirmed), "error": confirmed.error}
         print(json.dumps({**facts, "settings": asdict(settings), "confirmed": reported, **rows}, indent=2))
         return 0
     facts["reported"] = told(confirmed or best_of(evaluations))
-    print_rows([{"": name, "value": value} for name, value in {**facts, **_flat(settings)}.items()])
+    facts |= {"stage": f"{len(begun)} of {len(settings.stages)}"} if begun else {}
+    shown_settings = {**_flat(settings), **_stages(settings, begun)}
+    print_rows([{"": name, "value": value} for name, value in {**facts, **shown_settings}.items()])
     print()
     shown = history[-SHOWN:] if sys.stdout.isatty() else history
     judged = {each.generation: each.mean for each in evaluations}
@@ -48,10 +54,21 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str, object]:
+    """Each stage of a schedule in words, and when it began."""
+    found: dict[str, object] = {}
+    for stage in stages_of(settings) if settings.stages else ():
+        since = f"since generation {begun[stage.number - 1].since}" if stage.number <= len(begun) else "not begun"
+        found[f"stage {stage.number}"] = f"{since}, {stage.ending}: {stage.told}"
+    return found
+
+
 def _flat(settings: RunSettings) -> dict[str, object]:
-    """The settings with the task's and the controller's among them."""
+    """The settings with the task's and the controller's among them, but for the stages."""
     flat: dict[str, object] = {}
-    for name, value in asdict(settings).items():
+    plain = asdict(settings)
+    del plain["stages"]
+    for name, value in plain.items():
         flat |= {name: value} if not isinstance(value, dict) else _within(name, value)
     return flat
 

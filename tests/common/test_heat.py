@@ -4,9 +4,10 @@ import itertools
 import pytest
 
 from dreamfleet.common.controller import ControllerShape
-from dreamfleet.common.heat import deciding_evaluation, spec_at
+from dreamfleet.common.heat import Heat
 from dreamfleet.common.messages import HOTTEST
 from dreamfleet.common.stored import RunSettings, StoredEvaluation
+from dreamfleet.common.terms import terms_at
 from tests.support.samples import SPEC
 
 EVERY = 5
@@ -21,9 +22,13 @@ def checks(*means):
     return [StoredEvaluation(EVERY * (index + 1) - 1, 16, mean, 40.0) for index, mean in enumerate(means)]
 
 
+def temperature(generation, evaluations, settings=SETTINGS):
+    return terms_at(generation, settings, (), evaluations).spec.temperature
+
+
 def raised(means, settings=SETTINGS):
     """Of the first generation that all of the checks decide upon."""
-    found = spec_at(EVERY * (len(means) + 1), settings, checks(*means)).temperature
+    found = temperature(EVERY * (len(means) + 1), checks(*means), settings)
     return None if found == settings.task.temperature else found
 
 
@@ -47,17 +52,17 @@ def test_a_check_that_falls_clearly_raises_the_temperature_and_begins_the_compar
 
 
 def test_a_generation_is_decided_by_checks_that_are_a_whole_block_old():
-    found = [spec_at(generation, SETTINGS, checks(500.0, 400.0, 390.0)).temperature for generation in range(20)]
+    found = [temperature(generation, checks(500.0, 400.0, 390.0)) for generation in range(20)]
     found = [None if each == SETTINGS.task.temperature else each for each in found]
     assert found == [None] * 15 + [1.5] * 5
-    assert [deciding_evaluation(SETTINGS, generation) for generation in (0, 9, 10, 14, 15)] == [-6, -1, 4, 4, 9]
+    assert [Heat(SETTINGS).awaited(generation) for generation in (0, 9, 10, 14, 15)] == [-6, -1, 4, 4, 9]
 
 
 def test_later_checks_and_those_off_the_schedule_and_the_order_of_arrival_change_nothing():
     known = checks(500.0, 450.0, 500.0)
     stray = [StoredEvaluation(7, 16, 900.0, 40.0), *checks(0.0, 0.0, 0.0, 0.0, 0.0)[3:]]
     for order in itertools.permutations([*known, *stray]):
-        assert spec_at(20, SETTINGS, order).temperature == spec_at(20, SETTINGS, known).temperature == 1.5
+        assert temperature(20, order) == temperature(20, known) == 1.5
 
 
 def test_the_temperature_stays_within_what_a_message_may_carry():
@@ -69,7 +74,7 @@ def test_without_heat_nothing_is_raised_or_waited_for():
     cold = dataclasses.replace(SETTINGS, heat=1.0)
     assert raised((500.0, 400.0, 300.0, 200.0), cold) is None
     never = dataclasses.replace(cold, evaluate_every=0)
-    assert [deciding_evaluation(each, 50) for each in (cold, never)] == [-1, -1]
+    assert [Heat(each).awaited(50) for each in (cold, never)] == [-1, -1]
 
 
 def test_settings_and_digests_without_heat_are_what_they_were():

@@ -21,6 +21,7 @@ from tests.support.samples import HEAD, SPEC
 
 BEAT = 1.0
 GENERATIONS, SLOTS = 3, 2
+SPECS = (SPEC, SPEC.at(horizon=400, patience=0), SPEC.at(horizon=400, patience=0))  # of each: a run of two stages
 SEEDS = (1000, 1001, 1002)
 
 
@@ -40,7 +41,7 @@ def fitness_of(digest):
 
 
 def lossless(number):
-    generation = Generation(number, SPEC, population(number), SEEDS)
+    generation = Generation(number, SPECS[number], population(number), SEEDS, own=SPEC)
     for work in generation.work:
         generation.record(work.job.digest, fitness_of(work.job.digest), 10)
     return generation.fitness().tolist()
@@ -110,7 +111,7 @@ class AnyOrder(RuleBasedStateMachine):
         if self.number == GENERATIONS:
             self.fleet.hurry = True
             return
-        self.generation = Generation(self.number, SPEC, population(self.number), SEEDS)
+        self.generation = Generation(self.number, SPECS[self.number], population(self.number), SEEDS, own=SPEC)
         for work in self.generation.missing:
             if work.job.digest in self.journal:
                 self.generation.record(work.job.digest, self.journal[work.job.digest], 10)
@@ -326,7 +327,7 @@ class AnyOrder(RuleBasedStateMachine):
         wanted = [
             work.job.digest
             for number in range(GENERATIONS)
-            for work in (*Generation(number, SPEC, population(number), SEEDS).work, *slack_of(number))
+            for work in (*Generation(number, SPECS[number], population(number), SEEDS).work, *slack_of(number))
         ]
         assert self.journal == {digest: fitness_of(digest) for digest in wanted}
         assert len(self.told) == GENERATIONS

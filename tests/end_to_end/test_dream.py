@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.bundle import DREAM, write_bundle
-from dreamfleet.common.heat import spec_of
 from dreamfleet.common.runs import open_run
+from dreamfleet.common.terms import terms_of
 from tests.support import tasks
 
 pytestmark = pytest.mark.timeout(300)
@@ -65,7 +65,7 @@ def heated_outcome(processes, name):
     with open_run(processes.runs, name) as run:
         places = [(g, i) for g in range(HEATED_GENERATIONS) for i in range(POPULATION)]
         told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
-        temperatures = [spec_of(run, g).temperature for g in range(HEATED_GENERATIONS)]
+        temperatures = [terms_of(run, g).spec.temperature for g in range(HEATED_GENERATIONS)]
         return told, run.evaluations(), temperatures
 
 

@@ -15,6 +15,7 @@ from typing import Any
 from unittest.mock import patch
 
 from dreamfleet.common.messages import MAX_PART
+from dreamfleet.common.stages import Stages, stages_of
 from dreamfleet.coordinator import fleet, packing
 from dreamfleet.coordinator.collection import Collections
 from dreamfleet.coordinator.confirmation import Confirmation
@@ -70,6 +71,7 @@ class Mutant:
 MUTANTS: dict[str, Mutant] = {}
 FOUND = [Schedule.from_json(line) for line in Path(__file__).with_name("found.jsonl").read_text().splitlines()]
 COLLECTING = {"collect_every": 1, "rollout": 90_000, "heat": 1.0}
+SCORED = {"evaluate_every": 1, "first_stage": 3, "first_score": 1.2, "heat": 1.0, "generations": 3}
 LONG = {"parameters": 23_000, "width": 1, "heat": 1.0}
 
 
@@ -240,7 +242,7 @@ def generation_lets_the_worse_half_pass_the_barrier(original):
 
 @mutant(Generations, "_recall")
 def generations_forget_the_results_of_the_life_before(_original):
-    return lambda self, stored: self._generation(stored.number, stored.vectors, stored.seeds)
+    return lambda self, stored, terms: self._generation(stored.number, stored.vectors, stored.seeds, terms)
 
 
 @mutant(Run, "commit")
@@ -265,6 +267,22 @@ def confirmation_fills_its_round_in_the_order_in_which_scores_come(original):
             original(self, still[0], score)
 
     return record
+
+
+@mutant(Stages, "awaited", **SCORED)
+def stages_begin_without_the_evaluation_that_decides(original):
+    def awaited(self, generation):
+        return original(self, generation) if generation == self._seen else -1
+
+    return awaited
+
+
+@mutant(Generations, "_search", first_stage=1, anew=True)
+def a_stage_that_is_continued_searches_as_the_first_one(original):
+    def search(self, stage, start):
+        return original(self, stage if hasattr(self, "terms") and self.last else stages_of(self._settings)[0], start)
+
+    return search
 
 
 @mutant(Collections, "receive", **COLLECTING)

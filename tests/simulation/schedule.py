@@ -22,6 +22,9 @@ class Shape:
     episodes: int = 2
     parameters: int = 4  # more than 10,240 are spread over several batches
     racing: bool = False
+    first_stage: int = 0  # generations after which a second stage begins; 0: never
+    first_score: float = 0.0  # of an evaluated mean, at which it begins earlier; 0: at none
+    anew: bool = False  # whether the second stage begins the search anew
     heat: float = 1.0
     evaluate_every: int = 0
     evaluation_episodes: int = 2
@@ -31,6 +34,12 @@ class Shape:
     turn: float = 0.6  # virtual seconds that a slot's turn takes
     run_seed: int = 1
     ends: bool = True  # whether the run reaches its limit, or is paused after its last generation, and falls silent
+
+    @property
+    def most_jobs(self) -> int:
+        """Of a generation; the second stage has a candidate and an episode more at most."""
+        more = self.first_stage > 0
+        return (self.population + more) * (self.episodes + more)
 
 
 @dataclass(frozen=True)
@@ -104,11 +113,22 @@ class Schedule:
 def draw(seed: int, number: int) -> Schedule:
     """The schedule of this number in the campaign of this seed."""
     source = random.Random(f"{seed}/{number}")
-    shape = _draw_shape(source)
+    shape = _staged(_draw_shape(source), random.Random(f"stages of {seed}/{number}"))
     count = source.choice((0, 1, 5, 20, 20, 30, 40, 60))  # few faults too: each alone must be harmless
     kinds, weights = list(KINDS), [often for often, _, _ in KINDS.values()]
     faults = [_draw_fault(source, kind, shape.workers) for kind in source.choices(kinds, weights, k=count)]
     return Schedule(shape, tuple(sorted(faults, key=lambda fault: fault.at)), f"seed {seed}, schedule {number}")
+
+
+def _staged(shape: Shape, source: random.Random) -> Shape:
+    """One in eight has two stages; what else is drawn does not hang on it."""
+    if source.random() > 0.125:
+        return shape
+    first, scored, anew = source.choice((1, 2, 3)), source.random() < 0.5, source.random() < 0.5
+    every = 1 if scored else shape.evaluate_every
+    return replace(
+        shape, generations=3, first_stage=first, first_score=1.4 if scored else 0.0, anew=anew, evaluate_every=every
+    )
 
 
 def _draw_fault(source: random.Random, kind: str, workers: int) -> Fault:

@@ -11,7 +11,8 @@ from tests.simulation.world import Outcome, play
 MOST_PLAYS = 600
 # What a shape can do without; heat goes before the evaluations that it follows from.
 PLAINER = (
-    "heat", "racing", "width", "parameters", "rollout", "collect_every", "confirm_episodes", "evaluate_every", "slots",
+    "first_score", "first_stage", "anew", "heat", "racing", "width", "parameters", "rollout", "collect_every",
+    "confirm_episodes", "evaluate_every", "slots",
 )  # fmt: skip
 SMALLER = {"generations": 1, "workers": 1, "population": 2, "episodes": 1}
 

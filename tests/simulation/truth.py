@@ -14,15 +14,19 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dreamfleet.common.controller import ControllerShape
-from dreamfleet.common.heat import spec_at
 from dreamfleet.common.messages import Job, TaskSpec
-from dreamfleet.common.seeds import collection_seed, training_seed, validation_seeds
-from dreamfleet.common.stored import RunSettings, StoredEvaluation
+from dreamfleet.common.seeds import collection_seed, search_seed, training_seed, validation_seeds
+from dreamfleet.common.stored import RunSettings, StageSettings, StoredEvaluation
+from dreamfleet.common.terms import terms_at
 from dreamfleet.coordinator.optimisers.api import Search
 from tests.simulation.schedule import Shape
 
 STEPS = 100  # of every episode
 TASK = "simulated"
+SECOND_HORIZON, SECOND_PATIENCE, SECOND_SIGMA = 2 * STEPS, 7, 0.25  # of a second stage
+
+Named = tuple[float | None, int | None, int | None]
+"""Temperature, horizon and patience of a job where they are not the run's."""
 
 
 class Strategy:
@@ -74,21 +78,32 @@ def settings_of(shape: Shape) -> RunSettings:
         collect_every=shape.collect_every,
         heat=shape.heat,
         optimiser=TASK,
+        stages=_stages_of(shape),
     )
 
 
-def fitness_of(vector: bytes, seed: int, temperature: float | None) -> float:
-    """What an episode gives: a function of the parameters' bytes, the seed and the temperature, and of nothing else."""
-    return _fitness(hashlib.sha256(vector).digest(), seed, temperature)
+def _stages_of(shape: Shape) -> tuple[StageSettings, ...]:
+    if not shape.first_stage:
+        return ()
+    anew = {"population": shape.population + 1, "sigma0": SECOND_SIGMA} if shape.anew else {}
+    scored = {"horizon": SECOND_HORIZON, "patience": SECOND_PATIENCE, "racing": not shape.racing}
+    first = StageSettings(shape.first_stage, score=shape.first_score or None)
+    return first, StageSettings(episodes=shape.episodes + 1, **scored, **anew)  # type: ignore[arg-type]
+
+
+def fitness_of(vector: bytes, seed: int, named: Named) -> float:
+    """What an episode gives: a function of the parameters' bytes, the seed and what is named, and of nothing else."""
+    return _fitness(hashlib.sha256(vector).digest(), seed, named)
 
 
 def fitness_of_job(job: Job) -> float:
     """What an episode of this job gives, if its vector is what it says."""
-    return _fitness(job.vector, job.seeds[0], job.temperature)
+    return _fitness(job.vector, job.seeds[0], job.terms)
 
 
-def _fitness(identity: bytes, seed: int, temperature: float | None) -> float:
-    told = hashlib.blake2b(identity + repr((seed, temperature)).encode(), digest_size=4).digest()
+def _fitness(identity: bytes, seed: int, named: Named) -> float:
+    content = seed, *(named if any(named[1:]) else named[:1])
+    told = hashlib.blake2b(identity + repr(content).encode(), digest_size=4).digest()
     return 1.0 + int.from_bytes(told, "little") / 2**32
 
 
@@ -117,14 +132,20 @@ def truth_of(shape: Shape) -> Truth:
 def _truth(shape: Shape) -> Truth:
     settings = settings_of(shape)
     strategy = Strategy(Search(np.zeros(settings.controller.size), shape.population, settings.sigma0, shape.run_seed))
-    truth, counted = Truth([], [], {}, {}, 0), set()
+    truth, counted, second = Truth([], [], {}, {}, 0), set(), False
     for number in range(shape.generations):
-        spec = spec_at(number, settings, truth.evaluations.values())
-        temperature = None if spec.temperature == settings.task.temperature else spec.temperature
+        warm = terms_at(number, settings, (), truth.evaluations.values()).spec.temperature
+        named: Named = (None if warm == settings.task.temperature else warm, None, None)
+        episodes, racing = shape.episodes, shape.racing
+        if not second and _first_is_over(shape, number, truth.evaluations):
+            second = True
+            strategy = _second_search(shape, strategy) if shape.anew else strategy
+        if second:
+            named, episodes, racing = (named[0], SECOND_HORIZON, SECOND_PATIENCE), episodes + 1, not racing
         vectors = tuple(row.astype("<f4").tobytes() for row in strategy.ask())
-        seeds = [training_seed(shape.run_seed, number, episode) for episode in range(shape.episodes)]
-        scores = [[fitness_of(vector, seed, temperature) for seed in seeds] for vector in vectors]
-        told, driven = _told(scores, shape.racing)
+        seeds = [training_seed(shape.run_seed, number, episode) for episode in range(episodes)]
+        scores = [[fitness_of(vector, seed, named) for seed in seeds] for vector in vectors]
+        told, driven = _told(scores, racing)
         truth.vectors.append(vectors)
         truth.told.append(told)
         counted |= {("score", vectors[candidate], seeds[episode]) for candidate, episode in driven}
@@ -133,7 +154,7 @@ def _truth(shape: Shape) -> Truth:
         mean = strategy.mean.astype("<f4").tobytes()
         if _due(shape.evaluate_every, number, last and shape.ends):
             tracks = validation_seeds(shape.evaluation_episodes)
-            values = np.array([fitness_of(mean, seed, None) for seed in tracks])
+            values = np.array([fitness_of(mean, seed, (None, None, None)) for seed in tracks])
             truth.evaluations[number] = StoredEvaluation(number, len(tracks), float(values.mean()), float(values.std()))
             counted |= {("evaluate", mean, seed) for seed in tracks}
         if _due(shape.collect_every, number, last and shape.ends):
@@ -141,8 +162,23 @@ def _truth(shape: Shape) -> Truth:
             truth.rollouts[f"{number:06d}-0000.npz"] = rollout_of(mean, seed, shape.rollout)
             counted.add(("collect", mean, seed))
     # One more is asked for when the last is told, so that a run with wider limits could go on from it.
+    if not second and shape.anew and _first_is_over(shape, shape.generations, truth.evaluations):
+        strategy = _second_search(shape, strategy)
     truth.vectors.append(tuple(row.astype("<f4").tobytes() for row in strategy.ask()))
     return replace(truth, jobs=len(counted))
+
+
+def _first_is_over(shape: Shape, number: int, evaluations: Mapping[int, StoredEvaluation]) -> bool:
+    """Whether a second stage begins with generation `number`, or began before it."""
+    if not shape.first_stage or number >= shape.first_stage:
+        return shape.first_stage > 0
+    every = shape.evaluate_every
+    old = [each for each in evaluations if each % every == every - 1 and each + 1 + every <= number]
+    return shape.first_score > 0 and any(evaluations[each].mean >= shape.first_score for each in old)
+
+
+def _second_search(shape: Shape, first: Strategy) -> Strategy:
+    return Strategy(Search(first.mean, shape.population + 1, SECOND_SIGMA, search_seed(shape.run_seed, 2)))
 
 
 def _told(scores: list[list[float]], racing: bool) -> tuple[list[float], set[tuple[int, int]]]:

@@ -268,7 +268,7 @@ class Worker:
                 self._scored.errors += 1
                 self.outbox.add(Result(job.digest, None, STEPS, 0.1, "boom", None))
                 continue
-            fitness, upload = fitness_of(vector, job.seeds[0], job.temperature), None
+            fitness, upload = fitness_of(vector, job.seeds[0], job.terms), None
             if job.kind == "collect":
                 data = rollout_of(vector, job.seeds[0], self._shape.rollout)
                 self.uploads.add(job.digest, data)

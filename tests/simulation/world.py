@@ -381,7 +381,7 @@ class World:
     def _check_waste(self) -> None:
         """What is scored beyond what counts was lost by a fault, one worker's hands at most each."""
         slack = self.scored.steps / 100 - self.counted_jobs
-        hands = 3 * self.shape.slots * min(self.shape.width, self.shape.population * self.shape.episodes)
+        hands = 3 * self.shape.slots * min(self.shape.width, self.shape.most_jobs)
         if slack > hands * (2 + len(self.schedule.faults)):
             raise Violation("waste", f"{slack:.0f} jobs were scored in vain under {len(self.schedule.faults)} faults")
 

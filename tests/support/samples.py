@@ -44,11 +44,10 @@ VERDICTS = ("accepted", "duplicate", "obsolete", "refused")
 HEAD = {"run_uid": UID, "incarnation": 3}
 
 
-def job(episode=0, kind="score", candidate=2, spec=SPEC, seed=1048576, temperature=None):
+def job(episode=0, kind="score", candidate=2, spec=SPEC, seed=1048576, **named):
     return Job(
         kind=kind, task=spec.task, generation=7, candidate=candidate, episode=episode, seeds=(seed + episode,),
-        vector=VECTOR_ID, digest=spec.at(temperature).digest(kind, VECTOR_ID, (seed + episode,)), stall=30.0,
-        temperature=temperature,
+        vector=VECTOR_ID, digest=spec.at(**named).digest(kind, VECTOR_ID, (seed + episode,)), stall=30.0, **named,
     )  # fmt: skip
 
 
@@ -62,6 +61,10 @@ MSGPACK = {
     "job-raised": JobBatch(
         **HEAD, nonce="c0ffee00c0ffee00", numbering=3, number=10, vectors=(),
         jobs=(job(temperature=1.5),), cancels=(), verdicts=(),
+    ),
+    "job-staged": JobBatch(
+        **HEAD, nonce="c0ffee00c0ffee00", numbering=3, number=11, vectors=(),
+        jobs=(job(horizon=400, patience=60), job(horizon=400), job(patience=0)), cancels=(), verdicts=(),
     ),
     "result": ResultBatch(
         **HEAD, fingerprint="x86_64 avx2 glibc-2.36 numpy-2.4.6",

@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files import read_text
 from dreamfleet.common.runs import RunFolder
+from dreamfleet.common.stages import begun_stages, in_turn
 from dreamfleet.worker.inspection.charts import FONT, new_figure, png
 from dreamfleet.worker.inspection.section import Section
 
@@ -74,6 +75,9 @@ def fitness(run: RunFolder) -> Section | None:
     panel.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label="± 1 standard deviation")
     panel.plot(number, mean, "o-", markersize=3, color="tab:blue", label="mean of the population")
     panel.plot(number, best, color="tab:orange", linewidth=1, label="best candidate")
+    stages = begun_stages(run.settings, history, evaluations)
+    for each in stages[1:]:
+        panel.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1)
     panel.set(xlabel="generation", ylabel="fitness")
     panel.xaxis.set_major_locator(MaxNLocator(integer=True))
     handles = list(panel.get_legend_handles_labels()[0])
@@ -94,6 +98,6 @@ def fitness(run: RunFolder) -> Section | None:
         real.set_ylabel("score of whole episodes", color="tab:green")
     panel.legend(handles=handles, fontsize=FONT, loc="best")
     panel.grid(alpha=0.3)
-    task = run.settings.task
-    text = f"Run {run.name}, task {task.task}, {task.horizon} steps an episode: fitness over the generations."
+    horizon = in_turn(str(each.stage.horizon) for each in stages)
+    text = f"Run {run.name}, task {run.spec.task}, {horizon} steps an episode: fitness over the generations."
     return Section("fitness", "How its controller evolved", text, png(figure))

@@ -12,6 +12,7 @@ from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, DatasetError, JournalError
 from dreamfleet.common.files import is_file
 from dreamfleet.common.runs import RunFolder, open_run
+from dreamfleet.common.stages import begun_stages, in_turn
 from dreamfleet.worker.dream.daydream import can_dream
 from dreamfleet.worker.inspection import curves, memory, vision
 from dreamfleet.worker.inspection.page import Page
@@ -80,12 +81,13 @@ def _page(subject: Subject, sections: list[Section]) -> Page:
         about = f"{subject.bundle.path.name}, SHA-256 {subject.bundle.sha256}"
         return Page(title, about, facts(subject.bundle), sections)
     assert subject.run is not None
-    settings = subject.run.settings
+    settings, history = subject.run.settings, subject.run.history()
+    stages = begun_stages(settings, history, subject.run.evaluations())
     rows = [
         ("task", settings.task.task),
         ("controller", f"{settings.controller.size} parameters, layers {settings.controller.layers}"),
-        ("population", f"{settings.population} x {settings.episodes} episodes"),
-        ("generations", str(len(subject.run.history()))),
+        ("population", in_turn(f"{each.stage.population} x {each.stage.episodes} episodes" for each in stages)),
+        ("generations", str(len(history))),
     ]
     return Page(f"{subject.run.name}, a run without a world model", f"run {subject.run.uid}", rows, sections)
 

@@ -41,7 +41,7 @@ class Scorer:
         self._batch_for: Callable[[TaskSpec], Batch] | None = None
         if isinstance(task, Batched) and not judge:
             make = task.make_batch
-            # One is kept: a run's temperature is raised now and then, and making a batch takes milliseconds.
+            # One is kept: a run's terms change now and then, and making a batch takes milliseconds.
             self._batch_for = lru_cache(maxsize=1)(lambda each: make(Assignment(each, assignment.bundle)))
             self._batch_for(spec)  # so that what is wrong with it shows at once
         self._environment = task.make_judge(assignment) if judge else task.make_environment(assignment)
@@ -54,11 +54,11 @@ class Scorer:
     ) -> Score:  # fmt: skip
         """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode.
 
-        `spec` is one other than the run's: the same at another temperature.
+        `spec` is one other than the run's: the same at another temperature, horizon or patience.
         """
         if kind == "score" and self._batch_for is not None:
             return self._batch_for(spec or self.spec).score([(parameters, seed)], on_step)[0]
-        return score(self._environment, self._policy, parameters, self.course(kind, seed), on_step)
+        return score(self._environment, self._policy, parameters, self.course(kind, seed, spec), on_step)
 
     def score_all(
         self, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]], on_step: Callable[[int], None],
@@ -78,11 +78,12 @@ class Scorer:
         return scores
 
     def collect(
-        self, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None
-    ) -> tuple[Score, Rollout]:
-        """An episode as candidates drive it, and what happened in it, failures included."""
+        self, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,
+        spec: TaskSpec | None = None,
+    ) -> tuple[Score, Rollout]:  # fmt: skip
+        """An episode as candidates drive it, and what happened in it, failures included; `spec` as in `score`."""
         rollout = Rollout(DRIVER, self._preprocessing)
-        course = self.course("collect", seed)
+        course = self.course("collect", seed, spec)
         return score(self._environment, self._policy, parameters, course, on_step, rollout), rollout
 
     @property
@@ -90,11 +91,12 @@ class Scorer:
         """Who draws the environment's picture; `-` where a task does not say."""
         return str(getattr(self._environment.unwrapped, "drawn_by", "-"))
 
-    def course(self, kind: Kind, seed: int) -> Course:
-        """The episode that a job of this kind and seed is."""
+    def course(self, kind: Kind, seed: int, spec: TaskSpec | None = None) -> Course:
+        """The episode that a job of this kind and seed is, in the run's specification or in `spec`."""
         if kind == "evaluate":
             return Course(seed, self.world.horizon)
-        return Course(seed, self.spec.horizon, self.spec.patience, self.world.idle_cost)
+        spec = spec or self.spec
+        return Course(seed, spec.horizon, spec.patience, self.world.idle_cost)
 
     def close(self) -> None:
         """Release the environment."""

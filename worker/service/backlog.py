@@ -56,7 +56,7 @@ class Backlog:
             self._jobs.pop(digest, None)
         refused = []
         for job in batch.jobs:
-            spec = self._spec.at(job.temperature)
+            spec = job.spec(self._spec)
             if job.digest != spec.digest(job.kind, job.vector, job.seeds) or job.task != spec.task:
                 refused.append((job, "the job's digest is not of its content"))
             elif job.digest not in held:
@@ -67,11 +67,11 @@ class Backlog:
     def take(self, count: int) -> list[tuple[Job, bytes]]:
         """The first jobs whose vectors are whole, with them: at most `count` to be scored, or one of another kind.
 
-        They are of one temperature.
+        They are of one specification.
         """
         taken: list[tuple[Job, bytes]] = []
         for digest, job in list(self._jobs.items()):
-            if len(taken) == count or (taken and (job.kind != "score" or job.temperature != taken[0][0].temperature)):
+            if len(taken) == count or (taken and (job.kind != "score" or job.terms != taken[0][0].terms)):
                 break
             if (vector := self._whole(job.vector)) is not None:
                 taken.append((job, vector))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dreamfleet.common.bounds import LONGEST_EPISODE, excess, saturated
-from dreamfleet.common.messages import MAX_UPLOAD, Job, Result
+from dreamfleet.common.messages import MAX_UPLOAD, Job, Result, TaskSpec
 
 if TYPE_CHECKING:  # the child imports this module before it imports what scores
     from dreamfleet.worker.scoring.rollout import Rollout
@@ -28,7 +28,7 @@ Work = tuple[Job, bytes]
 
 @dataclass
 class Turn:
-    """Jobs that a child scores together, at one temperature: one, or as many as its task's width."""
+    """Jobs that a child scores together, in one specification: one, or as many as its task's width."""
 
     number: int
     work: Sequence[Work]
@@ -103,9 +103,10 @@ def do_turn(scorer: Scorer, turn: int, work: Sequence[Work], count: Callable[[in
 
     try:
         count(0)
-        scores, upload = _score(scorer, work, on_step)
+        spec = work[0][0].spec(scorer.spec)
+        scores, upload = _score(scorer, work, on_step, spec)
         spent = (perf_counter() - started) / len(work)
-        return Done(turn, _results(work, scores, spent, upload, scorer.spec.horizon), upload)
+        return Done(turn, _results(work, scores, spent, upload, spec.horizon), upload)
     except AbandonedError:
         return Done(turn, ())
     except Exception as error:
@@ -114,14 +115,16 @@ def do_turn(scorer: Scorer, turn: int, work: Sequence[Work], count: Callable[[in
         return Done(turn, tuple(Result(job.digest, None, *each, None) for job, _ in work), failure=failure)
 
 
-def _score(scorer: Scorer, work: Sequence[Work], on_step: Callable[[int], None]) -> tuple[list[Score], bytes | None]:
+def _score(
+    scorer: Scorer, work: Sequence[Work], on_step: Callable[[int], None], spec: TaskSpec
+) -> tuple[list[Score], bytes | None]:
     """The score of each job, and the file of a kept rollout."""
     episodes = [(job.kind, np.frombuffer(vector, dtype="<f4"), job.seeds[0]) for job, vector in work]
     if episodes[0][0] == "collect":
         _, vector, seed = episodes[0]
-        score, drive = scorer.collect(vector, seed, on_step)
+        score, drive = scorer.collect(vector, seed, on_step, spec)
         return [score], _packed(drive)
-    return scorer.score_all(episodes, on_step, scorer.spec.at(work[0][0].temperature)), None
+    return scorer.score_all(episodes, on_step, spec), None
 
 
 def _results(

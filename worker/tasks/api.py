@@ -182,7 +182,7 @@ class Batched(Protocol):
     def make_batch(self, assignment: Assignment) -> Batch:
         """What scores candidates; `BundleError` if the bundle has no such thing.
 
-        Called again whenever the specification's temperature changes, which a run with `--heat` raises.
+        Called again whenever the specification's temperature (`--heat`), horizon or patience (`--schedule`) changes.
         """
 
 

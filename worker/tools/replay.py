@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.heat import spec_of
 from dreamfleet.common.runs import RunFolder
+from dreamfleet.common.terms import terms_of
 from dreamfleet.common.threads import pin_thread_pools
 
 
@@ -23,14 +23,14 @@ class Replayed:
 
 
 def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[Replayed]:
-    """Each stored episode of a candidate, scored again under its generation's task, bundle and seeds."""
+    """Each stored episode of a candidate, scored again under its generation's terms, bundle and seeds."""
     parameters = run.candidate(generation, candidate)
     results = run.results(generation, candidate)
     pin_thread_pools()
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.worker.scoring.scorer import Scorer
 
-    spec = spec_of(run, generation)
+    spec = terms_of(run, generation).spec
     scorer = Scorer(spec, Bundle.open(run.bundle_path, spec.bundle) if spec.bundle else None)
     for result in results:
         yield Replayed(

@@ -81,6 +81,20 @@ def test_a_turn_is_of_one_temperature():
     assert [[each.episode for each, _ in backlog.take(5)] for _ in range(4)] == [[0, 1], [2, 3], [4], []]
 
 
+def test_a_job_is_of_the_horizon_and_patience_that_it_names():
+    backlog, short = Backlog(SPEC), job(1, horizon=400, patience=0)
+    renamed = [dataclasses.replace(short, **wrong) for wrong in ({"horizon": None}, {"patience": 1}, {"horizon": 401})]
+    assert [each for each, _ in backlog.take_in(batch(1, (short, *renamed)))] == renamed
+    assert backlog.take(5) == [(short, VECTOR)]
+
+
+def test_a_turn_is_of_one_stage():
+    named = ({}, {}, {"horizon": 400}, {"horizon": 400}, {"horizon": 400, "patience": 5}, {"patience": 5})
+    backlog = Backlog(SPEC)
+    backlog.take_in(batch(1, [job(episode, **each) for episode, each in enumerate(named)]))
+    assert [[each.episode for each, _ in backlog.take(5)] for _ in range(5)] == [[0, 1], [2, 3], [4], [5], []]
+
+
 def test_a_damaged_vector_is_never_scored():
     backlog = Backlog(SPEC)
     backlog.take_in(batch(1, (job(0),), (dataclasses.replace(WHOLE, data=VECTOR[::-1]),)))

@@ -120,6 +120,28 @@ def test_a_turn_is_scored_at_its_jobs_temperature_as_a_run_of_that_temperature_s
     assert len({score.fitness for scores in found.values() for score in scores}) == 9
 
 
+@pytest.mark.parametrize(("task", "horizons"), [("dream", (20, 7, 20)), ("car-racing", (4, 2, 4))])
+def test_a_turn_is_as_long_as_its_stage_and_scored_as_a_run_of_that_horizon_scores(random_bundle, task, horizons):
+    spec = TaskSpec(task, random_bundle.sha256, horizons[0], 0)
+    jobs = [("score", np.random.default_rng(1).normal(size=867).astype(np.float32), seed) for seed in (1, 2)]
+    scorer = Scorer(spec, random_bundle)
+    for horizon in horizons:
+        scores = scorer.score_all(jobs, lambda _: None, spec.at(horizon=horizon))
+        assert max(each.steps for each in scores) <= horizon
+        assert scores == Scorer(spec.at(horizon=horizon), random_bundle).score_all(jobs, lambda _: None)
+    scorer.close()
+
+
+def test_only_what_is_scored_or_kept_is_cut_by_a_stages_horizon_and_patience(random_bundle):
+    spec = TaskSpec("car-racing", random_bundle.sha256, 1000, 0)
+    scorer, stage = Scorer(spec, random_bundle), spec.at(horizon=300, patience=40)
+    for kind in ("score", "collect"):
+        course = scorer.course(kind, 5, stage)
+        assert (course.horizon, course.patience) == (300, 40)
+    assert scorer.course("evaluate", 5, stage) == scorer.course("evaluate", 5)
+    scorer.close()
+
+
 @pytest.mark.parametrize("name", ["os:abort", "sys:exit", "tests.support.tasks:steps_made"])
 def test_what_is_no_class_is_never_called_as_a_task(name):
     with pytest.raises(UsageError, match="is no task: it is no class"):

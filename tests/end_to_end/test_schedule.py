@@ -1,0 +1,138 @@
+"""A run of several stages with real workers: the same bits through kills, each stage replayed, and told to people."""
+
+import json
+
+import pytest
+
+from dreamfleet.common.runs import open_run
+from dreamfleet.common.stages import begun_stages
+from dreamfleet.common.terms import terms_of
+from dreamfleet.coordinator.plot import plot_fitness
+from dreamfleet.worker.inspection.curves import fitness
+from tests.support import tasks
+
+pytestmark = pytest.mark.timeout(300)
+GENERATIONS, BEGUN, SIZES = 8, [0, 4, 6], [5] * 4 + [7] * 4
+STAGES = """
+[[stage]]
+score = -1000.0     # of any mean: that of generation 1 counts from generation 4 on
+horizon = 4
+patience = 3
+
+[[stage]]
+generations = 2
+horizon = 7
+patience = 0
+population = 7
+sigma0 = 0.3
+
+[[stage]]
+horizon = 10
+episodes = 4
+racing = true
+"""
+
+
+@pytest.fixture
+def begin(processes, random_bundle):
+    path = processes.folder / "stages.toml"
+    path.write_text(STAGES)
+
+    def coordinator(name, *flags):
+        return processes.coordinator(
+            "--bundle", random_bundle.path, "--task", tasks.TOY, "--population", 5, "--episodes", 2,
+            "--evaluate-every", 2, "--evaluation-episodes", 3, "--generations", GENERATIONS, "--schedule", path, *flags,
+            name=name,
+        )  # fmt: skip
+
+    return coordinator
+
+
+def outcome(processes, name):
+    with open_run(processes.runs, name) as run:
+        places = [(g, i) for g in range(GENERATIONS) for i in range(SIZES[g])]
+        told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
+        steps = [[each.steps for each in run.results(*place)] for place in places]
+        begun = begun_stages(run.settings, run.history(), run.evaluations())
+        return told, steps, run.evaluations(), [each.since for each in begun]
+
+
+def resume(processes, name):
+    return processes.start(
+        "coordinator", "--resume", name, "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2
+    )
+
+
+def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(processes, begin):
+    coordinator = begin("calm")
+    worker = processes.worker("--task", tasks.TOY, "--run", "calm")
+    coordinator.wait_for("stage 3 of 3 (10 steps, 7 x 4 episodes, racing, the search goes on) begins with generation 6")
+    assert coordinator.finish()[0] == 0
+    worker.end()
+    coordinator = begin("night")
+    for number in range(2):
+        processes.worker("--task", tasks.TOY, "--run", "night", "--name", f"w{number}")
+    for said in ("generation 2: mean", "stage 2 of 3", "generation 5: mean", "generation 6: mean"):
+        coordinator.wait_for(said)
+        coordinator.end()
+        coordinator = resume(processes, "night")
+    assert coordinator.finish()[0] == 0
+    told, steps, evaluations, begun = outcome(processes, "calm")
+    assert (told, steps, evaluations, begun) == outcome(processes, "night")
+    assert begun == BEGUN
+    assert steps[0] == [3, 3], "patience cuts what never is rewarded"
+    assert {each for candidate in steps[4 * 5 : 4 * 5 + 2 * 7] for each in candidate} == {7}
+    assert sorted(map(len, steps[-7:])) == [2] * 3 + [4] * 4
+    for generation in (3, 4, 6):
+        code, out, err = processes.call(
+            "replay", "night", "--runs-dir", processes.runs, "--candidate", f"{generation}/1"
+        )
+        assert (code, "DIFFERS" in out) == (0, False), err
+    code, out, err = processes.call("runs", "show", "night", "--runs-dir", processes.runs)
+    assert code == 0, err
+    shown = [line.split("\t") for line in out.splitlines()]
+    assert ["stage", "3 of 3"] in shown
+    assert any(row[0] == "stage 2" and row[1].startswith("since generation 4, until 2 generations: ") for row in shown)
+    code, out, err = processes.call("runs", "show", "night", "--runs-dir", processes.runs, "--json")
+    assert [each["since"] for each in json.loads(out)["stages"]] == BEGUN
+    picture = processes.folder / "fitness.png"
+    with open_run(processes.runs, "night") as run:
+        plot_fitness(run, picture)
+        text = fitness(run).text
+    assert "4, then 7, then 10 steps an episode" in text
+    assert picture.stat().st_size > 1000
+
+
+def test_a_live_run_tells_its_stage_and_a_fork_begins_with_it(processes, begin):
+    coordinator = begin("night")
+    worker = processes.worker("--task", tasks.TOY, "--run", "night")
+    coordinator.wait_for("generation 4: mean")
+    coordinator.end()
+    with open_run(processes.runs, "night") as run:
+        stage = terms_of(run, len(run.history())).stage
+    forked = processes.start(
+        "fork", "night", "--runs-dir", processes.runs, "--run", "other", "--listen", processes.endpoint, "--beat", 0.2,
+        "--generations", 1,
+    )  # fmt: skip
+    forked.wait_for(f"generation 0 is in stage 1 of {4 - stage.number} ({stage.horizon} steps")
+    status = processes.statuses()[0]
+    assert (status.generation.stage.number, status.generation.stage.horizon) == (1, stage.horizon)
+    worker.end()
+    processes.worker("--task", tasks.TOY, "--run", "other")
+    assert forked.finish()[0] == 0
+
+
+def test_a_schedule_is_frozen_with_its_run_and_a_file_that_says_another_is_told(processes, begin):
+    begin("night").end()
+    schedule = processes.folder / "stages.toml"
+    resumed = ("coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint)
+    code, _, err = processes.call(*resumed, "--schedule", schedule)
+    assert code == 2
+    assert "--schedule: frozen with run night" in err
+    other = processes.folder / "other.toml"
+    for text, warned in ((STAGES, False), (STAGES.replace("generations = 2", "generations = 3"), True)):
+        other.write_text(text)
+        coordinator = processes.start(*resumed, "--config", other)
+        coordinator.wait_for("incarnation")
+        coordinator.end()
+        assert any("schedule" in line for line in coordinator.lines) == warned
