@@ -10,6 +10,7 @@ jobs lost, and the share of environment steps that did not count.
 import argparse
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -89,6 +90,7 @@ def _drive(fleet, processes, stage, faults, happened):
 
 def outcome(processes, generations):
     """Every fitness and vector, every evaluation, and the reported mean; jobs lost, and jobs that count."""
+    shutil.copytree(processes.runs, processes.folder / "runs-as-they-ended")  # their disk goes
     with open_run(processes.runs, "run") as run:
         places = [(g, i) for g in range(generations) for i in range(POPULATION)]
         fitness = [run.fitness(*place) for place in places]
@@ -96,7 +98,9 @@ def outcome(processes, generations):
         vectors = [run.candidate(*place).tobytes() for place in places]
         mean = np.load(run.controller_path)["parameters"].tobytes()
         lost = sum(EPISODES - len(each) for each in episodes)
-        return (fitness, episodes, vectors, run.evaluations(), mean), lost, run.result_count()
+        whole = {"fitness": fitness, "episodes": episodes, "vectors": vectors, "evaluations": run.evaluations(),
+                 "confirmed": run.confirmation(), "mean": mean}  # fmt: skip
+        return whole, lost, run.result_count()
 
 
 def compare(folder, faults, seed, stage=NARROW, kinds=tuple(KINDS)):
@@ -118,8 +122,11 @@ def compare(folder, faults, seed, stage=NARROW, kinds=tuple(KINDS)):
         seconds = time.monotonic() - started
         print(f"{stage.name}, {name}: {seconds:.0f} s, {made} steps made, {counted} counted", file=sys.stderr)
     calm, chaos = outcomes
+    different = [name for name in calm if calm[name] != chaos[name]]
+    for name in different:
+        print(f"{stage.name}: {name} differ: {_first_difference(calm[name], chaos[name])}", file=sys.stderr)
     return {
-        "identical": calm == chaos,
+        "identical": not different,
         "lost": lost,
         "waste": round(1 - counted / made, 4),
         "faults": dict(happened),
@@ -128,6 +135,14 @@ def compare(folder, faults, seed, stage=NARROW, kinds=tuple(KINDS)):
         "made": made,
         "seconds": round(seconds),
     }
+
+
+def _first_difference(calm, chaos):
+    """The first place where they differ, for people."""
+    if not isinstance(calm, list) or len(calm) != len(chaos):
+        return f"{calm!r:.300} and {chaos!r:.300}"
+    place = next(place for place, pair in enumerate(zip(calm, chaos, strict=True)) if pair[0] != pair[1])
+    return f"at {place}: {calm[place]!r:.300} and {chaos[place]!r:.300}"
 
 
 def both(folder, faults, seed, kinds):
@@ -162,12 +177,17 @@ def main():
     parser.add_argument(
         "--stage", choices=("narrow", "wide", "both"), default="both", help="slots of width 1, 256, both"
     )
+    parser.add_argument("--folder", type=Path, help="a new folder, which is kept")
     arguments = parser.parse_args()
     kinds = tuple(name for name in arguments.kinds.split(",") if name not in arguments.without.split(","))
     if unknown := set(kinds) - KINDS.keys():
         parser.error(f"no such kind of fault: {', '.join(unknown)}; there are: {', '.join(KINDS)}")
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with ExitStack() as stack:
+        if arguments.folder is None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        else:
+            folder = arguments.folder
+            folder.mkdir(parents=True)
         if arguments.stage == "both":
             figures = both(folder, arguments.faults, arguments.seed, kinds)
         else:

@@ -53,7 +53,9 @@ def fingerprints(processes):
 
 def test_a_host_that_said_hello_and_left_keeps_nobody_out(processes, settings):
     coordinator = processes.coordinator(*settings, "--generations", 2)
-    hello = HelloRequest(1, 1, "0", "gone/00000001", (tasks.SLOW_TOY,), OTHER, 1)
+    hello = HelloRequest(
+        keys.PROTOCOL_VERSION, keys.PROTOCOL_VERSION, "0", "gone/00000001", (tasks.SLOW_TOY,), OTHER, 1
+    )
     with open_session(Network(connect=(processes.endpoint,))) as session:
         (reply,) = session.get(keys.hello("test"), payload=encode_json(hello), timeout=5)
         assert b'"accepted": true' in reply.ok.payload.to_bytes()

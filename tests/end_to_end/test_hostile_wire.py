@@ -93,7 +93,8 @@ def test_a_hundred_thousand_damaged_messages_leave_no_trace_but_their_count(proc
     assert after - before < 20e6
 
 
-HELLO = replace(JSON["hello-request"], tasks=(tasks.SLOW_TOY,), slots=1)
+SPOKEN = {"protocol_min": keys.PROTOCOL_VERSION, "protocol_max": keys.PROTOCOL_VERSION}
+HELLO = replace(JSON["hello-request"], tasks=(tasks.SLOW_TOY,), slots=1, **SPOKEN)
 
 
 def say(session, key, payload=None):
