@@ -85,3 +85,8 @@ def test_settings_and_digests_without_heat_are_what_they_were():
     written = "32b5b1f8a6bee0b22ed62a5034cdf1657709a3c7b15707ad38a792110c7c9de4"  # by the version before heat
     assert SPEC.digest("score", b"x" * 32, (1,)).hex() == written
     assert SPEC.at(None).digest("score", b"x" * 32, (1,)).hex() == written
+
+
+def test_a_dream_that_nobody_evaluates_stays_as_warm_as_it_is():
+    settings = dataclasses.replace(SETTINGS, heat=1.0, evaluate_every=0)
+    assert temperature(5, [], settings) == settings.task.temperature
