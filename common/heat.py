@@ -39,7 +39,9 @@ class Heat:
         `finished` holds by generation at least the evaluations that this one depends on.
         """
         last = self.awaited(generation)
-        while self._temperature is not None and self._next <= last >= 0:
+        if self._temperature is None or last < 0:
+            return self._temperature
+        while self._next <= last:
             if (evaluation := finished.get(self._next)) is not None:
                 self._look(evaluation)
             self._next += self._settings.evaluate_every

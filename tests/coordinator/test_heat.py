@@ -8,65 +8,32 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from dreamfleet.common.messages import Result, ResultBatch
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.table import run_panel
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.status import take_snapshot
 from dreamfleet.coordinator.verbs import fork
-from tests.coordinator.test_run import SETTINGS, A, Bench
+from tests.coordinator.evaluated import EVERY, Evaluated
+from tests.coordinator.test_run import SETTINGS
 from tests.support.samples import SPEC
 
-EVERY, GENERATIONS = 2, 14
+GENERATIONS = 14
 HEATED = replace(
     SETTINGS, task=replace(SPEC, temperature=1.0), heat=1.5, evaluate_every=EVERY, evaluation_episodes=2,
     population=6, collect_every=0,
 )  # fmt: skip
 REALITY = (500.0, 400.0, 300.0, 450.0, 350.0, 300.0, 300.0)  # of the means after generations 1, 3, 5, ...
-OFF_SCHEDULE = 900.0  # of a mean that is evaluated because a limit was reached: all others would fall behind it
 TEMPERATURES = [None] * 6 + [1.5] * 6 + [2.25] * 2
 
 
-class Heated(Bench):
-    """Its jobs are finished in any order that a test likes."""
-
-    def begin(self):
-        self.given = []
-        super().begin()
-
-    def fetch(self):
-        for send in self.run.fleet.dispatch(self.now):
-            self.given += [work.job for work in send.content.work]
-
-    def finish(self, index):
-        job = self.given.pop(index)
-        if job.kind == "score":
-            fitness = int.from_bytes(job.digest[:4], "little") / 1e6
-        elif job.generation % EVERY:
-            fitness = REALITY[job.generation // EVERY] + job.episode
-        else:
-            fitness = OFF_SCHEDULE
-        self.deliver(A, Result(job.digest, fitness, 10, 0.1, None, None))
-
-    def first(self, kind):
-        return next((index for index, job in enumerate(self.given) if job.kind == kind), None)
+class Heated(Evaluated):
+    reality = REALITY
 
     def outcome(self):
         with RunFolder(self.path) as run:
             numbers = [(number, index) for number in range(GENERATIONS) for index in range(self.settings.population)]
             told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in numbers]
             return told, [each for each in run.evaluations() if each.generation % EVERY]
-
-
-def driven(bench, choose, after=lambda: None):
-    """To its end; temperatures of the jobs by generation."""
-    found = {}
-    while bench.run.ended is None:
-        bench.fetch()
-        found.update({job.generation: job.temperature for job in bench.given if job.kind == "score"})
-        bench.finish(choose(bench))
-        after()
-    return found
 
 
 @pytest.fixture
@@ -85,38 +52,26 @@ def heated(tmp_path, random_bundle):
 @pytest.fixture
 def undisturbed(heated):
     bench = heated("undisturbed")
-    assert list(driven(bench, lambda _: 0).values()) == TEMPERATURES
+    assert [terms[0] for terms in bench.drive(lambda _: 0).values()] == TEMPERATURES
     return bench.outcome()
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_killed_anywhere_it_raises_at_the_same_generations_and_gives_the_same_bits(heated, undisturbed, seed):
     bench, chance = heated("night"), random.Random(seed)
-
-    def deliver_and_perhaps_die(name, result):
-        """Before the commit, after it, or not."""
-        fate = chance.random()
-        batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(result,))
-        bench.run.exchange.results(name, batch, bench.now)
-        bench.run.advance(bench.now)
-        if fate > 0.2 or bench.run.ended is not None:
-            bench.run.commit()
-        if fate < 0.4 and bench.run.ended is None:
-            bench.restart()
-
-    bench.deliver = deliver_and_perhaps_die
-    found = driven(bench, lambda bench: chance.randrange(len(bench.given)))
-    assert [found[number] for number in range(GENERATIONS)] == TEMPERATURES
+    bench.die_by(chance)
+    found = bench.drive(lambda bench: chance.randrange(len(bench.given)))
+    assert [found[number][0] for number in range(GENERATIONS)] == TEMPERATURES
     assert bench.run.incarnation > 10
     assert bench.outcome() == undisturbed
 
 
 def test_a_run_that_ended_between_two_checks_and_goes_on_raises_as_if_it_had_not(heated, undisturbed):
     bench = heated("night", generations=5)
-    driven(bench, lambda _: 0)
+    bench.drive(lambda _: 0)
     bench.limits = LimitsConfig(generations=GENERATIONS)
     bench.restart()
-    driven(bench, lambda _: 0)
+    bench.drive(lambda _: 0)
     assert bench.outcome() == undisturbed
 
 
@@ -136,7 +91,7 @@ def test_a_generation_waits_for_the_check_that_decides_its_temperature_and_for_n
 
 def test_the_temperature_is_told_as_it_rises(heated):
     bench, told = heated("night"), []
-    driven(bench, lambda _: 0, lambda: told.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0)))
+    bench.drive(lambda _: 0, lambda: told.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0)))
     assert {each.status.generation.temperature for each in told} == {1.0, 1.5, 2.25}
     console = Console(file=io.StringIO(), width=120)
     console.print(run_panel(told[-1].status))
@@ -150,7 +105,7 @@ def test_the_temperature_is_told_as_it_rises(heated):
 
 def test_a_fork_begins_as_warm_as_its_run_is(heated, monkeypatch):
     bench, served = heated("night", generations=7), []
-    driven(bench, lambda _: 0)
+    bench.drive(lambda _: 0)
     monkeypatch.setattr(
         "dreamfleet.coordinator.verbs.coordinator.serve", lambda _args, settings, _start: served.append(settings)
     )

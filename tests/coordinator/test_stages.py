@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from dreamfleet.common.messages import Result, ResultBatch
+from dreamfleet.common.messages import Result
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.stages import begun_stages
 from dreamfleet.common.stored import StageSettings
@@ -17,10 +17,11 @@ from dreamfleet.common.terms import terms_of
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.status import take_snapshot
 from dreamfleet.coordinator.verbs import fork
-from tests.coordinator.test_run import SETTINGS, A, Bench
+from tests.coordinator.evaluated import EVERY, Evaluated
+from tests.coordinator.test_run import SETTINGS, A
 from tests.support.samples import SPEC
 
-EVERY, GENERATIONS = 2, 11
+GENERATIONS = 11
 STAGES = (
     StageSettings(2),
     StageSettings(score=500.0, horizon=400, patience=0, episodes=2, racing=True),
@@ -29,34 +30,12 @@ STAGES = (
 )
 STAGED = replace(SETTINGS, population=6, evaluate_every=EVERY, evaluation_episodes=2, collect_every=0, stages=STAGES)
 REALITY = (900.0, 400.0, 510.0, 450.0, 350.0, 300.0, 300.0)  # of the means after generations 1, 3, 5, ...
-OFF_SCHEDULE = 900.0  # of a mean that is evaluated because a limit was reached: it would end a stage at once
 BEGUN = [0, 2, 8, 10]  # the score of generation 5's mean counts from generation 8 on, and 12 x 10 steps come twice
 SIZES = [6] * 8 + [8] * 4
 
 
-class Staged(Bench):
-    """Its jobs are finished in any order that a test likes."""
-
-    def begin(self):
-        self.given = []
-        super().begin()
-
-    def fetch(self):
-        for send in self.run.fleet.dispatch(self.now):
-            self.given += [work.job for work in send.content.work]
-
-    def finish(self, index):
-        job = self.given.pop(index)
-        if job.kind == "score":
-            fitness = int.from_bytes(job.digest[:4], "little") / 1e6
-        elif job.generation % EVERY:
-            fitness = REALITY[job.generation // EVERY] + job.episode
-        else:
-            fitness = OFF_SCHEDULE
-        self.deliver(A, Result(job.digest, fitness, 10, 0.1, None, None))
-
-    def first(self, kind):
-        return next((index for index, job in enumerate(self.given) if job.kind == kind), None)
+class Staged(Evaluated):
+    reality = REALITY
 
     def outcome(self):
         with RunFolder(self.path) as run:
@@ -65,17 +44,6 @@ class Staged(Bench):
             kept = [(each.episode, each.seed, each.fitness) for place in numbers for each in run.results(*place)]
             begun = begun_stages(run.settings, run.history(), run.evaluations())
             return told, kept, [each for each in run.evaluations() if each.generation % EVERY], begun
-
-
-def driven(bench, choose, after=lambda: None):
-    """To its end; what the jobs name, by generation."""
-    found = {}
-    while bench.run.ended is None:
-        bench.fetch()
-        found.update({job.generation: (job.horizon, job.patience) for job in bench.given if job.kind == "score"})
-        bench.finish(choose(bench))
-        after()
-    return found
 
 
 @pytest.fixture
@@ -94,8 +62,8 @@ def staged(tmp_path, random_bundle):
 @pytest.fixture
 def undisturbed(staged):
     bench = staged("undisturbed")
-    named = driven(bench, lambda _: 0)
-    assert list(named.values()) == [(None, None)] * 2 + [(400, 0)] * 6 + [(600, 0)] * 3
+    named = bench.drive(lambda _: 0)
+    assert list(named.values()) == [(None, None, None)] * 2 + [(None, 400, 0)] * 6 + [(None, 600, 0)] * 3
     *_, begun = bench.outcome()
     assert [each.since for each in begun] == BEGUN
     return bench.outcome()
@@ -104,20 +72,8 @@ def undisturbed(staged):
 @pytest.mark.parametrize("seed", range(4))
 def test_killed_anywhere_it_comes_to_the_same_stages_and_gives_the_same_bits(staged, undisturbed, seed):
     bench, chance = staged("night"), random.Random(seed)
-
-    def deliver_and_perhaps_die(name, result):
-        """Before the commit, after it, or not."""
-        fate = chance.random()
-        batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(result,))
-        bench.run.exchange.results(name, batch, bench.now)
-        bench.run.advance(bench.now)
-        if fate > 0.2 or bench.run.ended is not None:
-            bench.run.commit()
-        if fate < 0.4 and bench.run.ended is None:
-            bench.restart()
-
-    bench.deliver = deliver_and_perhaps_die
-    driven(bench, lambda bench: chance.randrange(len(bench.given)))
+    bench.die_by(chance)
+    bench.drive(lambda bench: chance.randrange(len(bench.given)))
     assert bench.run.incarnation > 10
     assert bench.outcome() == undisturbed
 
@@ -126,7 +82,7 @@ def test_killed_anywhere_it_comes_to_the_same_stages_and_gives_the_same_bits(sta
 def test_killed_as_each_generation_opens_every_optimiser_gives_the_same_bits(staged, optimiser):
     settings = replace(STAGED, optimiser=optimiser)
     calm, bench = staged("calm", settings=settings), staged("night", settings=settings)
-    driven(calm, lambda _: 0)
+    calm.drive(lambda _: 0)
     while bench.run.ended is None:
         before = bench.run.generation.number
         bench.fetch()
@@ -139,10 +95,10 @@ def test_killed_as_each_generation_opens_every_optimiser_gives_the_same_bits(sta
 
 def test_a_run_that_ended_between_two_checks_and_goes_on_comes_to_the_same_stages(staged, undisturbed):
     bench = staged("night", generations=5)
-    driven(bench, lambda _: 0)
+    bench.drive(lambda _: 0)
     bench.limits = LimitsConfig(generations=GENERATIONS)
     bench.restart()
-    driven(bench, lambda _: 0)
+    bench.drive(lambda _: 0)
     assert bench.outcome() == undisturbed
 
 
@@ -164,14 +120,14 @@ def test_limits_count_over_the_whole_run(staged):
     bench = staged("night")
     bench.limits = LimitsConfig(steps=20 * 6)
     bench.restart()
-    driven(bench, lambda _: 0)
+    bench.drive(lambda _: 0)
     assert bench.run.ended == f"{20 * 6} environment steps"
     assert len(bench.run.history) == 2
 
 
 def test_the_log_says_when_a_stage_begins_and_why(staged):
     bench = staged("night")
-    driven(bench, lambda _: 0)
+    bench.drive(lambda _: 0)
     said = [note for note in bench.run.fleet.notes if "stage" in note]
     assert said == [
         "generation 0 is in stage 1 of 4 (1000 steps, patience 100, 6 x 1 episodes, a new search with step size 0.1)",
@@ -186,7 +142,7 @@ def test_the_log_says_when_a_stage_begins_and_why(staged):
 
 def test_the_status_says_which_stage_it_is_and_what_counts_there(staged):
     bench, told = staged("night"), []
-    driven(bench, lambda _: 0, lambda: told.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
+    bench.drive(lambda _: 0, lambda: told.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
     seen = {(each.generation.stage.number, each.generation.stage.since) for each in told}
     assert seen == {(number, since) for number, since in enumerate(BEGUN, 1)}
     stage = told[-1].generation.stage
@@ -252,7 +208,7 @@ def forked(bench, monkeypatch, given=frozenset()):
 
 def test_a_fork_begins_with_the_stage_that_its_run_is_in_and_goes_on_with_the_others(staged, monkeypatch):
     bench = staged("night", generations=4)
-    driven(bench, lambda _: 0)
+    bench.drive(lambda _: 0)
     with RunFolder(bench.path) as run:
         assert terms_of(run, 4).stage.number == 2
     settings = forked(bench, monkeypatch)
@@ -263,7 +219,7 @@ def test_a_fork_begins_with_the_stage_that_its_run_is_in_and_goes_on_with_the_ot
 
 def test_a_fork_of_the_last_stage_has_no_schedule(staged, monkeypatch):
     bench = staged("night")
-    driven(bench, lambda _: 0)
+    bench.drive(lambda _: 0)
     settings = forked(bench, monkeypatch)
     assert settings["stages"] == ()
     assert (settings["horizon"], settings["population"]) == (600, 8)

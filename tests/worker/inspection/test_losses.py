@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.shelf import find_controller
 from dreamfleet.worker.inspection import probe
 from dreamfleet.worker.inspection.hand import ControllersHand
 from dreamfleet.worker.inspection.imagination import Beginning, Imagination
@@ -19,16 +17,6 @@ from dreamfleet.worker.inspection.tables import knowledge_rows, loss_rows
 from dreamfleet.worker.inspection.witness import OFF, WitnessConfig, witness
 
 CONFIG, DRIVEN = LossConfig(losses=6, before=(20, 0), dreams=2), WitnessConfig()
-
-
-@pytest.fixture(scope="module")
-def tiny():
-    return find_bundle("tiny")
-
-
-@pytest.fixture(scope="module")
-def controller(tmp_path_factory):
-    return find_controller("tiny", tmp_path_factory.mktemp("runs"))[0]
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.bundle import find_bundle, write_bundle
+from dreamfleet.common.bundle import write_bundle
 from dreamfleet.common.errors import ControllerError, UsageError
-from dreamfleet.common.shelf import find_controller
 from dreamfleet.worker.inspection.disturbance import Disturbance, pushed
 from dreamfleet.worker.inspection.hand import ControllersHand, controllers_hand, drivers_hands
 from dreamfleet.worker.inspection.mind import Mind
@@ -20,16 +19,6 @@ from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
-
-
-@pytest.fixture(scope="module")
-def tiny():
-    return find_bundle("tiny")
-
-
-@pytest.fixture(scope="module")
-def controller(tmp_path_factory):
-    return find_controller("tiny", tmp_path_factory.mktemp("runs"))[0]
 
 
 def drive(bundle, hands, **config):

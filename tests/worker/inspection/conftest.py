@@ -1,0 +1,16 @@
+"""What ships, as it is looked into."""
+
+import pytest
+
+from dreamfleet.common.bundle import find_bundle
+from dreamfleet.common.shelf import find_controller
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return find_bundle("tiny")
+
+
+@pytest.fixture(scope="module")
+def controller(tmp_path_factory):
+    return find_controller("tiny", tmp_path_factory.mktemp("runs"))[0]
