@@ -31,7 +31,8 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     axes.plot(number, [each.best for each in history], color="tab:orange", linewidth=1, label="best candidate")
     stages = begun_stages(settings, history, evaluations)
     for each in stages[1:]:
-        axes.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1)
+        label = "a stage begins" if each is stages[1] else None
+        axes.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1, label=label)
     handles: tuple[Any, ...] = axes.get_legend_handles_labels()
     if evaluations:
         real = axes.twinx() if dreamt else axes
