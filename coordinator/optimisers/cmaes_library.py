@@ -37,8 +37,10 @@ class CmaesOptimiser(ABC):
 
     @property
     def sigma(self) -> float:
-        """The overall step size."""
-        return float(self._strategy._sigma)
+        """The step size: the standard deviation of the middle coordinate."""
+        covariance = self._strategy._C
+        variances = covariance if covariance.ndim == 1 else np.diag(covariance)
+        return float(self._strategy._sigma * np.sqrt(np.median(variances)))
 
     def ask(self) -> NDArray[np.float64]:
         """Sample the next population `(population, dimension)`."""

@@ -17,6 +17,7 @@ from dreamfleet.coordinator.optimisers.api import Search, State
 from dreamfleet.coordinator.optimisers.normals import Normals
 
 HISTORY = 100  # entries that stay of each of pycma's histories
+FAR = 1e60  # from one: a factor that is further away is brought back
 
 
 class Pycma:
@@ -50,8 +51,11 @@ class Pycma:
 
     @property
     def sigma(self) -> float:
-        """The overall step size."""
-        return float(self._strategy.sigma)
+        """The step size: the standard deviation of the middle coordinate.
+
+        pycma's own `sigma` is one of its three factors, which may drift apart without end while they balance.
+        """
+        return float(np.median(self._strategy.stds))
 
     def ask(self) -> NDArray[np.float64]:
         """Sample the next population `(population, dimension)` (equations 38 to 40)."""
@@ -64,6 +68,8 @@ class Pycma:
         self._asked = []
         # Histories by which pycma would stop by itself, which nothing else reads: a state must not grow with the run.
         del self._strategy.fit.histbest[HISTORY:], self._strategy.fit.histmedian[HISTORY:]
+        if self._diagonal and not 1 / FAR < self._strategy.sigma_vec.scaling.min() < FAR:
+            self._balance()
 
     def prepare(self) -> None:
         """Draw the normals of the next `ask`, which do not depend on `tell`."""
@@ -94,6 +100,22 @@ class Pycma:
             "verbose": -9,
         }
         self._strategy = cma.CMAEvolutionStrategy(mean, self._search.sigma0, options)
+
+    def _balance(self) -> None:
+        """Write the same distribution with factors near one; after tens of thousands of generations they overflow.
+
+        A deviation is step size x scaling x the sampler's deviation. The paths are kept in units of the third (`pc`) and
+        of the last two (`pc2`), so that they change with these.
+        """
+        strategy, middle = self._strategy, self.sigma
+        ratio = middle / strategy.sigma
+        deviations = np.sqrt(strategy.sm.variances)
+        strategy.sigma_vec.scaling *= deviations / ratio
+        strategy.pc /= deviations
+        strategy.pc2 /= ratio
+        strategy.sm *= 1 / deviations.max() ** 2
+        strategy.sigma, strategy.adapt_sigma.delta = middle, middle / strategy.sigma0
+        strategy._updateBDfromSM()
 
     def _refuse_too_few_candidates(self) -> None:
         """Two-point step sizes put two candidates on the last step, and populations below 6 hold a mirrored one too."""

@@ -82,6 +82,31 @@ def test_a_strategy_continues_from_every_generation_up_to_convergence_and_beyond
     assert min(steps) < 1e-9, "below what pycma takes for movement"
 
 
+def following(candidates, generation):
+    return -((candidates - 0.01 * generation) ** 2).sum(axis=1)
+
+
+@pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep"])
+def test_the_step_size_is_how_far_candidates_lie_apart_however_long_a_search_goes_on(optimiser):
+    """pycma's own number is above a thousand by then, and a fork would begin with it."""
+    evolution = Evolution(config(dimension=6, population=16, optimiser=optimiser))
+    run(evolution, range(1500), following)
+    apart = (evolution.ask() - evolution.mean).std()
+    assert evolution.sigma == pytest.approx(apart, rel=0.5)
+
+
+@pytest.mark.parametrize(("dimension", "population"), [(6, 4), (400, 16)])  # above 300 pycma steps in another way
+def test_a_balanced_search_goes_on_as_it_was(dimension, population):
+    one, other = (Evolution(config(dimension=dimension, population=population)) for _ in range(2))
+    for evolution in (one, other):
+        run(evolution, range(200), following)
+    other._optimiser._balance()
+    for evolution in (one, other):
+        run(evolution, range(200, 210), following)
+    assert np.allclose(other.mean, one.mean, rtol=1e-9, atol=0)
+    assert np.allclose(other.ask(), one.ask(), rtol=1e-9, atol=1e-9)
+
+
 def test_asking_again_from_a_state_gives_the_same_population():
     evolution = Evolution(config())
     run(evolution, range(3))
