@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,29 +14,58 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Continuous:
-    """Outputs in [-1, 1], each scaled, shifted and bounded: `clip(scale * tanh(x) + shift, low, high)`."""
+    """Outputs in [-1, 1], each scaled, shifted and bounded: `clip(scale * tanh(x) + shift, low, high)`.
+
+    An action has an output of its own unless `outputs_of` says which one each action takes; several may take the same.
+    """
 
     scale: tuple[float, ...]
     shift: tuple[float, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
+    outputs_of: tuple[int, ...] = ()
 
     @classmethod
     def between(cls, low: Any, high: Any) -> Continuous:
         """The whole range from `low` to `high` `(actions,)`, its middle at an output of 0."""
         low, high = (np.asarray(each, dtype=np.float64).reshape(-1) for each in (low, high))
-        return cls(*(tuple(map(float, each)) for each in ((high - low) / 2, (high + low) / 2, low, high)))
+        ranges = ((high - low) / 2, (high + low) / 2, low, high)
+        scale, shift, lowest, highest = (tuple(map(float, each)) for each in ranges)
+        return cls(scale, shift, lowest, highest)
 
     @property
     def outputs(self) -> int:
         """Outputs of a controller."""
+        return max(self.outputs_of) + 1 if self.outputs_of else self.actions
+
+    @property
+    def actions(self) -> int:
+        """Numbers of an action."""
         return len(self.scale)
 
     def of(self, logits: Floats) -> Floats:
-        """The action `(actions,)` of what a controller's last layer adds up to."""
-        scale, shift, low, high = (np.array(each, np.float32) for each in (self.scale, self.shift, self.low, self.high))
-        action: Floats = np.clip(np.tanh(logits) * scale + shift, low, high).astype(np.float32)
+        """The actions `(..., actions)` of what a controller's last layer adds up to `(..., outputs)`."""
+        scale, shift, low, high = self._ranges
+        outputs = np.tanh(logits)
+        taken = outputs[..., self.outputs_of] if self.outputs_of else outputs
+        action: Floats = np.clip(taken * scale + shift, low, high).astype(np.float32)
         return action
+
+    def back(self, action: Floats) -> Floats:
+        """Actions `(..., actions)` as a controller gives them `(..., outputs)`.
+
+        Where several take one output they are added up, each with the sign of its scale: of one pedal gas less brake.
+        """
+        if not self.outputs_of:
+            return action
+        back = np.zeros((*action.shape[:-1], self.outputs), np.float32)
+        for place, (output, scale) in enumerate(zip(self.outputs_of, self.scale, strict=True)):
+            back[..., output] += np.copysign(np.float32(1), np.float32(scale)) * action[..., place]
+        return back
+
+    @cached_property
+    def _ranges(self) -> list[Floats]:
+        return [np.array(each, np.float32) for each in (self.scale, self.shift, self.low, self.high)]
 
 
 @dataclass(frozen=True)

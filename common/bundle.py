@@ -23,12 +23,13 @@ import numpy as np
 
 from dreamfleet.common.archives import Archive, DamagedError, Limits, open_archive
 from dreamfleet.common.codec import MalformedError, from_plain
-from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.controller import Controller, ControllerShape
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.fields import OPTIONAL, written
 from dreamfleet.common.files import is_there, open_growing, open_regular, read_regular, write_aside
 from dreamfleet.common.messages import Between, Word
 from dreamfleet.common.tensors import UnfitError, check_fit, is_empty, read_array, weights_finite
+from dreamfleet.common.variants import PLAIN, WORLD, Variant
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -65,10 +66,14 @@ class Manifest:
 class Bundle:
     """A verified bundle, under the controllers that a run evolves."""
 
-    def __init__(self, path: Path, sha256: str, manifest: Manifest, shape: ControllerShape | None = None) -> None:
+    def __init__(
+        self, path: Path, sha256: str, manifest: Manifest, shape: ControllerShape | None = None,
+        variant: Variant = PLAIN,
+    ) -> None:  # fmt: skip
         self.path = path
         self.sha256 = sha256
         self.manifest = manifest
+        self.variant = variant  # how its controllers drive
         self._shape = shape
 
     @classmethod
@@ -115,26 +120,41 @@ class Bundle:
         """The controllers that this bundle is under: `default_shape` unless `under` said otherwise."""
         return self._shape or self.default_shape
 
-    def shape_of(self, features: str, hidden: int = 0) -> ControllerShape:
-        """Controllers that see `z` or `zh` (latent, or latent and hidden state), through `hidden` units; 0: linear."""
-        width = self.manifest.latent + (self.manifest.hidden if features == "zh" else 0)
-        return ControllerShape(width, self.manifest.actions, hidden)
+    def shape_of(self, features: str, hidden: int = 0, variant: Variant = PLAIN) -> ControllerShape:
+        """Controllers that see `z` or `zh` (latent, or latent and hidden state), through `hidden` units; 0: linear.
 
-    def under(self, shape: ControllerShape | None) -> Bundle:
-        """This bundle under controllers of another shape; `ControllerError` if it cannot be, `None`: the default."""
-        if shape is None or shape == self.default_shape:
+        A `variant` has outputs of its own, and may see more.
+        """
+        width = self.manifest.latent + (self.manifest.hidden if features == "zh" else 0)
+        outputs = self.manifest.actions if variant.plain else variant.actions.outputs
+        return ControllerShape(width + variant.seen, outputs, hidden)
+
+    def under(self, shape: ControllerShape | None, variant: Variant = PLAIN) -> Bundle:
+        """This bundle under controllers of another shape or variant; `None`: linear ones on all that they can see.
+
+        `ControllerError` if they do not fit it, `BundleError` if it is too old for them or of a world without variants.
+        """
+        if variant.plain and shape in (None, self.default_shape):
             return Bundle(self.path, self.sha256, self.manifest)
-        if shape not in (self.shape_of("z", shape.hidden), self.shape_of("zh", shape.hidden)):
+        if not variant.plain and self.manifest.task != WORLD:
+            raise BundleError(f"{self.path.name} is of {self.manifest.task}: {variant.options} are options of {WORLD}")
+        shape = shape or self.shape_of("zh", variant=variant)
+        if shape not in (self.shape_of(features, shape.hidden, variant) for features in ("z", "zh")):
+            fitting = self.shape_of("zh", variant=variant)
             raise ControllerError(
                 f"a controller of {shape.size} parameters does not fit {self.path.name}, which needs "
-                f"{self.default_shape.size}, or other inputs: latent {self.manifest.latent}, hidden "
-                f"{self.manifest.hidden}, {self.manifest.actions} actions"
+                f"{fitting.size}, or other inputs: latent {self.manifest.latent}, hidden "
+                f"{self.manifest.hidden}, {fitting.actions} actions"
             )
         if not {DREAM, LINEAR, LAYERED} <= self.manifest.parts.keys():
             raise BundleError(
                 f"{self.path.name} is from before other controllers than the linear one on z and h: build it again"
             )
-        return Bundle(self.path, self.sha256, self.manifest, shape)
+        return Bundle(self.path, self.sha256, self.manifest, shape, variant)
+
+    def fitting(self, controller: Controller) -> Bundle:
+        """This bundle under one controller's shape and variant; errors as of `under`."""
+        return self.under(controller.shape, controller.variant)
 
     def read(self, name: str) -> bytes:
         """One part's bytes; `BundleError` if the bundle has no such part.

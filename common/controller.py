@@ -20,6 +20,7 @@ from dreamfleet.common.archives import Limits, read_arrays
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.fields import OPTIONAL, written
 from dreamfleet.common.files import write_aside
+from dreamfleet.common.variants import Variant
 
 FORMAT = 1
 _LIMITS = Limits(64 << 20, members=8)  # 16 million parameters: no search goes as far
@@ -105,6 +106,11 @@ class Controller:
     def sha256(self) -> str:
         """Hash of the parameters' little-endian bytes."""
         return hashlib.sha256(self.parameters.astype("<f4").tobytes()).hexdigest()
+
+    @property
+    def variant(self) -> Variant:
+        """How it drives, of one that was evolved on a world model; `UsageError` for options that are no variant's."""
+        return Variant.of(self.options)
 
     @property
     def _task_details(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -20,9 +20,11 @@ from dreamfleet.common.presets import check_preset, preset_help
 from dreamfleet.common.stages import Stage, stages_of
 from dreamfleet.common.stored import NAMED, RunSettings, StageSettings
 from dreamfleet.common.tasks import GYM, check_task, describe_task, describes_itself
+from dreamfleet.common.variants import WORLD, Variant
 from dreamfleet.coordinator.schedule import check_schedule, unfold
 
 DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
+DREAM = "dream"
 
 
 PYTHONS = {"True": True, "False": False, "None": None}
@@ -49,6 +51,11 @@ class RunConfig:
     environment: tuple[str, ...] = option((), "KEY=VALUE of what a gym:ENVIRONMENT is made with; values as in JSON")
     normalise: bool = option(False, "shift and scale what a gym:ENVIRONMENT shows, as it is when the run begins")
     task_options: str | None = option(None, "the task's own options as `runs show` prints them, instead of these two")
+    variant: tuple[str, ...] = option(
+        (),
+        "NAME=VALUE of how car-racing is driven, in its dream too: pedals=one, pedal_shift=, decide_every=, "
+        "feedback=last, time_cost= (docs/tasks.md)",
+    )
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
     hidden_units: int = option(8, "units of a hidden controller's layer")
     features: Literal["zh", "z"] = option("zh", "what the controller sees: latent and hidden state, or latent alone")
@@ -164,14 +171,27 @@ class RunConfig:
             raise UsageError(f"{self.task} is scored without a world model: leave --bundle out, or give --bundle none")
         if self.environment or self.normalise or self.task_options:
             raise UsageError("--environment, --normalise and --task-options are of tasks without a world model")
-        shape = bundle.shape_of(self.features, self._hidden)
-        named = None if shape == bundle.default_shape else bundle.under(shape).controller_shape
-        spec = TaskSpec(self.task, bundle.sha256, self.horizon, self.patience, named, self.temperature)
+        variant = self._variant()
+        shape = bundle.under(bundle.shape_of(self.features, self._hidden, variant), variant).controller_shape
+        named = None if shape == bundle.default_shape else shape
+        spec = TaskSpec(
+            self.task, bundle.sha256, self.horizon, self.patience, named, self.temperature, variant.options,
+            variant.version,
+        )  # fmt: skip
         return spec, shape, NUMERIC_PACKAGES
 
+    def _variant(self) -> Variant:
+        """How the run's controllers drive."""
+        variant = Variant.named(_arguments("--variant", self.variant, "pedals=one"))
+        if not variant.plain and self.task not in (WORLD, DREAM):
+            raise UsageError(f"task {self.task} has no variants: {WORLD} has, and its dream")
+        if variant.time_cost and self.task == DREAM:
+            raise UsageError("time_cost is of candidates that drive: no lap is ever over in a dream; leave it out")
+        return variant
+
     def _described(self) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
-        if self.temperature is not None or self.collect_every:
-            raise UsageError("--temperature and --collect-every are of tasks with a world model")
+        if self.temperature is not None or self.collect_every or self.variant:
+            raise UsageError("--temperature, --collect-every and --variant are of tasks with a world model")
         told = describe_task(self.task, self._options())
         options = told.options if self.task_options is None else self.task_options
         shape = ControllerShape(told.observations, told.outputs, self._hidden)
@@ -192,10 +212,8 @@ class RunConfig:
                 return {"environment": dict(frozen.get("environment", {}))}
             except (ValueError, AttributeError, TypeError, RecursionError) as error:
                 raise UsageError(f"--task-options must be a JSON object, not {self.task_options!r}") from error
-        arguments = list(map(_argument, self.environment))
-        if len(dict(arguments)) < len(arguments):
-            raise UsageError("--environment: a KEY stands there twice")
-        options: dict[str, Any] = {"environment": dict(arguments)} if arguments else {}
+        arguments = _arguments("--environment", self.environment, "continuous=true")
+        options: dict[str, Any] = {"environment": arguments} if arguments else {}
         return options | ({"normalise": True, "seed": self.seed} if self.normalise else {})
 
 
@@ -214,10 +232,18 @@ def _check_normal(options: str, observations: int) -> None:
         raise UsageError(f"--task-options: normal must have a mean and a positive deviation of {observations} numbers")
 
 
-def _argument(text: str) -> tuple[str, Any]:
+def _arguments(flag: str, texts: Sequence[str], such: str) -> dict[str, Any]:
+    """The values of a flag's KEY=VALUE texts by their keys; `such` is one of them."""
+    arguments = [_argument(flag, text, such) for text in texts]
+    if len(dict(arguments)) < len(arguments):
+        raise UsageError(f"{flag}: a KEY stands there twice")
+    return dict(arguments)
+
+
+def _argument(flag: str, text: str, such: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not (equals and name.isidentifier()):
-        raise UsageError(f"--environment {text!r}: write KEY=VALUE, such as continuous=true")
+        raise UsageError(f"{flag} {text!r}: write KEY=VALUE, such as {such}")
     if value in PYTHONS:  # as people who know gymnasium write it
         return name, PYTHONS[value]
     try:
@@ -250,7 +276,7 @@ def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:
     frozen |= {name: getattr(spec, name) for name in ("task", "horizon", "patience", "temperature")}
     if not spec.bundle:
         return {**frozen, "bundle": NO_BUNDLE, "task_options": spec.options}
-    return {**frozen, "bundle": str(bundle)}
+    return {**frozen, "bundle": str(bundle), "variant": Variant.of(spec.options).texts}
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,7 @@ def _settle(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle | No
 
 
 def _settle_new(config: RunConfig, start: Start | None) -> tuple[RunSettings, Bundle | None]:
-    if start is not None and config.needs_no_bundle:
+    if start is not None and config.needs_no_bundle == (not start.bundle):
         config = start.under(config)
     bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
     settings = config.settings(bundle)

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
 from dreamfleet.common.files import is_file, is_there
+from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.runs import JOURNAL, RunFolder, open_run
 from dreamfleet.common.shelf import find_controller
 from dreamfleet.common.stored import RunSettings
+from dreamfleet.common.variants import Variant
 from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.config import RunConfig
 from dreamfleet.coordinator.journal import Journal
@@ -32,6 +34,8 @@ class Start:
 
     def under(self, config: RunConfig) -> RunConfig:
         """The configuration with the options that this start was evolved under, where it names none."""
+        if self.bundle:
+            return config if config.variant else replace(config, variant=Variant.of(self.options).texts)
         given = config.task_options is not None or config.environment or config.normalise
         return config if given else replace(config, task_options=self.options)
 
@@ -47,11 +51,7 @@ class Start:
             raise ControllerError(
                 f"{self.source} belongs to {_told(self.bundle)}, not to {_told(spec.bundle)}: give its own --bundle"
             )
-        if self.options != spec.options:
-            raise ControllerError(
-                f"{self.source} was evolved under other options of {spec.task}: leave --environment and --normalise "
-                "out, and it brings its own"
-            )
+        self._check_options(spec)
         if len(self.mean) != shape.size:
             raise ControllerError(
                 f"{self.source} has {len(self.mean)} parameters, this run's controllers {shape.size}: give its own "
@@ -59,6 +59,23 @@ class Start:
             )
         if not (np.abs(self.mean) <= np.finfo(np.float32).max).all():
             raise ControllerError(f"{self.source} has parameters that no single-precision number can hold")
+
+    def _check_options(self, spec: TaskSpec) -> None:
+        """What candidates pay is no part of a controller: a start may be of another time cost."""
+        if not spec.bundle and self.options != spec.options:
+            raise ControllerError(
+                f"{self.source} was evolved under other options of {spec.task}: leave --environment and --normalise "
+                "out, and it brings its own"
+            )
+        if spec.bundle and (own := Variant.of(self.options).driving) != (wanted := Variant.of(spec.options).driving):
+            raise ControllerError(
+                f"{self.source} drives {_way(own)}, this run's controllers {_way(wanted)}, so that its parameters mean "
+                "something else: leave --variant out, and it brings its own"
+            )
+
+
+def _way(variant: Variant) -> str:
+    return f"with {variant.options}" if variant.options else "the plain way"
 
 
 def _told(bundle: str) -> str:

@@ -53,6 +53,69 @@ def test_jobs_of_other_controllers_have_other_digests(random_bundle):
     assert written(other)["controller"] == {"features": 32, "actions": 3, "hidden": 24}
 
 
+@pytest.mark.parametrize(
+    ("texts", "options", "shape"),
+    [
+        (("pedals=one",), {"pedals": "one"}, (288, 2)),
+        (("pedals=one", "pedal_shift=0.25"), {"pedal_shift": 0.25, "pedals": "one"}, (288, 2)),
+        (("decide_every=4",), {"decide_every": 4}, (288, 3)),
+        (("feedback=last",), {"feedback": "last"}, (294, 3)),
+        (("feedback=last", "pedals=one"), {"feedback": "last", "pedals": "one"}, (292, 2)),
+        (("time_cost=1",), {"time_cost": 1.0}, (288, 3)),
+    ],
+)
+def test_a_variant_is_frozen_with_a_run_and_can_be_configured_again(random_bundle, texts, options, shape):
+    settings = RunConfig(variant=texts).settings(random_bundle)
+    assert json.loads(settings.task.options) == options
+    assert (settings.controller.features, settings.controller.actions, settings.task.version) == (*shape, 2)
+    assert (settings.task.controller is None) == (shape == (288, 3))
+    assert RunSettings.from_json(settings.to_json()) == settings
+    assert RunConfig(**settings_of(settings, random_bundle.path)).settings(random_bundle) == settings
+    plain = RunConfig().settings(random_bundle)
+    assert settings.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
+    assert RunConfig(variant=texts, task="dream").settings(random_bundle) if "time_cost=1" not in texts else True
+
+
+def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(random_bundle):
+    said = RunConfig(variant=("pedals=two", "decide_every=1", "feedback=none")).settings(random_bundle)
+    assert said.to_json() == RunConfig().settings(random_bundle).to_json()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (
+            {"variant": ("pedal=one",)},
+            "car-racing knows no option pedal: known are pedals, pedal_shift, decide_every, ",
+        ),
+        ({"variant": ("pedals=three",)}, "pedals must be two or one, not 'three'"),
+        ({"variant": ("pedals",)}, "--variant 'pedals': write KEY=VALUE, such as pedals=one"),
+        ({"variant": ("pedals=one", "pedals=one")}, "a KEY stands there twice"),
+        ({"variant": ("time_cost=1",), "task": "dream"}, "no lap is ever over in a dream"),
+        ({"variant": ("pedals=one",), "task": "tests.support.tasks:Toy"}, "has no variants: car-racing has"),
+        ({"task_options": '{"pedals": "one"}'}, "--task-options are of tasks without a world model"),
+    ],
+)
+def test_a_variant_that_there_is_not_is_refused_in_one_line(random_bundle, changes, says):
+    with pytest.raises(UsageError) as told:
+        RunConfig(**changes).settings(random_bundle)
+    assert says in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_a_start_that_drives_otherwise_is_refused_and_one_that_pays_otherwise_is_not(random_bundle):
+    one_pedal = Start(np.zeros(578), random_bundle.sha256, "run night", '{"pedals": "one"}')
+    one_pedal.check(RunConfig(variant=("pedals=one", "time_cost=1")).settings(random_bundle))
+    for variant in ((), ("pedals=one", "decide_every=4")):
+        with pytest.raises(ControllerError, match=r'run night drives with {"pedals": "one"}, this .* --variant out'):
+            one_pedal.check(RunConfig(variant=variant).settings(random_bundle))
+    with pytest.raises(ControllerError, match="drives the plain way"):
+        Start(np.zeros(867), random_bundle.sha256, "run night").check(
+            RunConfig(variant=("decide_every=4",)).settings(random_bundle)
+        )
+    assert one_pedal.under(RunConfig()).settings(random_bundle).task.options == one_pedal.options
+
+
 def test_a_start_of_another_length_is_refused(random_bundle):
     start = Start(np.zeros(867), random_bundle.sha256, "run night")
     start.check(RunConfig().settings(random_bundle))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -26,6 +27,7 @@ WORLD = World(
     actions=STEERING_GAS_BRAKE,
     packages=NUMERIC_PACKAGES,
     idle_cost=0.1,
+    goal="lap_finished",
     frames_per_second=50,
     action_names=("steer", "gas", "brake"),
     dream_reward=DreamReward(gain=3.5, cost=0.1),  # a tile gives 1000 / N, of a track's N tiles: 3.5 on average
@@ -39,6 +41,11 @@ class CarRacing(Task):
     world = WORLD
     drivers = DRIVERS
     preprocessings = PREPROCESSINGS
+
+    def world_of(self, assignment: Assignment) -> World:
+        """The world as the run's variant drives it."""
+        variant = assignment.world_model.variant
+        return replace(WORLD, actions=variant.actions, version=variant.version, time_cost=variant.time_cost)
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """The environment with the native picture, where that is exact; it observes the bundle's pictures."""
@@ -101,7 +108,10 @@ class PictureObservation(gymnasium.ObservationWrapper[NDArray[np.uint8], Any, ND
 
 
 class CarRacingPolicy:
-    """A controller on latent and hidden state; the state advances with every action."""
+    """A controller on latent and hidden state; the state advances with every action, also with one that is held.
+
+    The MDN-RNN was trained on every frame: one that skipped some would remember another car's speed.
+    """
 
     def __init__(self, bundle: Bundle) -> None:
         self._step = PolicyStep(bundle)

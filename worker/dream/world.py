@@ -60,10 +60,12 @@ class DreamWorld:
         step = self._step.step
         return self._judge(step(latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask))
 
-    def imagine(self, latent: Floats, action: Floats, state: Floats, draw: Draw) -> Moment:
-        """The dream goes on under given actions `(rows, actions)`."""
+    def imagine(
+        self, latent: Floats, action: Floats, state: Floats, draw: Draw, chosen: Floats | None = None
+    ) -> Moment:
+        """The dream goes on under given actions `(rows, actions)`; `chosen` is a controller's where another is done."""
         step = self._step.imagine
-        return self._judge(step(latent, action, state, draw.uniform, draw.normal, self._temperature, draw.mask))
+        return self._judge(step(latent, action, state, draw.uniform, draw.normal, self._temperature, draw.mask, chosen))
 
     def _judge(self, dream: Dream) -> Moment:
         told = dream.reward.astype(np.float64)

@@ -18,7 +18,7 @@ class Disturbance:
         self._random = np.random.default_rng(seed)
         self._actions = actions
         self._scale = noise * (np.array(actions.high) - np.array(actions.low)) / 2
-        self._value = np.zeros(actions.outputs)
+        self._value = np.zeros(actions.actions)
 
     def next(self) -> Floats:
         """What is added to the next action `(1, actions)`."""

@@ -32,10 +32,10 @@ class Hand(Protocol):
 
 
 class ControllersHand:
-    """A controller, by the mind of the world model that it was evolved in."""
+    """A controller, by the mind of the world model that it was evolved in, under its shape and variant."""
 
     def __init__(self, controller: Controller, bundle: Bundle, mind: Mind) -> None:
-        self._controllers = Controllers(bundle.under(controller.shape))
+        self._controllers = Controllers(bundle.fitting(controller))
         self._parameters = controller.parameters.reshape(1, -1)
         self.mind = mind
 
@@ -66,7 +66,7 @@ def controllers_hand(controller: Controller, own: Bundle, bundle: Bundle, mind: 
             f"the controller sees {own.manifest.preprocessing} of {own.manifest.task}, {bundle.manifest.name} "
             f"{bundle.manifest.preprocessing} of {bundle.manifest.task}: choose one that sees the same"
         )
-    return ControllersHand(controller, own, Mind(own))
+    return ControllersHand(controller, own, Mind(own.fitting(controller)))
 
 
 def drivers_hands(bundle: Bundle, name: str) -> Callable[[int], Hand]:

@@ -38,7 +38,7 @@ class Imagination:
     """Dreams from real states on, under a controller that is pushed as in reality, or under reality's own actions."""
 
     def __init__(self, bundle: Bundle, controller: Controller, temperature: float, rows: int) -> None:
-        fitting = bundle.under(controller.shape)
+        fitting = bundle.fitting(controller)
         self._world, self._controllers = DreamWorld(fitting, temperature), Controllers(fitting)
         self._hidden = bundle.manifest.hidden
         self._parameters = np.repeat(controller.parameters[None], rows, axis=0)
@@ -55,9 +55,10 @@ class Imagination:
         going = np.ones((rows, 1), dtype=bool)
         for action, push in zip(drive.action[begun.steps], drive.push[begun.steps], strict=True):
             features.append(np.concatenate([latent, state[:, : self._hidden]], axis=1))
-            done = self._chosen(latent, state, push) if own else np.repeat(action[None], rows, axis=0)
+            chosen = self._controllers.act(self._parameters, latent, state) if own else None
+            done = np.repeat(action[None], rows, axis=0) if chosen is None else self._pushed(chosen, push)
             draw = side_by_side([noise.next() for noise in noises], axis=0).each(np.concatenate)
-            moment = self._world.imagine(latent, done, state, draw)
+            moment = self._world.imagine(latent, done, state, draw, chosen)
             rewards.append(np.where(going[:, 0], moment.reward, 0.0))
             latent, state = np.where(going, moment.latent, latent), np.where(going, moment.state, state)
             going = going & ~moment.done[:, None]
@@ -75,7 +76,7 @@ class Imagination:
         latent = np.concatenate([drive.latent[:1], moment.latent[:-1]])
         return np.concatenate([latent, drive.state[:, : self._hidden]], axis=1), moment.reward
 
-    def _chosen(self, latent: Floats, state: Floats, push: Floats) -> Floats:
+    def _pushed(self, chosen: Floats, push: Floats) -> Floats:
         actions = self._world.world.actions
         assert isinstance(actions, Continuous)
-        return pushed(actions, self._controllers.act(self._parameters, latent, state), push[None])
+        return pushed(actions, chosen, push[None])

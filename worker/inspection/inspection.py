@@ -53,7 +53,7 @@ def find_subject(name: str, runs_dir: Path) -> Iterator[Subject]:
             yield Subject(bundle, run=run)
             return
         controller = Controller.load(run.controller_path)
-        yield Subject(bundle.under(controller.shape), controller, run)
+        yield Subject(bundle.fitting(controller), controller, run)
 
 
 def inspect(

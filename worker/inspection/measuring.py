@@ -26,6 +26,12 @@ class Driving:
     own: Bundle | None = None
     driver: str = ""
 
+    def watching(self, bundle: Bundle) -> Bundle:
+        """The world model that watches, under the controller if that drives by it."""
+        if self.controller is None or self.controller.bundle != bundle.sha256:
+            return bundle
+        return bundle.fitting(self.controller)
+
     def hands(self, bundle: Bundle, mind: Mind) -> Callable[[int], Hand]:
         """The hand of each seed."""
         if self.controller is None:
@@ -60,5 +66,5 @@ def dream_losses(
 
 
 def _drives(bundle: Bundle, driving: Driving, config: WitnessConfig) -> Iterator[WitnessedDrive]:
-    mind = Mind(bundle)
+    mind = Mind(driving.watching(bundle))
     return witness(bundle, mind, driving.hands(bundle, mind), config)

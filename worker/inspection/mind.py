@@ -28,9 +28,9 @@ class Mind:
         """Look at a picture `(side, side, 3)`."""
         self.latent, _ = self._encoder.encode(picture[None])
 
-    def remember(self, action: Floats) -> None:
-        """Advance by the action `(1, actions)` that was done."""
-        self.state = self._memory.advance(self.latent, action, self.state)
+    def remember(self, action: Floats, chosen: Floats | None = None) -> None:
+        """Advance by the action `(1, actions)` that was done; `chosen` is the controller's, where it is another."""
+        self.state = self._memory.advance(self.latent, action, self.state, chosen)
 
     def reward(self, value: float) -> None:
         """What the action brought; some models see it in the next step."""

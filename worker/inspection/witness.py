@@ -102,11 +102,11 @@ class Witness:
         """The disturbed action."""
         for each in self._minds:
             each.see(observation)
-        push = self._disturbance.next()
-        action = self._disturbance.apply(self._hand.choose(), push)
+        push, chosen = self._disturbance.next(), self._hand.choose()
+        action = self._disturbance.apply(chosen, push)
         self._note(action, push)
         for each in self._minds:
-            each.remember(action)
+            each.remember(action, chosen)
         done: Floats = action[0]
         return done
 

@@ -23,6 +23,8 @@ class Course:
     horizon: int
     patience: int = 0
     idle_cost: float = 0.0  # the world's: charged for each step that is cut off
+    time_cost: float = 0.0  # charged for each step until the goal is reached, or the horizon
+    goal: str = ""  # the world's, of an episode's last info; empty: there is none
 
 
 class Moment(NamedTuple):
@@ -34,6 +36,7 @@ class Moment(NamedTuple):
     step: int  # from 1
     ended: bool  # the environment says so
     cut: bool  # patience is at its end
+    reached: bool  # it ended at the world's goal
 
 
 Begin = Callable[[gymnasium.Env[Any, Any], Any], Any]
@@ -56,14 +59,14 @@ def play(
     idle, over = 0, False
     for step in range(1, course.horizon + 1):
         seen, action = observation, policy.act(observation)
-        observation, given, terminated, truncated, _ = environment.step(action)
+        observation, given, terminated, truncated, info = environment.step(action)
         reward = float(given)
         if tell is not None:
             tell(reward)
         idle = 0 if reward > 0 else idle + 1
         ended = bool(terminated or truncated)
         over = not ended and 0 < course.patience <= idle
-        yield Moment(seen, action, reward, step, ended, over)
+        yield Moment(seen, action, reward, step, ended, over, reached=ended and bool(info.get(course.goal)))
         if ended or over:
             return
 
@@ -79,12 +82,12 @@ def score(
     """The episode's fitness: the sum of its rewards, in step order, in double precision. `rollout` keeps what happens.
 
     An episode that patience cuts is charged what standing still would have cost up to the horizon, so that cut and
-    uncut candidates compare.
+    uncut candidates compare. Time costs up to the horizon too, unless the goal is reached: to crash saves nothing.
     """
     if not np.isfinite(parameters).all():
         raise ValueError("the controller's parameters hold NaN or infinity")
     policy.begin(parameters)
-    fitness, steps = 0.0, 0
+    fitness, steps, reached = 0.0, 0, False
     for moment in play(environment, policy, course):
         fitness += moment.reward
         steps = moment.step
@@ -94,6 +97,9 @@ def score(
         on_step(steps)
         if moment.cut:
             fitness -= course.idle_cost * (course.horizon - steps)
+        reached = moment.reached
+    if course.time_cost:
+        fitness -= course.time_cost * (steps if reached else course.horizon)
     if not math.isfinite(fitness):
         raise ValueError("the episode's rewards do not add up to a number")
     return Score(fitness, steps)

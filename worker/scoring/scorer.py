@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.messages import Kind, TaskSpec
+from dreamfleet.common.variants import Variant
 from dreamfleet.worker.scoring.episode import Course, score
 from dreamfleet.worker.scoring.rollout import Rollout
 from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Score
@@ -30,7 +31,8 @@ class Scorer:
 
     def __init__(self, spec: TaskSpec, bundle: Bundle | None = None, *, judge: bool = False) -> None:
         task = find_task(spec.task)
-        assignment = Assignment(spec, None if bundle is None else bundle.under(spec.controller))
+        fitting = None if bundle is None else bundle.under(spec.controller, Variant.of(spec.options))
+        assignment = Assignment(spec, fitting)
         self.world = task.world_of(assignment)
         if self.world.version != spec.version:
             raise UsageError(
@@ -95,8 +97,9 @@ class Scorer:
         """The episode that a job of this kind and seed is, in the run's specification or in `spec`."""
         if kind == "evaluate":
             return Course(seed, self.world.horizon)
-        spec = spec or self.spec
-        return Course(seed, spec.horizon, spec.patience, self.world.idle_cost)
+        spec, world = spec or self.spec, self.world
+        time_cost = world.time_cost if kind == "score" else 0.0
+        return Course(seed, spec.horizon, spec.patience, world.idle_cost, time_cost, world.goal)
 
     def close(self) -> None:
         """Release the environment."""

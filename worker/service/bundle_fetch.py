@@ -60,7 +60,7 @@ def fetch_for(controller: Controller, session: zenoh.Session, run: str) -> Bundl
         return None
     bundle = obtain(session, run, controller.bundle, BundleStore(default_cache()), Inbox())
     assert bundle is not None  # nobody stops it
-    return bundle.under(controller.shape)
+    return bundle.fitting(controller)
 
 
 def _download(

@@ -20,6 +20,7 @@ from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.tasks import Description
+from dreamfleet.common.variants import Variant
 from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
 __all__ = [
@@ -97,6 +98,10 @@ class World:
     idle_cost: float = 0.0  # what a step without a reward costs: charged for steps that `patience` cuts off
     horizon: int = ENVIRONMENTS_OWN  # steps of a judged episode at most
     version: int = 1  # to be raised whenever the same parameters and seeds give another fitness
+    time_cost: float = (
+        0.0  # what a candidate pays for each step until `goal` is reached, or its horizon; not the judged
+    )
+    goal: str = ""  # of an episode's last info: true where what it is about was reached, such as a whole lap
     frames_per_second: int = 30  # of a video
     action_names: tuple[str, ...] = ()  # of continuous actions, for people
     dream_reward: DreamReward | None = None  # of worlds that world models are trained on
@@ -124,10 +129,12 @@ class Assignment:
 
     @property
     def world_model(self) -> Bundle:
-        """The bundle, under the run's controllers; `BundleError` where there is none."""
+        """The bundle, under the run's controllers and variant; `BundleError` where there is none."""
+        spec = self.spec
         if self.bundle is None:
-            raise BundleError(f"task {self.spec.task} needs a world model: give one with --bundle")
-        return self.bundle.under(self.spec.controller) if self.spec.controller else self.bundle
+            raise BundleError(f"task {spec.task} needs a world model: give one with --bundle")
+        own = spec.controller or spec.options
+        return self.bundle.under(spec.controller, Variant.of(spec.options)) if own else self.bundle
 
     @property
     def controller(self) -> ControllerShape:

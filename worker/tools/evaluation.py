@@ -61,7 +61,7 @@ def bundle_for(controller: Controller, named: str | None, beside: Path | None = 
                 f"the controller's world model {controller.bundle[:12]}... is not here: name it with --bundle FILE"
             )
         bundle = found
-    return bundle.under(controller.shape)
+    return bundle.fitting(controller)
 
 
 def evaluate(

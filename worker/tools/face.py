@@ -66,7 +66,7 @@ def evaluate(
 
 def _assignment(controller: Controller, bundle: Bundle | None) -> Assignment:
     found = bundle or evaluation.bundle_for(controller, None)
-    fitting = None if found is None else found.under(controller.shape)
+    fitting = None if found is None else found.fitting(controller)
     return Assignment(evaluation.spec_for(controller, fitting), fitting)
 
 

@@ -40,7 +40,8 @@ def record(
     environment = task.make_judge(assignment, "rgb_array")
     policy: Any = task.make_policy(assignment)
     policy.begin(controller.parameters)
-    mind = None if bundle is None else Thoughts(bundle, policy, controller, dreaming or DaydreamConfig(seed=seed))
+    config = dreaming or DaydreamConfig(seed=seed)
+    mind = None if bundle is None else Thoughts(assignment.world_model, policy, controller, config)
     score = 0.0
     with Film(out, environment, world, seed) as film:
         actor = Filmed(policy, film, mind)

@@ -112,8 +112,8 @@ def graphs(
 ) -> dict[str, bytes]:
     """The parts of a new bundle."""
     actions = find_world().world.actions
-    if not isinstance(actions, Continuous):
-        raise DatasetError(f"world models are built for continuous actions; those of {WORLD} are not")
+    if not isinstance(actions, Continuous) or actions.outputs_of:
+        raise DatasetError(f"world models are built for continuous actions of an output each; those of {WORLD} are not")
     buffer = io.BytesIO()
     np.save(buffer, initial)
     return {

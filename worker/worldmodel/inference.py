@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.bundle import DECODER, DREAM, ENCODER, LAYERED, LINEAR, POLICY, Bundle
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.tensors import check_closed
+from dreamfleet.worker.worldmodel.choices import Choices, Layer, decide
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]
@@ -53,7 +54,10 @@ def check_sizes(
 
 
 class Step(NamedTuple):
-    """What one policy step gives, a row an episode; `state` is for the next step, its first columns are h."""
+    """What one policy step gives, a row an episode.
+
+    `state` is for the next step: its first columns are h, its last ones what the controller keeps of its choices.
+    """
 
     action: Floats
     state: Floats
@@ -67,7 +71,7 @@ class PolicyStep:
         self.shape = bundle.controller_shape
         self.hidden_size = bundle.manifest.hidden
         self._reward = RewardLabel(bundle)
-        self._whole = self.shape == bundle.default_shape
+        self._whole = bundle.variant.plain and self.shape == bundle.default_shape
         if self._whole:
             session = open_part(bundle, POLICY)
             manifest = bundle.manifest
@@ -118,23 +122,37 @@ class RewardLabel:
 
 
 class Controllers:
-    """Controllers of the bundle's shape, a row each, apart from the policy's graph."""
+    """Controllers of the bundle's shape, a row each, apart from the policy's graph; a variant's are no graph at all."""
 
     def __init__(self, bundle: Bundle) -> None:
-        self.shape = bundle.controller_shape
-        self._hidden = bundle.manifest.hidden if self.shape.features > bundle.manifest.latent else 0
-        self._run = open_part(bundle, LAYERED if self.shape.hidden else LINEAR).run
+        self.shape, variant = bundle.controller_shape, bundle.variant
+        self.choices = Choices(variant)
+        remembered = self.shape.features - variant.seen > bundle.manifest.latent
+        self._hidden = bundle.manifest.hidden if remembered else 0
+        self._actions = variant.actions
+        self._run = open_part(bundle, LAYERED if self.shape.hidden else LINEAR).run if variant.plain else None
         self._parameters = np.zeros((0, self.shape.size), dtype=np.float32)
+        self._layers: list[Layer] = []
         self._feed: dict[str, Floats] = {}
 
     def act(self, parameters: Floats, latent: Floats, state: Floats) -> Floats:
         """`action` (N, actions) of `parameters` (N, size); these are unpacked once, so do not change them in place."""
         if parameters is not self._parameters:
-            layers = enumerate(self.shape.unpack(parameters))
-            named = [(f"{kind}{index}", each) for index, pair in layers for kind, each in zip(NAMES, pair, strict=True)]
-            self._feed = {name: np.ascontiguousarray(each) for name, each in named}
-            self._parameters = parameters
-        features = np.concatenate([latent, state[:, : self._hidden]], axis=1) if self._hidden else latent
+            self._unpack(parameters)
+        return self.choices.choose(state, lambda: self._decide(latent, state))
+
+    def _unpack(self, parameters: Floats) -> None:
+        layers = [(np.ascontiguousarray(a), np.ascontiguousarray(b)) for a, b in self.shape.unpack(parameters)]
+        numbered = enumerate(layers)
+        named = [(f"{kind}{index}", each) for index, pair in numbered for kind, each in zip(NAMES, pair, strict=True)]
+        self._layers, self._feed, self._parameters = layers, dict(named), parameters
+
+    def _decide(self, latent: Floats, state: Floats) -> Floats:
+        parts = [latent, state[:, : self._hidden]] if self._hidden else [latent]
+        parts += [self.choices.features(state)] if self.choices.seen else []
+        features = np.concatenate(parts, axis=1) if len(parts) > 1 else latent
+        if self._run is None:
+            return decide(self._layers, features, self._actions)
         (action,) = self._run(["action"], {**self._feed, "features": features})
         return np.asarray(action, dtype=np.float32)
 
@@ -173,12 +191,14 @@ class DreamStep:
         self.attends = ATTENTION in outputs
         self._names = [name for name in outputs if name != ATTENTION]
         self._controllers = Controllers(bundle)
+        self._choices = self._controllers.choices
         self._only = onnxruntime.RunOptions()
         self._only.only_execute_path_to_fetches = True
         self._idle: dict[str, Floats] = {}
         self.shape = bundle.controller_shape
         self.hidden_size = bundle.manifest.hidden
-        self.state_size: int = sizes["state"][1]
+        self._model_size: int = sizes["state"][1]
+        self.state_size = self._model_size + self._choices.columns
         self.latent_size: int = sizes["latent"][1]
         dropout = float(manifest.models["mdnrnn"]["dropout"]) if "mask" in sizes else 0.0
         self.chance = Chance(self.latent_size, self.hidden_size, dropout)
@@ -197,21 +217,23 @@ class DreamStep:
 
     def imagine(
         self, latent: Floats, action: Floats, state: Floats, uniform: Floats, normal: Floats,
-        temperature: float, mask: Floats | None = None,
+        temperature: float, mask: Floats | None = None, chosen: Floats | None = None,
     ) -> Dream:  # fmt: skip
-        """Dream on under these actions `(N, actions)`."""
-        feed = {"latent": latent, "action": action, "state": state, "uniform": uniform, "normal": normal}
+        """Dream on under these actions `(N, actions)`; `chosen` are the controllers' where others are done."""
+        own = self._models(state)
+        feed = {"latent": latent, "action": action, "state": own, "uniform": uniform, "normal": normal}
         feed["temperature"] = np.array([temperature], dtype=np.float32)
         if self.chance.dropout:
             feed["mask"] = np.ones((len(latent), self.hidden_size), np.float32) if mask is None else mask
         given = dict(zip(self._names, self._run(self._names, feed), strict=True))
         none = np.zeros(len(latent), dtype=np.float32)
         told = given.get("reward", none), given.get("done", none)
-        return Dream(action, given["next_latent"], given["next_state"], *told)
+        after = self._after(given["next_state"], state, action if chosen is None else chosen)
+        return Dream(action, given["next_latent"], after, *told)
 
-    def advance(self, latent: Floats, action: Floats, state: Floats) -> Floats:
-        """The next state alone, as in reality, where the next latent is seen and not dreamt."""
-        return self._look("next_state", latent, action, state)
+    def advance(self, latent: Floats, action: Floats, state: Floats, chosen: Floats | None = None) -> Floats:
+        """The next state alone, as in reality, where the next latent is seen and not dreamt; `chosen` as above."""
+        return self._after(self._look("next_state", latent, action, state), state, action if chosen is None else chosen)
 
     def attend(self, latent: Floats, action: Floats, state: Floats) -> Floats:
         """The weights (N, window) that attention gives its inputs at this step, the oldest first."""
@@ -224,9 +246,19 @@ class DreamStep:
             self._idle = {"uniform": zeros, "normal": zeros, "temperature": np.ones(1, np.float32)}
             if self.chance.dropout:
                 self._idle["mask"] = np.ones((len(latent), self.hidden_size), np.float32)
-        feed = {**self._idle, "latent": latent, "action": action, "state": state}
+        feed = {**self._idle, "latent": latent, "action": action, "state": self._models(state)}
         (found,) = self._run([output], feed, self._only)
         return np.asarray(found, dtype=np.float32)
+
+    def _models(self, state: Floats) -> Floats:
+        """The world model's part of a state."""
+        return np.ascontiguousarray(state[:, : self._model_size]) if self._choices.columns else state
+
+    def _after(self, models: Floats, state: Floats, chosen: Floats) -> Floats:
+        """The world model's next state with what the controllers keep behind it."""
+        if not self._choices.columns:
+            return models
+        return np.concatenate([models, self._choices.after(state, chosen)], axis=1)
 
     def zero_state(self, rows: int) -> Floats:
         """The state before the first step."""

@@ -11,7 +11,9 @@ from dreamfleet.worker.dream.policy import DreamPolicy
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.episode import Course
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
+from tests.support.variants import VARIANTS
 
 HORIZON = 20
 
@@ -44,6 +46,32 @@ def test_the_environment_dreams_the_same_bits(dreaming, random_bundle):
     for vector, seed in zip(candidates(random_bundle, 3), (5, 6, 7), strict=True):
         (batched,) = dreaming.score([(vector, seed)])
         assert episode.score(environment, DreamPolicy(random_bundle), vector, Course(seed, HORIZON)) == batched
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_variant_dreams_the_same_bits_alone_in_any_batch_and_step_by_step(random_bundle, name):
+    bundle = random_bundle.under(None, VARIANTS[name])
+    dreamer = Dreamer(bundle, spec(bundle))
+    dreams = [(vector, seed) for vector in candidates(bundle, 9) for seed in (1, 2)]
+    together = dreamer.score(dreams)
+    assert len({score.fitness for score in together}) == len(dreams)
+    assert dreamer.score(dreams[::-1])[::-1] == together
+    assert dreamer.score(dreams[5:12]) == together[5:12]
+    environment = CarRacingDream(bundle, temperature=1.3, horizon=HORIZON)
+    for dream, found in zip(dreams[:4], together[:4], strict=True):
+        assert dreamer.score([dream]) == [found]
+        assert episode.score(environment, DreamPolicy(bundle), dream[0], Course(dream[1], HORIZON)) == found
+
+
+def test_rows_that_leave_a_batch_take_along_what_they_held(tmp_path):
+    rnn = MDNRNNConfig(latent=3, hidden=4, done=True)
+    plain = write_random_bundle(tmp_path / "b.zip", vae=VAEConfig(latent=3, channels=(2, 2, 2, 2)), rnn=rnn)
+    bundle = plain.under(None, VARIANTS["all"])
+    dreamer = Dreamer(bundle, spec(bundle, temperature=3.0))
+    dreams = [(vector, seed) for vector in candidates(bundle, 20) for seed in range(3)]
+    together = dreamer.score(dreams)
+    assert len({score.steps for score in together}) > 2
+    assert [dreamer.score([dream])[0] for dream in dreams] == together
 
 
 def test_dropout_is_part_of_the_dream_and_changes_no_promise(tmp_path):

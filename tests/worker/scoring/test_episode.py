@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -14,8 +16,8 @@ class Scripted(gymnasium.Env):
     observation_space = spaces.Box(-1, 1, (1,))
     action_space = spaces.Box(-1, 1, (1,))
 
-    def __init__(self, rewards):
-        self._rewards = rewards
+    def __init__(self, rewards, info=None):
+        self._rewards, self._info = rewards, info or {}
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -24,7 +26,8 @@ class Scripted(gymnasium.Env):
 
     def step(self, action):
         self._step += 1
-        return np.zeros(1, np.float32), self._rewards[self._step - 1], self._step == len(self._rewards), False, {}
+        over = self._step == len(self._rewards)
+        return np.zeros(1, np.float32), self._rewards[self._step - 1], over, False, self._info if over else {}
 
 
 class Still:
@@ -66,6 +69,23 @@ def test_a_hopeless_episode_is_cut_and_charged_what_standing_still_costs():
     whole = score(Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, Course(1, 100))
     assert driven.steps == 21
     assert driven.fitness == pytest.approx(whole.fitness)
+
+
+@pytest.mark.parametrize(
+    ("rewards", "info", "paid"),
+    [
+        ([1.0] * 8, {"lap": True}, 8),  # it came home
+        ([1.0] * 8, {"lap": False}, 20),  # it crashed
+        ([1.0] * 8, {}, 20),
+        ([1.0] * 40, {}, 20),  # it is still on its way
+        ([1.0] + [0.0] * 39, {}, 20),  # it was given up
+    ],
+)
+def test_time_costs_until_the_goal_is_reached_and_to_crash_saves_nothing(rewards, info, paid):
+    free = Course(1, 20, patience=5, goal="lap")
+    found = [score(Scripted(rewards, info), Still(), PARAMETERS, each) for each in (free, replace(free, time_cost=0.5))]
+    assert found[0].fitness - found[1].fitness == 0.5 * paid
+    assert found[0].steps == found[1].steps
 
 
 def test_reward_restores_patience():

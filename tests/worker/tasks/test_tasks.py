@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -5,7 +7,9 @@ import pytest
 from dreamfleet.common.bundle import Manifest, write_bundle
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.variants import Variant
 from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
+from dreamfleet.worker.scoring.episode import play
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
@@ -13,6 +17,7 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support import tasks
 from tests.support.bundles import npy, write_random_bundle
+from tests.support.variants import VARIANTS
 
 
 def test_car_racing_is_registered():
@@ -99,6 +104,70 @@ def test_a_job_is_scored_under_the_controller_that_its_run_names(random_bundle):
     assert scorer.score("score", np.zeros(shape.size, np.float32), 3).steps == 5
     with pytest.raises(ControllerError, match="867 parameters"):
         scorer.score("score", np.zeros(867, np.float32), 3)
+    scorer.close()
+
+
+def varied(bundle, task="car-racing", horizon=5, **named):
+    """A specification of a variant, and a vector that it scores."""
+    variant = Variant(**named)
+    shape = bundle.shape_of("zh", 0, variant)
+    spec = TaskSpec(task, bundle.sha256, horizon, 0, shape, options=variant.options, version=variant.version)
+    return spec, np.random.default_rng(1).normal(0, 0.1, shape.size).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_job_is_scored_under_the_variant_that_its_run_names(random_bundle, name):
+    spec, vector = varied(random_bundle, **vars(VARIANTS[name]))
+    scorer = Scorer(spec, random_bundle)
+    scores = [scorer.score("score", vector, 3) for _ in range(2)]
+    assert scores[0] == scores[1]
+    scorer.close()
+    judge = Scorer(spec, random_bundle, judge=True)
+    assert judge.score("score", vector, 3) == scores[0]
+    judge.close()
+
+
+def test_only_candidates_pay_for_time(random_bundle):
+    (plain, vector), (dear, _) = varied(random_bundle), varied(random_bundle, time_cost=0.5)
+    scorers = [Scorer(each, random_bundle) for each in (plain, dear)]
+    free, paid = (each.score("score", vector, 3).fitness for each in scorers)
+    assert free - paid == pytest.approx(0.5 * 5)
+    for kind in ("evaluate", "collect"):
+        assert scorers[1].course(kind, 3) == scorers[0].course(kind, 3)
+    for each in scorers:
+        each.close()
+
+
+def test_a_lap_that_is_over_costs_no_more_time(random_bundle):
+    course = Scorer(varied(random_bundle, time_cost=0.5)[0], random_bundle).course("score", 3)
+    assert (course.time_cost, course.goal) == (0.5, "lap_finished")
+    environment = find_task("car-racing").make_environment(Assignment.of("car-racing", random_bundle))
+
+    class HomeAtOnce:
+        """Moves the lap's end under the car."""
+
+        def act(self, _observation):
+            environment.unwrapped.tile_visited_count = len(environment.unwrapped.track)
+            return np.zeros(3, np.float32)
+
+    *_, last = play(environment, HomeAtOnce(), course)
+    assert (last.ended, last.reached) == (True, True)
+    environment.close()
+
+
+def test_who_knows_no_variants_does_not_score_one_as_if_it_were_plain(random_bundle):
+    spec, _ = varied(random_bundle, decide_every=4)
+    assert (spec.version, spec.controller) == (2, random_bundle.default_shape)
+    with pytest.raises(UsageError, match="version 1 of task car-racing, here is version 2"):
+        Scorer(replace(spec, version=1), random_bundle)
+
+
+def test_a_variant_is_dreamt_and_driven(random_bundle):
+    spec, vector = varied(random_bundle, "dream", 20, **vars(VARIANTS["all"]))
+    scorer = Scorer(spec, random_bundle)
+    alone = scorer.score("score", vector, 3)
+    assert scorer.score_all([("score", vector, 3), ("score", -vector, 3)], lambda _: None)[0] == alone
+    assert scorer.world.actions == VARIANTS["all"].actions
     scorer.close()
 
 

@@ -1,0 +1,90 @@
+import json
+
+import pytest
+
+from dreamfleet.common.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.variants import KNOWN, PLAIN, Variant
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        '{"pedals": "one"}',
+        '{"pedal_shift": 0.25, "pedals": "one"}',
+        '{"decide_every": 4}',
+        '{"feedback": "last"}',
+        '{"time_cost": 0.5}',
+        '{"decide_every": 2, "feedback": "last", "pedals": "one", "time_cost": 1.0}',
+    ],
+)
+def test_a_variant_is_its_options_and_back(options):
+    variant = Variant.of(options)
+    assert variant.options == options
+    assert Variant.of(variant.options) == variant
+    assert (variant.plain, variant.version) == (False, 2)
+
+
+def test_the_plain_way_is_named_by_nothing():
+    assert Variant.of("") == Variant.named({"pedals": "two", "decide_every": 1, "time_cost": 0}) == PLAIN
+    assert (PLAIN.options, PLAIN.plain, PLAIN.version, PLAIN.seen) == ("", True, 1, 0)
+    assert PLAIN.actions == STEERING_GAS_BRAKE
+
+
+def test_a_whole_number_is_written_as_the_number_that_it_means():
+    assert Variant.named({"time_cost": 2}).options == '{"time_cost": 2.0}' == Variant.of('{"time_cost": 2}').options
+
+
+def test_a_variant_can_be_said_as_a_run_is_told_it():
+    assert Variant(pedals="one", decide_every=4, time_cost=0.25).texts == (
+        "pedals=one", "decide_every=4", "time_cost=0.25",
+    )  # fmt: skip
+    assert PLAIN.texts == ()
+
+
+def test_what_candidates_pay_is_no_part_of_how_they_drive():
+    assert Variant(time_cost=0.5).driving == PLAIN
+    assert Variant(pedals="one", time_cost=0.5).driving == Variant(pedals="one")
+
+
+def test_each_output_of_a_controller_is_seen_twice():
+    assert Variant(feedback="last").seen == 6
+    assert Variant(feedback="last", pedals="one").seen == 4
+
+
+def test_an_unknown_option_names_those_that_there_are():
+    with pytest.raises(
+        UsageError, match="car-racing knows no option gears, pedal: known are pedals, pedal_shift, "
+    ) as told:
+        Variant.of('{"pedal": "one", "gears": 5}')
+    assert all(name in str(told.value) for name in KNOWN)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("pedals", ["three", 1, ["one"], None]),
+        ("pedal_shift", [0.5, "0", True]),  # of two pedals
+        ("decide_every", [0, 51, 2.0, True, "4"]),
+        ("feedback", ["first", False]),
+        ("time_cost", [-0.1, 101, float("nan"), "1", True]),
+    ],
+)
+def test_a_value_out_of_its_range_is_refused_with_what_it_must_be(name, values):
+    for value in values:
+        with pytest.raises(UsageError) as told:
+            Variant.of(json.dumps({name: value}))
+        assert f"car-racing's {name} must be {KNOWN[name]}, not {value!r}" == str(told.value)
+
+
+@pytest.mark.parametrize("options", ["{", "[1]", "7", '"one"'])
+def test_options_that_are_no_object_are_refused(options):
+    with pytest.raises(UsageError, match="must be a JSON object"):
+        Variant.of(options)
+
+
+def test_a_shift_that_leaves_no_pedal_is_refused():
+    assert Variant(pedals="one", pedal_shift=-1).actions.shift == (0, -1, 1)
+    with pytest.raises(UsageError, match="from -1 to 1"):
+        Variant(pedals="one", pedal_shift=1.5)

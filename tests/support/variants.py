@@ -1,0 +1,29 @@
+"""Variants of driving CarRacing, and controllers that drive so."""
+
+import numpy as np
+
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.variants import Variant
+
+VARIANTS = {
+    "one pedal": Variant(pedals="one"),
+    "shifted pedal": Variant(pedals="one", pedal_shift=0.25),
+    "every third": Variant(decide_every=3),
+    "feedback": Variant(feedback="last"),
+    "all": Variant(pedals="one", decide_every=3, feedback="last"),
+}
+
+
+def vectors(bundle, count, seed=4, scale=0.3):
+    """Parameters `(count, size)` of the bundle's controllers."""
+    random = np.random.default_rng(seed)
+    return random.normal(0, scale, (count, bundle.controller_shape.size)).astype(np.float32)
+
+
+def controller_of(bundle, task="car-racing", seed=4):
+    """One of the bundle's controllers, which drive by its variant."""
+    (parameters,) = vectors(bundle, 1, seed)
+    variant = bundle.variant
+    return Controller(
+        bundle.controller_shape, parameters, task, bundle.sha256, {}, variant.options, variant.version
+    )  # fmt: skip
