@@ -58,8 +58,9 @@ sanitize: $(VENV)/.dev  ## 200,000 steps of the native picture under AddressSani
 	LD_PRELOAD=$$(cc -print-file-name=libasan.so) ASAN_OPTIONS=detect_leaks=0 SDL_VIDEODRIVER=dummy \
 	  $(BIN)/python deploy/sanitize.py build/sanitized.so $(or $(STEPS),200000)
 
-bundle: $(VENV)/.dev  ## a world model like the shipped one, from nothing: 45 minutes of two cores; ROUNDS=1: 15
-	ROUNDS=$(or $(ROUNDS),2) DREAMFLEET=$(BIN)/dreamfleet deploy/bundle.sh data/tiny
+bundle: $(VENV)/.dev  ## a world model like the shipped one, from nothing: an hour of two cores; ROUNDS=1: 20 minutes
+	$(BIN)/dreamfleet iterate --data data/tiny --rounds $(or $(ROUNDS),2) --more-drives 580 --own-drives 0 \
+	  --run-flags "--generations 32 --collect-every 2 --collect-episodes 5" $(ARGS)
 
 stranger:  ## both commands as a stranger runs them: a fresh clone of what is committed, no settings, an empty home
 	deploy/stranger.sh

@@ -42,6 +42,11 @@ def spoken(*words: object) -> str:
     return shlex.join([*program, *map(str, words)])
 
 
+def leash() -> tuple[str, ...]:
+    """What a command runs `inside` so that it ends with this process, however this one ends; of Linux."""
+    return (sys.executable, "-P", "-m", "dreamfleet.common.leash", str(os.getpid()))
+
+
 def call(*words: object) -> None:
     """Run a verb to its end in this terminal; `DreamfleetError` if it fails."""
     if subprocess.run(command(*words), check=False).returncode != 0:  # noqa: S603 - our own interpreter and verb

@@ -101,9 +101,14 @@ class RunFolder:
         row = self._one("SELECT vector FROM candidate WHERE generation = ? AND number = ?", generation, number)
         if row is None:
             raise JournalError(f"run {self.name} has no candidate {generation}/{number}")
-        if not isinstance(row[0], bytes) or len(row[0]) % 4:
-            raise self._damaged("a candidate is no vector")
-        return np.frombuffer(row[0], dtype="<f4").astype(np.float32)
+        return self._vector(row[0], "a candidate")
+
+    def evaluated(self, generation: int) -> NDArray[np.float32]:
+        """The mean `(size,)` after a generation that was evaluated, as it travelled."""
+        row = self._one("SELECT vector FROM evaluation WHERE generation = ?", generation)
+        if row is None:
+            raise JournalError(f"run {self.name} has no evaluation of generation {generation}")
+        return self._vector(row[0], "an evaluated mean")
 
     def fitness(self, generation: int, number: int) -> float | None:
         """What the strategy was told of a candidate; `None` while its generation is open."""
@@ -154,6 +159,11 @@ class RunFolder:
     def fact(self, key: str) -> str | None:
         """One of the run's facts, such as the limits that it was last served with; `None` if it has no such fact."""
         return self._fact(key)
+
+    def _vector(self, data: Any, what: str) -> NDArray[np.float32]:
+        if not isinstance(data, bytes) or len(data) % 4:
+            raise self._damaged(f"{what} is no vector")
+        return np.frombuffer(data, dtype="<f4").astype(np.float32)
 
     def _fact(self, key: str) -> str | None:
         row = self._one("SELECT value FROM run WHERE key = ?", key)

@@ -20,7 +20,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.network import DEFAULT_ENDPOINT, check_endpoint
 
 ARRAYS = ("stage",)  # tables that a file may hold several of
-TABLES = ("run", "limits", "network", "worker", "demo")  # of every verb: one file serves all of them
+TABLES = ("run", "limits", "network", "worker", "demo", "iterate")  # of every verb: one file serves all of them
 OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG")
 PREFIX = "DREAMFLEET_"
 ALIKE = 0.75  # how near a name must be to a known one to be taken for a slip of the hand

@@ -104,8 +104,8 @@ class Pycma:
     def _balance(self) -> None:
         """Write the same distribution with factors near one; after tens of thousands of generations they overflow.
 
-        A deviation is step size x scaling x the sampler's deviation. The paths are kept in units of the third (`pc`) and
-        of the last two (`pc2`), so that they change with these.
+        A deviation is step size x scaling x the sampler's deviation. The paths are kept in units of the third (`pc`)
+        and of the last two (`pc2`), so that they change with these.
         """
         strategy, middle = self._strategy, self.sigma
         ratio = middle / strategy.sigma

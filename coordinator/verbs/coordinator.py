@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from dreamfleet.coordinator.start import Start
 
 SUMMARY = "start a run: CMA-ES decides, workers score"
-EXTRAS = ()
+EXTRAS: tuple[str, ...] = ()
 LEFT_OPEN = 130
 log = logging.getLogger("dreamfleet.coordinator")
 
@@ -66,10 +66,16 @@ def run(args: argparse.Namespace) -> int:
 
 def serve(args: argparse.Namespace, base: Table, start: Start | None) -> int:
     """Serve a new run, whose settings are those of `base` where nothing else is said."""
+    config, limits = configured(args, base)
+    return _serve(args, _request(args, args.run_name, config, limits, {}, start))
+
+
+def configured(args: argparse.Namespace, base: Table) -> tuple[RunConfig, LimitsConfig]:
+    """What a new run is, and when it ends, as its flags, the environment and the file say."""
     config = _scheduled(args, load(RunConfig, "run", base=base, preset=find_preset, **args.sources))
     limits = load(LimitsConfig, "limits", **args.sources)
     _check_target(limits, config.evaluate_every)
-    return _serve(args, _request(args, args.run_name, config, limits, {}, start))
+    return config, limits
 
 
 def _scheduled(args: argparse.Namespace, config: RunConfig) -> RunConfig:

@@ -1,5 +1,10 @@
 """Our own verbs as processes."""
 
+import os
+import select
+import subprocess
+import sys
+
 import pytest
 
 from dreamfleet.common.errors import DreamfleetError
@@ -45,3 +50,19 @@ def test_what_is_not_said_is_an_error_and_no_endless_wait(tmp_path):
         child.wait_for("nothing of the kind")
     with pytest.raises(DreamfleetError, match="dreamfleet runs failed"):
         call("runs", "show", "absent", "--runs-dir", tmp_path)
+
+
+def test_a_leashed_child_dies_with_a_parent_that_is_killed(tmp_path):
+    program = (
+        "import sys; from dreamfleet.common.processes import Child, leash\n"
+        "child = Child('worker', '--connect', 'tcp/127.0.0.1:1', inside=leash())\n"
+        "print(child.popen.pid, flush=True); sys.stdin.read()"
+    )
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", program], stdin=pipe, stdout=pipe, text=True) as parent:
+        child = os.pidfd_open(int(parent.stdout.readline()))
+        parent.kill()
+    try:
+        assert select.select([child], [], [], 30)[0], "it lives on"
+    finally:
+        os.close(child)

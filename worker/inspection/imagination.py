@@ -12,8 +12,8 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.worker.dream.noise import PIECE, Noise, side_by_side
 from dreamfleet.worker.dream.world import DreamWorld
-from dreamfleet.worker.inspection.disturbance import pushed
 from dreamfleet.worker.inspection.witness import WitnessedDrive
+from dreamfleet.worker.scoring.disturbance import pushed
 from dreamfleet.worker.worldmodel.inference import Controllers
 
 Floats = NDArray[np.float32]

@@ -9,11 +9,11 @@ from itertools import islice
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.inspection.hand import Hand, controllers_hand, drivers_hands
 from dreamfleet.worker.inspection.knowledge import Knowledge, measure
 from dreamfleet.worker.inspection.losses import Compared, LossConfig, compare, gather
-from dreamfleet.worker.inspection.mind import Mind
 from dreamfleet.worker.inspection.witness import WitnessConfig, WitnessedDrive, witness
+from dreamfleet.worker.scoring.hand import Hand, controllers_hand, drivers_hands
+from dreamfleet.worker.scoring.mind import Mind
 
 Told = Callable[[int], None]
 

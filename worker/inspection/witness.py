@@ -15,11 +15,12 @@ from dreamfleet.common.actions import Continuous
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.seeds import VALIDATION
-from dreamfleet.worker.inspection.disturbance import Disturbance
-from dreamfleet.worker.inspection.hand import Hand
-from dreamfleet.worker.inspection.mind import Mind
 from dreamfleet.worker.inspection.rollout import ZOOM
+from dreamfleet.worker.scoring.disturbance import Disturbance
+from dreamfleet.worker.scoring.disturbed import Disturbed
 from dreamfleet.worker.scoring.episode import Begin, Course, play
+from dreamfleet.worker.scoring.hand import Hand
+from dreamfleet.worker.scoring.mind import Mind
 from dreamfleet.worker.tasks.api import Assignment, Collected, Task, Truthful
 from dreamfleet.worker.tasks.registry import find_task
 
@@ -85,37 +86,16 @@ class Notes:
     push: list[Floats] = field(default_factory=list)
 
 
-class Witness:
+class Witness(Disturbed):
     """A policy that drives by a disturbed hand, and notes what was true and what the mind held."""
 
     def __init__(self, mind: Mind, hand: Hand, disturbance: Disturbance, truth: Callable[[], dict[str, float]]) -> None:
-        self._mind, self._hand, self._disturbance, self._truth = mind, hand, disturbance, truth
-        self._minds = [mind] if hand.mind in (None, mind) else [mind, hand.mind]
+        super().__init__(hand, disturbance, mind)
+        self._mind, self._truth = mind, truth
         self.notes, self.hidden = Notes(), mind.hidden
 
-    def begin(self, _parameters: Any = None) -> None:
-        """Begin an episode."""
-        for each in self._minds:
-            each.begin()
-
-    def act(self, observation: Any) -> Floats:
-        """The disturbed action."""
-        for each in self._minds:
-            each.see(observation)
-        push, chosen = self._disturbance.next(), self._hand.choose()
-        action = self._disturbance.apply(chosen, push)
-        self._note(action, push)
-        for each in self._minds:
-            each.remember(action, chosen)
-        done: Floats = action[0]
-        return done
-
-    def reward(self, value: float) -> None:
-        """What the action brought."""
-        for each in self._minds:
-            each.reward(value)
-
-    def _note(self, action: Floats, push: Floats) -> None:
+    def note(self, action: Floats, push: Floats) -> None:
+        """Write a step down."""
         notes, mind = self.notes, self._mind
         notes.latent.append(mind.latent[0])
         notes.state.append(mind.state[0])

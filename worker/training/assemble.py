@@ -27,6 +27,7 @@ from dreamfleet.common.bundle import (
     write_bundle,
 )
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.files import write_aside
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
@@ -52,7 +53,8 @@ def record_quality(folder: Path, figures: dict[str, float]) -> None:
     """Keep a model's figures beside the data, for the manifest."""
     path = folder / QUALITY
     known = json.loads(path.read_text()) if path.exists() else {}
-    path.write_text(json.dumps({**known, **figures}, indent=1))
+    with write_aside(path) as file:
+        file.write(json.dumps({**known, **figures}, indent=1).encode())
 
 
 def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundle:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -21,9 +21,14 @@ from dreamfleet.common.files import write_aside
 from dreamfleet.common.threads import pin_thread_pools
 from dreamfleet.worker.scoring.episode import Course, play
 from dreamfleet.worker.scoring.rollout import Rollout, write_episode
+from dreamfleet.worker.scoring.scorer import DRIVER
+from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.policy import Driven
 from dreamfleet.worker.training.dataset import check_pictures
+from dreamfleet.worker.training.pilot import Pilot
 from dreamfleet.worker.training.world import find_world, preprocessing_to
+
+LOUDEST = 10.0  # noise, in halves of an action's range
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,7 @@ class CollectConfig:
     anywhere: float = 0.6  # share of episodes that start somewhere on the track instead of at its beginning
     patience: int = 120  # steps after the last new tile before an episode ends
     picture: int = 64  # height and width of what is recorded: 64, or 96 for the whole observation
+    noise: float = 0.3  # on a controller's actions, in halves of their range; random drivers have none
 
     def __post_init__(self) -> None:
         for name in ("episodes", "steps", "patience"):
@@ -43,6 +49,8 @@ class CollectConfig:
                 raise UsageError(f"--{name} must be at least 1, not {getattr(self, name)}")
         if self.seed < 0:
             raise UsageError(f"--seed must not be negative, not {self.seed}")
+        if not 0 <= self.noise <= LOUDEST:
+            raise UsageError(f"--noise must be from 0 to {LOUDEST:g}, not {self.noise}")
         preprocessing_to(self.picture)
 
 
@@ -61,13 +69,16 @@ def missing(folder: Path, config: CollectConfig) -> list[int]:
     return [number for number in range(config.episodes) if not episode_path(folder, number).exists()]
 
 
-def collect(folder: Path, config: CollectConfig, jobs: int) -> Generator[int, None, None]:
+def collect(folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pilot] = ()) -> Generator[int, None, None]:
     """Drive the episodes that are not there yet in `jobs` processes; yields the frames of each as it is written.
 
-    `DatasetError` before anything is driven if what is there has other pictures. Closed early, it waits until those
-    that are being driven are written.
+    Random drivers drive them, or these pilots in turn. `DatasetError` or `ControllerError` before anything is driven if
+    what is there has other pictures, or a pilot sees others. Closed early, it waits until those that are being driven
+    are written.
     """
     check_pictures(present(folder), config.picture)
+    for pilot in pilots:
+        pilot.check(preprocessing_to(config.picture).name)
     numbers = missing(folder, config)
     try:
         (folder / "episodes").mkdir(parents=True, exist_ok=True)
@@ -79,7 +90,7 @@ def collect(folder: Path, config: CollectConfig, jobs: int) -> Generator[int, No
     pool = ProcessPoolExecutor(min(jobs, len(numbers)), get_context("spawn"), _start_process, (os.getpid(),))
     try:
         with signals_held():
-            rollouts = [pool.submit(_collect_one, (folder, config, number)) for number in numbers]
+            rollouts = [pool.submit(_collect_one, (folder, config, number, tuple(pilots))) for number in numbers]
         for each in as_completed(rollouts):
             yield each.result()
     except BrokenProcessPool as error:
@@ -93,20 +104,19 @@ def _start_process(parent: int) -> None:
     os.environ["SDL_VIDEODRIVER"] = "dummy"
 
 
-def _collect_one(task: tuple[Path, CollectConfig, int]) -> int:
-    folder, config, number = task
-    arrays = drive(config, number)
+def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...]]) -> int:
+    folder, config, number, pilots = task
+    arrays = drive(config, number, pilots)
     with write_aside(episode_path(folder, number)) as file:
         write_episode(file, arrays)
     return len(arrays["action"])
 
 
-def drive(config: CollectConfig, number: int) -> dict[str, NDArray[Any]]:
+def drive(config: CollectConfig, number: int, pilots: Sequence[Pilot] = ()) -> dict[str, NDArray[Any]]:
     """One episode of T steps: `picture` (T, side, side, 3) before each `action` (T, 3), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
     world = find_world()
-    name = list(world.drivers)[number % len(world.drivers)]
-    policy = Driven(world.drivers[name](random))
+    name, policy = _driver(config, number, pilots, random)
     preprocessing = preprocessing_to(config.picture)
     environment = world.make_recorded(preprocessing.name)
     course = Course(int(random.integers(2**20, 2**31)), config.steps, config.patience)
@@ -120,3 +130,15 @@ def drive(config: CollectConfig, number: int) -> dict[str, NDArray[Any]]:
         rollout.ended = moment.ended
     environment.close()
     return rollout.arrays()
+
+
+def _driver(
+    config: CollectConfig, number: int, pilots: Sequence[Pilot], random: np.random.Generator
+) -> tuple[str, Policy]:
+    """Who drives this episode, by name and as a policy that has begun."""
+    if pilots:
+        pilot = pilots[number % len(pilots)]
+        return DRIVER, pilot.policy(config.noise, int(random.integers(2**63)))
+    drivers = find_world().drivers
+    name = list(drivers)[number % len(drivers)]
+    return name, Driven(drivers[name](random))

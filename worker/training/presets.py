@@ -25,7 +25,7 @@ class Preset:
 
 
 # About 12 minutes of two cores. A VAE that was trained on more, or longer, told pictures apart better and made worse
-# dreams; an MDN-RNN that was made better ones (docs/dreams.md): `make bundle` goes on with it alone.
+# dreams; an MDN-RNN that was made better ones (docs/dreams.md): `iterate` goes on with it and the decoder alone.
 TINY = Preset(
     name="tiny",
     collect=CollectConfig(episodes=620, steps=300),

@@ -7,13 +7,17 @@ import os
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.presets import preset_help
 from dreamfleet.common.site import offer
 
-SUMMARY = "drive at random, or take in what a run collected, as training data for a world model"
+if TYPE_CHECKING:
+    from dreamfleet.worker.training.pilot import Pilot
+
+SUMMARY = "drive at random or by controllers, or take in what a run collected, as training data for a world model"
 EXTRAS = ("worker",)
 
 
@@ -22,9 +26,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
     parser.add_argument("--preset", default="tiny", help=f"{preset_help('training')} (default tiny)")
     parser.add_argument("--episodes", type=int, help="episodes in all, instead of the preset's")
+    parser.add_argument("--steps", type=int, help="steps of an episode at most, instead of the preset's")
     parser.add_argument("--seed", type=int, help="makes the data set, instead of the preset's")
     parser.add_argument("--picture", type=int, help="64, or 96 for the whole observation, instead of the preset's")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
+    parser.add_argument(
+        "--controller", nargs="+", default=[], metavar="CONTROLLER",
+        help="who drives the episodes that are missing, in turn, instead of random drivers: files, runs, or what ships",
+    )  # fmt: skip
+    parser.add_argument("--noise", type=float, help="on a controller's actions, of half their range (default 0.3)")
     parser.add_argument("--from-run", metavar="RUN", help="drive nothing: take in what this run collected, each once")
     offer(parser, "runs_dir")
     add_json(parser)
@@ -34,21 +44,24 @@ def run(args: argparse.Namespace) -> int:
     """Collect what is missing."""
     if args.from_run is not None:
         return _take_in(args)
+    if args.noise is not None and not args.controller:
+        raise UsageError("--noise is on a controller's actions: give --controller too")
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.common.stopping import heeding_signals
     from dreamfleet.worker.training.collect import collect, missing, present
     from dreamfleet.worker.training.presets import find_preset
 
     config = find_preset(args.preset).collect
-    names = ("episodes", "seed", "picture")
+    names = ("episodes", "steps", "seed", "picture", "noise")
     changes = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     config = replace(config, **changes)
+    pilots = _pilots(args)
     frames = done = 0
     before = len(present(args.data))
     total = before + len(missing(args.data, config))
     with progress_bar("collect", total, "episodes") as bar, heeding_signals() as stop:
         bar.move(before)
-        with closing(collect(args.data, config, max(1, args.jobs))) as counts:
+        with closing(collect(args.data, config, max(1, args.jobs), pilots)) as counts:
             for count in counts:
                 frames, done = frames + count, done + 1
                 bar.move(before + done)
@@ -65,15 +78,36 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _pilots(args: argparse.Namespace) -> tuple[Pilot, ...]:
+    if not args.controller:
+        return ()
+    from dreamfleet.common.shelf import find_controller
+    from dreamfleet.worker.tools.evaluation import bundle_for
+    from dreamfleet.worker.training.pilot import Pilot
+
+    found = []
+    for name in args.controller:
+        controller, beside = find_controller(name, args.runs_dir)
+        bundle = bundle_for(controller, None, beside)
+        if bundle is None:
+            raise UsageError(f"controller {name} sees no world model: give one that was evolved with one")
+        found.append(Pilot(controller, bundle))
+    return tuple(found)
+
+
 def _take_in(args: argparse.Namespace) -> int:
     from dreamfleet.common.runs import open_run
+    from dreamfleet.worker.training.collect import present
     from dreamfleet.worker.training.intake import take_in
 
+    if args.controller:
+        raise UsageError("--from-run drives nothing: leave --controller out")
     with open_run(args.runs_dir, args.from_run) as stored:
         drives = stored.rollouts()
         if not drives:
             raise UsageError(f"run {args.from_run} has collected nothing: start a run with --collect-every")
     new = list(take_in(args.data, drives))
     text = f"{args.data}: {len(new)} episodes, {sum(new)} frames new, of {len(drives)} that {args.from_run} collected"
-    answer(args, text, data=args.data, new_episodes=len(new), new_frames=sum(new), collected=len(drives))
+    answer(args, text, data=args.data, new_episodes=len(new), new_frames=sum(new), collected=len(drives),
+           episodes=len(present(args.data)))  # fmt: skip
     return 0

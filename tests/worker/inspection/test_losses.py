@@ -7,14 +7,14 @@ import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.inspection import probe
-from dreamfleet.worker.inspection.hand import ControllersHand
 from dreamfleet.worker.inspection.imagination import Beginning, Imagination
 from dreamfleet.worker.inspection.judge import Course, Judge
 from dreamfleet.worker.inspection.knowledge import measure
 from dreamfleet.worker.inspection.losses import CALM, LossConfig, compare, gather
-from dreamfleet.worker.inspection.mind import Mind
 from dreamfleet.worker.inspection.tables import knowledge_rows, loss_rows
 from dreamfleet.worker.inspection.witness import OFF, WitnessConfig, witness
+from dreamfleet.worker.scoring.hand import ControllersHand
+from dreamfleet.worker.scoring.mind import Mind
 
 CONFIG, DRIVEN = LossConfig(losses=6, before=(20, 0), dreams=2), WitnessConfig()
 

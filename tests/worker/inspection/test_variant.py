@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from dreamfleet.worker.inspection.mind import Mind
 
 from dreamfleet.common.variants import Variant
 from dreamfleet.worker.inspection.imagination import Beginning, Imagination
 from dreamfleet.worker.inspection.measuring import Driving
-from dreamfleet.worker.inspection.mind import Mind
 from dreamfleet.worker.inspection.witness import WitnessConfig, witness
 from tests.support.bundles import write_random_bundle
 from tests.support.variants import controller_of

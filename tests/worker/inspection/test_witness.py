@@ -6,14 +6,12 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from dreamfleet.common.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.bundle import write_bundle
 from dreamfleet.common.errors import ControllerError, UsageError
-from dreamfleet.worker.inspection.disturbance import Disturbance, pushed
-from dreamfleet.worker.inspection.hand import ControllersHand, controllers_hand, drivers_hands
-from dreamfleet.worker.inspection.mind import Mind
 from dreamfleet.worker.inspection.witness import OFF, WitnessConfig, first_stays, witness
 from dreamfleet.worker.scoring.episode import Course, play
+from dreamfleet.worker.scoring.hand import ControllersHand, controllers_hand, drivers_hands
+from dreamfleet.worker.scoring.mind import Mind
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -53,15 +51,6 @@ def test_a_drive_ends_behind_its_loss_and_is_a_function_of_its_seed(tiny):
 def drivers(name, bundle):
     hands = drivers_hands(bundle, name)
     return lambda _mind, seed: hands(seed)
-
-
-def test_noise_is_as_large_as_is_said_and_touches_no_action_at_its_bound():
-    disturbance = Disturbance(0, STEERING_GAS_BRAKE, 0.3)
-    pushes = np.concatenate([disturbance.next() for _ in range(20_000)])
-    np.testing.assert_allclose(pushes.std(axis=0), [0.3, 0.15, 0.15], rtol=0.1)
-    chosen = np.array([[0.9, 0.0, 1.0], [0.0, 0.5, 0.2]], np.float32)
-    done = pushed(STEERING_GAS_BRAKE, chosen, np.array([[0.3, 0.3, -0.3]], np.float32))
-    np.testing.assert_allclose(done, [[1.0, 0.0, 1.0], [0.3, 0.8, 0.0]], atol=1e-6)
 
 
 def test_a_controller_of_another_world_model_drives_by_its_own(tiny, controller, tmp_path):

@@ -1,10 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.bundle import find_bundle
+from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
+from dreamfleet.common.shelf import find_controller
 from dreamfleet.worker.car_racing.drivers import DRIVERS
 from dreamfleet.worker.training.collect import CollectConfig, collect, drive, episode_path
 from dreamfleet.worker.training.dataset import load_pictures
+from dreamfleet.worker.training.pilot import Pilot
 
 # SWIG warns as Box2D is imported, and an error there kills the process.
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
@@ -53,7 +58,7 @@ def test_collecting_again_writes_only_what_is_missing_and_the_same(tmp_path):
     assert len(load_pictures(episode_path(tmp_path, 2))) == 4
 
 
-@pytest.mark.parametrize("changes", [{"episodes": 0}, {"steps": 0}, {"patience": 0}, {"seed": -1}])
+@pytest.mark.parametrize("changes", [{"episodes": 0}, {"steps": 0}, {"patience": 0}, {"seed": -1}, {"noise": -1}])
 def test_impossible_settings_are_refused(changes):
     with pytest.raises(UsageError, match=f"--{next(iter(changes))}"):
         CollectConfig(**changes)
@@ -74,3 +79,30 @@ def test_a_driver_stays_within_the_cars_controls_and_moves_it(name):
     assert (actions <= 1).all()
     assert ((actions[:, 1] > 0) & (actions[:, 2] > 0)).sum() == 0  # one pedal at a time
     assert actions[:, 1].mean() > actions[:, 2].mean()
+
+
+@pytest.fixture
+def pilot(tmp_path):
+    return Pilot(find_controller("tiny", tmp_path)[0], find_bundle("tiny"))
+
+
+def test_controllers_drive_in_turn_under_noise_as_a_function_of_seed_and_number(pilot, tmp_path):
+    still = Pilot(replace(pilot.controller, parameters=np.zeros_like(pilot.controller.parameters)), pilot.bundle)
+    first = drive(TINY, 1, (pilot, still))
+    assert equal(drive(TINY, 1, (pilot, still)), first)
+    assert equal(drive(TINY, 1, (still,)), first)
+    assert not equal(drive(TINY, 1, (pilot,)), first)
+    assert str(first["driver"]) == "controller"
+    quiet = drive(replace(TINY, noise=0.0), 1, (still,))
+    assert np.ptp(quiet["action"], axis=0).max() == 0 < np.ptp(first["action"], axis=0).max()
+    assert list(collect(tmp_path, TINY, 1, (pilot, still))) == [4, 4, 4]
+    with np.load(episode_path(tmp_path, 1)) as written:
+        assert equal(dict(written), first)
+
+
+def test_a_controller_of_another_model_or_other_pictures_drives_for_no_data_set(pilot, random_bundle, tmp_path):
+    with pytest.raises(ControllerError, match=r"is of the world model .*, not of .*random\.zip"):
+        list(collect(tmp_path, TINY, 1, (Pilot(pilot.controller, random_bundle),)))
+    with pytest.raises(ControllerError, match=r"sees 'box-64' .* holds 'raw-96' .*: choose another --picture"):
+        list(collect(tmp_path, replace(TINY, picture=96), 1, (pilot,)))
+    assert not (tmp_path / "episodes").exists()

@@ -1,8 +1,10 @@
 import argparse
+import json
 
+import numpy as np
 import pytest
 
-from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.training.checkpoint import load_config
 from dreamfleet.worker.verbs import collect, train_mdnrnn, train_vae
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -50,3 +52,24 @@ def test_a_set_that_has_more_than_is_asked_for_is_counted_whole(tmp_path, capsys
 def test_a_summary_trains_nothing(tmp_path, capsys, verb, count):
     assert call(verb, "--data", str(tmp_path / "absent"), "--preset", "paper", "--summary") == 0
     assert count in capsys.readouterr().out
+
+
+def test_a_set_goes_on_with_drives_of_controllers(tmp_path, capsys):
+    write_drives(tmp_path, episodes=3, steps=4)
+    flags = ("--episodes", "4", "--jobs", "1", "--steps", "5", "--runs-dir", str(tmp_path))
+    assert call(collect, "--data", str(tmp_path), *flags, "--controller", "tiny", "--noise", "0.1", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["episodes"] == 4
+    with np.load(tmp_path / "episodes" / "000003.npz") as drive:
+        assert (str(drive["driver"]), len(drive["action"])) == ("controller", 5)
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--noise", "0.1"), "give --controller"),
+        (("--from-run", "r", "--controller", "tiny"), "leave --controller out"),
+    ],
+)
+def test_flags_of_controllers_that_do_not_drive_are_refused(tmp_path, flags, said):
+    with pytest.raises(UsageError, match=said):
+        call(collect, "--data", str(tmp_path), *flags)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError, UsageError
-from dreamfleet.worker.inspection.mind import Mind
+from dreamfleet.worker.scoring.mind import Mind
 from dreamfleet.worker.tasks.api import Collected
 from dreamfleet.worker.tasks.policy import Driver
 from dreamfleet.worker.tasks.registry import find_task

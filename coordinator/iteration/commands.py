@@ -1,0 +1,129 @@
+"""The verbs that each phase calls, as words: a function of the settings, of what is finished, and of nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dreamfleet.common.runs import CONTROLLER
+from dreamfleet.common.seeds import VALIDATION
+from dreamfleet.coordinator.iteration.config import IterateConfig, words
+from dreamfleet.coordinator.iteration.layout import Layout
+from dreamfleet.coordinator.iteration.ledger import Ledger
+from dreamfleet.coordinator.iteration.plan import EVOLVE, GATE, MDNRNN, VAE, Phase
+
+Words = tuple[str, ...]
+GATE_SEED = VALIDATION.start + 30_000  # the first track of a gate: no evaluation and no confirmation has it
+GATE_NOISE = 0.3  # the measurements of docs/dreams.md
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Each phase's verbs."""
+
+    config: IterateConfig
+    layout: Layout
+    ledger: Ledger
+
+    def seed(self, phase: Phase) -> int:
+        """What a phase draws its chance from, each round's training and run their own; a gate's is its first track."""
+        ours = self.config.seed + phase.round
+        return {VAE: ours - 1, MDNRNN: ours - 1, EVOLVE: ours, GATE: GATE_SEED}.get(phase.name, self.config.seed)
+
+    def collect(self, number: int) -> Words:
+        """Random drives: those of the first round, or so many more."""
+        more = self.ledger.episodes + self.config.more_drives
+        return self._collect(self.config.drives if number == 1 else more)
+
+    def take(self, number: int) -> Words:
+        """The rollouts that the last round's run kept."""
+        layout = self.layout
+        name = layout.run_name(number - 1)
+        return _spelt("collect", "--data", layout.root, "--from-run", name, "--runs-dir", layout.runs, "--json")
+
+    def drive(self, pilots: Sequence[Path]) -> Words:
+        """Drives of the last round's means, which lie in these files."""
+        wanted = self.ledger.episodes + self.config.own_drives
+        return self._collect(wanted, "--noise", self.config.noise, "--controller", *pilots)
+
+    def train(self, number: int, model: str) -> Words:
+        """The training of `vae` or `mdnrnn`: from nothing, or on from the world model that counts."""
+        config, seed = self.config, self.seed(Phase(number, model))
+        common = _spelt(
+            "train", model, "--data", self.layout.round(number), "--preset", config.preset, "--device", config.device,
+            "--seed", seed, *words(f"{model}_flags", getattr(config, f"{model}_flags")), "--json",
+        )  # fmt: skip
+        if number == 1:
+            return common
+        before = self.layout.checkpoint(self.ledger.kept(number - 1), model)
+        updates = getattr(config, f"{model}_updates")
+        kept = ("--decoder-only",) if model == "vae" and config.vae == "decoder" else ()
+        return (*common, *_spelt("--updates", updates, "--continue-from", before, *kept))
+
+    def tried(self, model: str) -> Words:
+        """The same without training anything: whether its flags are of the verb."""
+        return (*self.train(1, model), "--summary")
+
+    def encode(self, number: int) -> Words:
+        """Latents of all drives."""
+        return _spelt("encode", "--data", self.layout.round(number), "--json")
+
+    def bundle(self, number: int) -> Words:
+        """A round's models as one file."""
+        return _spelt("bundle", "--data", self.layout.round(number), "--out", self.layout.bundle(number), "--json")
+
+    def gate(self, number: int) -> dict[str, dict[str, Words]]:
+        """What is measured of the `old` and the `new` world model: `probe`, `losses`, or both.
+
+        Both are watched on the same drives of the last round's optimum. In dreams of losses it has to drive by the
+        model that dreams, so there the new one has the same parameters to itself.
+        """
+        config, layout = self.config, self.layout
+        optimum = layout.run(number - 1) / CONTROLLER
+        sides = {"old": (layout.bundle(self.ledger.kept(number - 1)), optimum),
+                 "new": (layout.bundle(number), layout.moved(number))}  # fmt: skip
+        found: dict[str, dict[str, Words]] = {side: {} for side in sides}
+        for side, (bundle, driver) in sides.items():
+            if config.gate_drives:
+                found[side]["probe"] = _measure(bundle, "--probe", optimum, config.gate_drives)
+            if config.gate_losses and config.vae != "whole":
+                found[side]["losses"] = _measure(bundle, "--losses", driver, config.gate_losses)
+        return found
+
+    def begin_run(self, number: int, listen: Sequence[str], more: Sequence[str], start: Path | None) -> Words:
+        """A round's evolution; `more` are flags that stand before those of the run."""
+        layout = self.layout
+        begun = () if start is None else ("--init", start)
+        return (
+            *_spelt("coordinator", *more, *words("run_flags", self.config.run_flags)),
+            *_spelt("--run", layout.run_name(number), "--bundle", layout.bundle(self.ledger.kept(number)),
+                    "--seed", self.seed(Phase(number, EVOLVE)), *begun, *self._reached(listen)),
+        )  # fmt: skip
+
+    def resume_run(self, number: int, listen: Sequence[str]) -> Words:
+        """The same evolution, continued."""
+        return _spelt("coordinator", "--resume", self.layout.run_name(number), *self._reached(listen))
+
+    def _reached(self, listen: Sequence[str]) -> Words:
+        return _spelt("--runs-dir", self.layout.runs, "--json", "--listen", *listen)
+
+    def _collect(self, episodes: int | None, *more: object) -> Words:
+        config = self.config
+        chosen = {"--episodes": episodes, "--steps": config.drive_steps, "--jobs": config.jobs}
+        said = [word for flag, value in chosen.items() if value is not None for word in (flag, value)]
+        return _spelt(
+            "collect", "--data", self.layout.root, "--preset", config.preset, "--seed", config.seed, *said, *more,
+            "--json",
+        )  # fmt: skip
+
+
+def _measure(bundle: Path, figure: str, controller: Path, episodes: int) -> Words:
+    return _spelt(
+        "inspect", bundle, figure, "--controller", controller, "--episodes", episodes, "--seed", GATE_SEED,
+        "--noise", GATE_NOISE, "--json",
+    )  # fmt: skip
+
+
+def _spelt(*told: object) -> Words:
+    return tuple(map(str, told))

@@ -1,0 +1,72 @@
+"""What an iteration is; what of it may change while it is under way."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from typing import Literal
+
+from dreamfleet.common.config import option
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.presets import check_preset, preset_help
+
+# They change no round that is finished, nor what it means; what `--run-flags` lead to is compared instead of them.
+HARMLESS = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
+LEAST = {
+    "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
+    "mdnrnn_updates": 1, "gate_drives": 0, "gate_losses": 0, "seed": 0, "local": 0, "jobs": 1,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class IterateConfig:
+    """How many rounds, and what each drives, learns, dreams and is held to."""
+
+    rounds: int = option(5, "rounds in all: each makes a world model and evolves in its dream; more may follow later")
+    preset: str = option("tiny", preset_help("training"))
+    drives: int | None = option(None, "random drives that the first world model learns from (default the preset's)")
+    more_drives: int = option(0, "random drives that each later round adds")
+    own_drives: int = option(80, "drives of the last round's own means that each later round adds")
+    means: int = option(4, "means that drive these: the one that the run reports, then its best evaluated ones")
+    noise: float = option(0.3, "on the actions of these drives, in halves of an action's range")
+    drive_steps: int | None = option(None, "steps of a drive at most (default the preset's)")
+    vae: Literal["decoder", "whole", "keep"] = option(
+        "decoder", "what of the VAE learns on in later rounds; after `whole` no earlier controller fits"
+    )
+    vae_updates: int = option(1800, "updates of the VAE in each later round")
+    mdnrnn_updates: int = option(600, "updates of the MDN-RNN in each later round")
+    vae_flags: str = option("", 'flags of `train vae` in every round, as one text: "--updates 900 --batch 50"')
+    mdnrnn_flags: str = option("", "flags of `train mdnrnn` in every round")
+    run_flags: str = option(
+        "--generations 32", "flags of each round's `coordinator`, whose preset is dream unless another is named"
+    )
+    go_on: bool = option(False, "begin each evolution at the last round's optimum instead of at zero")
+    gate_drives: int = option(20, "drives of `inspect --probe` that a new world model is held to the old by; 0: none")
+    gate_losses: int = option(30, "losses of `inspect --losses` that it is held to it by; 0: none")
+    seed: int = option(0, "makes the iteration: drives, training, populations and tracks follow from it")
+    local: int | None = option(None, "scoring processes here (default one a core, or none where --listen is given)")
+    jobs: int | None = option(None, "processes that drive for the data set here (default one a core)")
+    device: str = option("cpu", "that trains: cpu, cuda, or auto")
+
+    def __post_init__(self) -> None:
+        for name, least in LEAST.items():
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {value}")
+        check_preset("training", self.preset)
+        if not 0 <= self.noise <= 10:
+            raise UsageError(f"--noise must be from 0 to 10, not {self.noise}")
+        if self.gate_drives == 1 or 0 < self.gate_losses < 4:
+            raise UsageError("--gate-drives must be 0 or at least 2, --gate-losses 0 or at least 4")
+        if self.go_on and self.vae == "whole":
+            raise UsageError("--go-on begins with a controller, and another encoder fits none: leave --vae whole out")
+        for name in ("vae_flags", "mdnrnn_flags", "run_flags"):
+            words(name, getattr(self, name))
+
+
+def words(name: str, text: str) -> tuple[str, ...]:
+    """Flags that were given as one text; `UsageError` if its quotes do not match."""
+    try:
+        return tuple(shlex.split(text))
+    except ValueError as error:
+        raise UsageError(f"--{name.replace('_', '-')} {text!r}: {error}") from error

@@ -1,0 +1,77 @@
+"""Where everything of an iteration lies in its folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+EPISODES, ENCODED = "episodes", "encoded"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The folder: one data set of all drives, a folder a round with its models, and the rounds' runs.
+
+    A round's folder is a data folder of its own for the verbs that train: it leads to the drives by links.
+    """
+
+    root: Path
+
+    @property
+    def ledger(self) -> Path:
+        """What is finished."""
+        return self.root / "iteration.json"
+
+    @property
+    def lock(self) -> Path:
+        """Held by whoever works here."""
+        return self.root / "iteration.lock"
+
+    @property
+    def runs(self) -> Path:
+        """The rounds' runs."""
+        return self.root / "runs"
+
+    def round(self, number: int) -> Path:
+        """A round's models."""
+        return self.root / "rounds" / f"{number:02d}"
+
+    def log(self, number: int, name: str) -> Path:
+        """What a verb of a round said."""
+        return self.round(number) / "logs" / f"{name}.log"
+
+    def bundle(self, number: int) -> Path:
+        """A round's frozen world model."""
+        return self.round(number) / f"round-{number}.zip"
+
+    def checkpoint(self, number: int, model: str) -> Path:
+        """The weights that a round's training of `vae` or `mdnrnn` ended with."""
+        return self.round(number) / f"{model}.safetensors"
+
+    def run_name(self, number: int) -> str:
+        """Of a round's evolution."""
+        return f"round-{number:02d}"
+
+    def run(self, number: int) -> Path:
+        """The folder of a round's evolution."""
+        return self.runs / self.run_name(number)
+
+    def means(self, number: int) -> Path:
+        """The means of a round's run that drive for the next one, beside the world model that they see."""
+        return self.round(number) / "means"
+
+    def measured(self, number: int) -> Path:
+        """The figures of a round's gate, as they were measured."""
+        return self.round(number) / "gate.json"
+
+    def moved(self, number: int) -> Path:
+        """The last round's optimum, as a controller of this round's new world model."""
+        return self.round(number) / "moved.npz"
+
+    def start(self, number: int) -> Path:
+        """Where a round's evolution begins, if not at zero."""
+        return self.round(number) / "start.npz"
+
+    def relative(self, path: Path) -> str:
+        """A path below the folder, as the ledger writes it."""
+        return path.relative_to(self.root).as_posix()

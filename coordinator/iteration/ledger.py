@@ -1,0 +1,155 @@
+"""What of an iteration is finished, in one file: each phase with what it made, figures, commands and seed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.codec import MalformedError, from_plain
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.files import read_text, write_aside
+from dreamfleet.coordinator.iteration.config import HARMLESS, IterateConfig
+from dreamfleet.coordinator.iteration.plan import BUNDLE, GATE, Phase
+
+FORMAT = 1
+MOST_BYTES = 256 << 20
+
+
+@dataclass(frozen=True)
+class Made:
+    """A file that a phase made: its path below the folder, and its SHA-256."""
+
+    path: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A finished phase: `seed` made it, `seconds` of its last attempt, `at` when it was finished (ISO 8601, UTC)."""
+
+    round: int
+    phase: str
+    seed: int
+    seconds: float
+    at: str
+    commands: tuple[tuple[str, ...], ...] = ()
+    figures: dict[str, Any] = field(default_factory=dict)
+    made: tuple[Made, ...] = ()
+
+    @property
+    def of(self) -> Phase:
+        """The phase."""
+        return Phase(self.round, self.phase)
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """The settings that an iteration was begun with, those of its runs, and what is finished, oldest first."""
+
+    settings: dict[str, Any]
+    run: dict[str, Any]
+    entries: tuple[Entry, ...] = ()
+    format: int = FORMAT
+
+    @classmethod
+    def begin(cls, config: IterateConfig, run: Mapping[str, Any]) -> Ledger:
+        """Of an iteration that has done nothing yet."""
+        return cls(asdict(config), _plain(run))
+
+    @property
+    def finished(self) -> tuple[Phase, ...]:
+        """The finished phases, in order."""
+        return tuple(each.of for each in self.entries)
+
+    def entry(self, number: int, phase: str) -> Entry | None:
+        """A finished phase of a round; `None` if it is not."""
+        return next((each for each in self.entries if each.of == (number, phase)), None)
+
+    def kept(self, number: int) -> int:
+        """The round whose world model counts after so many rounds: the last one that no gate refused."""
+        built = (each.round for each in self.entries if each.phase == BUNDLE and each.round <= number)
+        return max(each for each in built if self.passed(each))
+
+    def passed(self, number: int) -> bool:
+        """Whether a round's new world model was kept; one that was held to none is."""
+        gate = self.entry(number, GATE)
+        return gate is None or bool(gate.figures["kept"])
+
+    @property
+    def episodes(self) -> int:
+        """Drives that the data set holds."""
+        return next((int(each.figures["episodes"]) for each in reversed(self.entries) if "episodes" in each.figures), 0)
+
+    @property
+    def files(self) -> frozenset[str]:
+        """All that was made."""
+        return frozenset(made.path for each in self.entries for made in each.made)
+
+    def add(self, entry: Entry) -> Ledger:
+        """With one more phase."""
+        return replace(self, entries=(*self.entries, entry))
+
+    def before(self, phase: Phase) -> Ledger:
+        """As it was before a finished phase."""
+        return replace(self, entries=self.entries[: self.finished.index(phase)])
+
+    def take(self, config: IterateConfig, run: Mapping[str, Any], folder: Path) -> Ledger:
+        """With what may change; `UsageError` names what was begun otherwise and may not."""
+        wanted = asdict(config)
+        differing = [*_differing(self.settings, wanted, HARMLESS), *_differing(self.run, run)]
+        if differing:
+            raise UsageError(
+                f"{folder} was begun with {'; '.join(differing)}: leave that out, or begin in another --data"
+            )
+        return replace(self, settings=wanted)
+
+    def to_json(self) -> str:
+        """The file's text."""
+        return json.dumps(asdict(self), indent=1, default=str) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Ledger:
+        """Read what `to_json` wrote; `ValueError`, `TypeError` or `MalformedError` if it is damaged."""
+        found: Ledger = from_plain(cls, json.loads(text))
+        if found.format != FORMAT:
+            raise ValueError(f"it is of format {found.format}; this version reads {FORMAT}")
+        known = {each.name for each in fields(IterateConfig)}
+        if unknown := sorted(set(found.settings) - known):
+            raise ValueError(f"it has settings that this version does not know: {', '.join(unknown)}")
+        IterateConfig(**found.settings)
+        return found
+
+    def save(self, path: Path) -> None:
+        """Write it, whole or not at all."""
+        try:
+            with write_aside(path) as file:
+                file.write(self.to_json().encode())
+        except OSError as error:
+            raise DatasetError(f"cannot write {path}: {error.strerror}; make room, or choose another --data") from error
+
+    @classmethod
+    def load(cls, path: Path) -> Ledger | None:
+        """The folder's ledger; `None` if it has none, `DatasetError` if it is damaged."""
+        try:
+            return cls.from_json(read_text(path, MOST_BYTES))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError, RecursionError, MalformedError, UsageError) as error:
+            raise DatasetError(f"{path} is damaged ({error}); put it back from a copy") from error
+
+
+def _differing(begun: Mapping[str, Any], wanted: Mapping[str, Any], free: frozenset[str] = frozenset()) -> list[str]:
+    """What has another value, in words; compared as JSON keeps it."""
+    return [
+        f"{name} {begun.get(name)}, not {value}"
+        for name, value in _plain(wanted).items()
+        if name not in free and begun.get(name) != value
+    ]
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
+    return plain

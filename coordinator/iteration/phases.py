@@ -1,0 +1,215 @@
+"""Doing a phase: its verbs called, what it made and measured told. Again after a kill, it goes on or ends the same."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files import is_there, write_aside
+from dreamfleet.common.runs import BUNDLE as RUN_BUNDLE
+from dreamfleet.common.runs import CONTROLLER, JOURNAL, RunFolder, open_run
+from dreamfleet.common.stopping import Stop
+from dreamfleet.common.stored import StoredEvaluation, best_of
+from dreamfleet.coordinator.iteration import artefacts, gate
+from dreamfleet.coordinator.iteration.commands import Commands, Words
+from dreamfleet.coordinator.iteration.evolving import Crew, evolve
+from dreamfleet.coordinator.iteration.layout import ENCODED, EPISODES
+from dreamfleet.coordinator.iteration.plan import (
+    BUNDLE,
+    COLLECT,
+    DRIVE,
+    ENCODE,
+    EVOLVE,
+    GATE,
+    MDNRNN,
+    TAKE,
+    VAE,
+    Phase,
+)
+
+log = logging.getLogger("dreamfleet.coordinator.iterate")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a phase called, told and made."""
+
+    commands: tuple[Words, ...] = ()
+    figures: dict[str, Any] | None = None
+    made: tuple[Path, ...] = ()
+
+
+class Phases:
+    """The phases of an iteration at one moment of it: `commands` knows what is finished."""
+
+    def __init__(self, commands: Commands, crew: Callable[[], Crew], ask: Callable[[Words, Path], Any], stop: Stop):
+        """`ask` runs a verb to its end, logging to a path, and returns its JSON answer."""
+        self._commands, self._crew, self._ask, self._stop = commands, crew, ask, stop
+        self._layout, self._ledger, self._config = commands.layout, commands.ledger, commands.config
+
+    def do(self, phase: Phase) -> Outcome:
+        """Do it, or do what is left of it."""
+        number = phase.round
+        self._lay_out(number)
+        done: dict[str, Callable[[int], Outcome]] = {
+            COLLECT: self._collect, TAKE: self._take, DRIVE: self._drive, VAE: self._vae, ENCODE: self._encode,
+            MDNRNN: self._mdnrnn, BUNDLE: self._bundle, GATE: self._gate, EVOLVE: self._evolve,
+        }  # fmt: skip
+        return done[phase.name](number)
+
+    def _lay_out(self, number: int) -> None:
+        """The round's folder, which leads to the one data set."""
+        folder = self._layout.round(number)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (EPISODES, ENCODED):
+            (self._layout.root / name).mkdir(exist_ok=True)
+            if not is_there(folder / name):
+                (folder / name).symlink_to(Path("..", "..", name), target_is_directory=True)
+
+    def _call(self, number: int, name: str, words: Words) -> Any:
+        return self._ask(words, self._layout.log(number, name))
+
+    def _collect(self, number: int) -> Outcome:
+        return self._drives(number, COLLECT, self._commands.collect(number))
+
+    def _take(self, number: int) -> Outcome:
+        return self._drives(number, TAKE, self._commands.take(number))
+
+    def _drive(self, number: int) -> Outcome:
+        pilots = sorted(self._layout.means(number - 1).glob("[0-9]*.npz"))
+        return self._drives(number, DRIVE, self._commands.drive(pilots))
+
+    def _drives(self, number: int, name: str, words: Words) -> Outcome:
+        told, known = self._call(number, name, words), self._ledger.files
+        new = [path for path in artefacts.drives(self._layout) if self._layout.relative(path) not in known]
+        return Outcome((words,), {"episodes": told["episodes"], "new": len(new)}, tuple(new))
+
+    def _vae(self, number: int) -> Outcome:
+        if number == 1 or self._config.vae != "keep":
+            return self._train(number, VAE)
+        before, path = (self._layout.checkpoint(each, VAE) for each in (self._ledger.kept(number - 1), number))
+        with before.open("rb") as source, write_aside(path) as target:
+            shutil.copyfileobj(source, target)
+        return Outcome(made=(path,))
+
+    def _mdnrnn(self, number: int) -> Outcome:
+        return self._train(number, MDNRNN)
+
+    def _train(self, number: int, model: str) -> Outcome:
+        words = self._commands.train(number, model)
+        return Outcome((words,), self._call(number, model, words), (self._layout.checkpoint(number, model),))
+
+    def _encode(self, number: int) -> Outcome:
+        words = self._commands.encode(number)
+        self._call(number, ENCODE, words)
+        return Outcome((words,))
+
+    def _bundle(self, number: int) -> Outcome:
+        words = self._commands.bundle(number)
+        told = self._call(number, BUNDLE, words)
+        provenance = Bundle.open(self._layout.bundle(number)).manifest.provenance
+        facts = {name: provenance[name] for name in ("frames", "quality")}
+        return Outcome((words,), {"sha256": told["sha256"], **facts}, (self._layout.bundle(number),))
+
+    def _gate(self, number: int) -> Outcome:
+        moved, measured = self._layout.moved(number), self._layout.measured(number)
+        self._move(number - 1, number, moved)
+        commands = self._commands.gate(number)
+        told = {side: {what: self._measure(number, f"{side}-{what}", words) for what, words in each.items()}
+                for side, each in commands.items()}  # fmt: skip
+        _write_json(measured, told)
+        figures = {side: gate.figures(each) for side, each in told.items()}
+        verdict = gate.judge(figures["old"], figures["new"])
+        plain = {side: {name: each and asdict(each) for name, each in found.items()} for side, found in figures.items()}
+        words = tuple(words for each in commands.values() for words in each.values())
+        return Outcome(words, {**plain, **asdict(verdict)}, (moved, measured))
+
+    def _measure(self, number: int, name: str, words: Words) -> dict[str, Any]:
+        """What `inspect` tells; drives that lose too few roads, or all of them at once, tell nothing."""
+        try:
+            return dict(self._call(number, f"gate-{name}", words))
+        except UsageError as error:
+            return {"failed": str(error)}
+
+    def _evolve(self, number: int) -> Outcome:
+        layout, name = self._layout, self._layout.run_name(number)
+        words: tuple[Words, ...] = ()
+        if not self._ended(number):
+            crew = self._crew()
+            log.info("run %s is reached at %s", name, ", ".join(crew.listen))
+            words = (self._run_words(number, crew),)
+            evolve(words[0], name, crew, layout.round(number) / "logs", self._stop)
+        with open_run(layout.runs, name) as run:
+            pilots, means = self._pilots(run, layout.means(number))
+            told = _told(run)
+        made = [layout.run(number) / each for each in (RUN_BUNDLE, CONTROLLER)]
+        return Outcome(words, {**told, "means": means}, (*made, *pilots))
+
+    def _ended(self, number: int) -> bool:
+        if not is_there(self._layout.run(number) / JOURNAL):
+            return False
+        with open_run(self._layout.runs, self._layout.run_name(number)) as run:
+            return run.ended is not None
+
+    def _run_words(self, number: int, crew: Crew) -> Words:
+        if is_there(self._layout.run(number) / JOURNAL):
+            return self._commands.resume_run(number, crew.listen)
+        start = None
+        if self._config.go_on and number > 1:
+            start = self._layout.start(number)
+            self._move(number - 1, self._ledger.kept(number), start)
+        return self._commands.begin_run(number, crew.listen, crew.coordinator, start)
+
+    def _move(self, run: int, model: int, path: Path) -> None:
+        """Write the optimum of a round's run as a controller of another round's world model, of the same encoder."""
+        optimum = Controller.load(self._layout.run(run) / CONTROLLER)
+        bundle = Bundle.open(self._layout.bundle(model))
+        replace(optimum, bundle=bundle.sha256, provenance={"moved_from": optimum.bundle}).save(path)
+
+    def _pilots(self, run: RunFolder, folder: Path) -> tuple[list[Path], list[int]]:
+        """The means that drive for the next round, as files beside a link to their world model; their generations."""
+        folder.mkdir(parents=True, exist_ok=True)
+        if not is_there(folder / RUN_BUNDLE):
+            (folder / RUN_BUNDLE).symlink_to(Path("..", "..", "..", *run.bundle_path.parts[-3:]))
+        reported = Controller.load(run.controller_path)
+        told = reported.provenance.get("generation")
+        others = best_others(run.evaluations(), told, self._config.means - 1)
+        vectors = [reported.parameters, *(run.evaluated(each) for each in others)]
+        paths = [folder / f"{row}.npz" for row in range(len(vectors))]
+        for path, vector in zip(paths, vectors, strict=True):
+            replace(reported, parameters=vector, provenance={}).save(path)
+        return paths, [int(told or 0), *others]
+
+
+def best_others(evaluations: Iterable[StoredEvaluation], reported: int | None, count: int) -> list[int]:
+    """The generations of the best evaluated means beside the reported one's, best first; of equals the first."""
+    others = [each for each in evaluations if each.generation != reported]
+    return [each.generation for each in sorted(others, key=lambda each: (-each.mean, each.generation))[:count]]
+
+
+def _told(run: RunFolder) -> dict[str, Any]:
+    history = run.history()
+    steps = sum(each.steps for each in history)
+    return {"run": run.name, "ended": run.ended, "generations": len(history), "steps": steps, "score": _score(run)}
+
+
+def _score(run: RunFolder) -> dict[str, Any] | None:
+    confirmed = run.confirmation()
+    judged = confirmed or best_of(run.evaluations())
+    if judged is None:
+        return None
+    facts = {"generation": judged.generation, "episodes": judged.episodes, "confirmed": confirmed is not None}
+    return {"mean": judged.mean, "error": judged.error, **facts}
+
+
+def _write_json(path: Path, content: Any) -> None:
+    with write_aside(path) as file:
+        file.write(json.dumps(content, indent=1).encode())

@@ -1,0 +1,59 @@
+"""A verb of a phase, run to its end: heard as JSON, logged, and ended with us."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
+from dreamfleet.common.processes import Child, leash
+from dreamfleet.common.stopping import Stop
+
+LOOK = 0.2  # seconds between looks at whether to stop
+LEAVE = 15.0  # seconds that a verb has to leave when asked: an update of a training may take some
+
+
+def wait(child: Child, stop: Stop, look: Callable[[], None] = lambda: None) -> None:
+    """Until it has ended; `StoppedError` as soon as `stop` says so, and whatever `look` raises meanwhile."""
+    while child.popen.poll() is None:
+        if stop():
+            raise StoppedError("stopped")
+        look()
+        try:
+            child.popen.wait(LOOK)
+        except subprocess.TimeoutExpired:
+            continue
+
+
+def ask(words: Sequence[str], log: Path, stop: Stop) -> Any:
+    """What a verb answers as JSON; the rest is as in `run`."""
+    return json.loads(run(words, log, stop).splitlines()[-1])
+
+
+def run(words: Sequence[str], log: Path, stop: Stop) -> str:
+    """What a verb answers; what it says besides goes to `log`.
+
+    A wrong command is a `UsageError`, any other failure a `DreamfleetError`, with its last words.
+    """
+    child = Child(*words, inside=leash())
+    try:
+        wait(child, stop)
+        code, out = child.finish()
+    finally:
+        child.end(LEAVE)
+        _keep(log, child.lines)
+    if code == 0:
+        return out
+    if code == StoppedError.exit_code:
+        raise StoppedError(f"{words[0]} was told to stop")
+    if code == UsageError.exit_code:
+        raise UsageError(child.last_words())
+    raise DreamfleetError(f"{child.last_words()} ({words[0]} left with {code}; its words are in {log})")
+
+
+def _keep(log: Path, lines: Sequence[str]) -> None:
+    log.parent.mkdir(parents=True, exist_ok=True)
+    log.write_text("".join(lines))

@@ -1,0 +1,103 @@
+"""What an iteration came to: a line a phase, a row a round."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dreamfleet.coordinator.iteration.gate import KNOWS, LOSES
+from dreamfleet.coordinator.iteration.layout import Layout
+from dreamfleet.coordinator.iteration.ledger import Entry, Ledger
+from dreamfleet.coordinator.iteration.plan import BUNDLE, DATA, EVOLVE, GATE, MDNRNN, VAE
+
+SHOWN = {  # figures of training, as `train` names them
+    VAE: ("reconstruction_error", "active_latents"),
+    MDNRNN: ("nats_per_dimension", "reward_auc", "reward_rmse"),
+}
+
+
+def line(entry: Entry) -> str:
+    """A finished phase: its round, what, how long, and what came out."""
+    return f"round {entry.round}  {entry.phase:<7} {_seconds(entry.seconds):>8}  {outcome(entry)}".rstrip()
+
+
+def outcome(entry: Entry) -> str:
+    """What came out of a phase, in a few words."""
+    figures = entry.figures
+    if entry.phase in DATA:
+        return f"{figures['new']} drives, {figures['episodes']} in all"
+    if entry.phase in SHOWN:
+        return ", ".join(f"{name} {figures[name]}" for name in SHOWN[entry.phase] if name in figures)
+    if entry.phase == BUNDLE:
+        return f"{figures['sha256'][:12]}, of {figures['frames']} frames"
+    if entry.phase == GATE:
+        return str(figures["why"])
+    if entry.phase == EVOLVE:
+        return f"{figures['generations']} generations, ended after {figures['ended']}; {score(figures['score'])}"
+    return ""
+
+
+def score(told: Mapping[str, Any] | None) -> str:
+    """A run's best mean in reality."""
+    if told is None:
+        return "not evaluated"
+    return f"{told['mean']:.0f} ± {told['error']:.0f} ({told['episodes']})" + ("" if told["confirmed"] else "?")
+
+
+def rounds(layout: Layout, ledger: Ledger) -> list[dict[str, Any]]:
+    """A row a round that was begun, for programs."""
+    return [_round(layout, ledger, number) for number in sorted({each.round for each in ledger.entries})]
+
+
+def rows(told: list[dict[str, Any]]) -> list[dict[str, object]]:
+    """The same rows for people: drives, the model's figures, the gate, the best mean in reality."""
+    return [
+        {
+            "round": each["round"], "drives": each["drives"], "frames": each["frames"],
+            "nats": each["quality"].get("nats_per_dimension"), "reward AUC": each["quality"].get("reward_auc"),
+            KNOWS: _figure(each["gate"], KNOWS), LOSES: _figure(each["gate"], LOSES),
+            "model": _kept(each["gate"]), "best evaluation": each["score"] and score(each["score"]),
+        }
+        for each in told
+    ]  # fmt: skip
+
+
+def best(told: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """The round whose mean scored best; of equals the first. `None`: none was evaluated."""
+    scored = [each for each in told if each["score"] is not None]
+    return max(scored, key=lambda each: each["score"]["mean"], default=None)
+
+
+def _round(layout: Layout, ledger: Ledger, number: int) -> dict[str, Any]:
+    bundle, gate, run = (_figures(ledger, number, phase) for phase in (BUNDLE, GATE, EVOLVE))
+    data = [each.figures["episodes"] for each in ledger.entries if each.round <= number and each.phase in DATA]
+    return {
+        "round": number,
+        "drives": data[-1] if data else 0,
+        "frames": bundle.get("frames"),
+        "quality": bundle.get("quality", {}),
+        "bundle": str(layout.bundle(number)) if bundle else None,
+        "sha256": bundle.get("sha256"),
+        "gate": gate or None,
+        "evolved_in": ledger.kept(number) if run else None,
+        "score": run.get("score"),
+        "controller": str(layout.run(number) / "controller.npz") if run else None,
+    }
+
+
+def _figures(ledger: Ledger, number: int, phase: str) -> dict[str, Any]:
+    entry = ledger.entry(number, phase)
+    return entry.figures if entry else {}
+
+
+def _figure(gate: Mapping[str, Any] | None, name: str) -> str | None:
+    found = gate and gate["new"].get(name)
+    return f"{found['value']:.2f} ± {found['error']:.2f}" if found else None
+
+
+def _kept(gate: Mapping[str, Any] | None) -> str:
+    return "kept" if gate is None or gate["kept"] else "refused"
+
+
+def _seconds(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 600 else f"{seconds / 60:.0f} min"

@@ -1,0 +1,81 @@
+"""The verbs of each phase, as words."""
+
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.coordinator.iteration.commands import Commands
+from dreamfleet.coordinator.iteration.config import IterateConfig
+from dreamfleet.coordinator.iteration.layout import Layout
+from dreamfleet.coordinator.iteration.plan import Phase
+from tests.coordinator.iteration.test_ledger import entry, ledger
+
+LAYOUT = Layout(Path("data"))
+ROUND_2 = (entry(1, "collect", episodes=620), entry(1, "bundle"), entry(1, "evolve"))
+
+
+def commands(*entries, **changes):
+    return Commands(IterateConfig(**changes), LAYOUT, ledger(*entries))
+
+
+def said(words):
+    return " ".join(words)
+
+
+def test_the_first_round_takes_the_presets_amounts():
+    first = commands(vae_flags="--batch 50")
+    assert said(first.collect(1)) == "collect --data data --preset tiny --seed 0 --json"
+    assert said(first.train(1, "vae")) == (
+        "train vae --data data/rounds/01 --preset tiny --device cpu --seed 0 --batch 50 --json"
+    )
+    assert said(first.tried("vae")) == said(first.train(1, "vae")) + " --summary"
+
+
+def test_each_round_trains_and_evolves_by_chance_of_its_own_on_one_data_set():
+    told = commands(seed=5)
+    assert [told.seed(Phase(1, name)) for name in ("collect", "vae", "mdnrnn", "evolve")] == [5, 5, 5, 6]
+    assert [told.seed(Phase(3, name)) for name in ("drive", "vae", "mdnrnn", "gate", "evolve")] == [5, 7, 7, 50_000, 8]
+
+
+def test_later_rounds_add_drives_to_those_that_there_are():
+    later = commands(*ROUND_2, more_drives=580, drive_steps=300, jobs=2)
+    assert "--episodes 1200 --steps 300 --jobs 2" in said(later.collect(2))
+    drive = said(commands(*ROUND_2, own_drives=80, noise=0.2).drive([Path("0.npz"), Path("1.npz")]))
+    assert drive.endswith("--episodes 700 --noise 0.2 --controller 0.npz 1.npz --json")
+    assert said(later.take(2)) == "collect --data data --from-run round-01 --runs-dir data/runs --json"
+
+
+@pytest.mark.parametrize(("vae", "decoder_only"), [("decoder", True), ("whole", False)])
+def test_later_training_goes_on_from_the_model_that_counts(vae, decoder_only):
+    later = commands(*ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), vae=vae)
+    words = later.train(3, "vae")
+    assert "--seed 2" in said(words)
+    assert "--updates 1800 --continue-from data/rounds/01/vae.safetensors" in said(words)
+    assert ("--decoder-only" in words) == decoder_only
+    assert "--decoder-only" not in later.train(3, "mdnrnn")
+
+
+def test_both_models_are_measured_on_the_same_drives_and_tracks():
+    gate = commands(*ROUND_2, entry(2, "bundle")).gate(2)
+    old, new = (said(gate[side]["probe"]) for side in ("old", "new"))
+    assert old.startswith("inspect data/rounds/01/round-1.zip --probe --controller data/runs/round-01/controller.npz")
+    assert new == old.replace("rounds/01/round-1", "rounds/02/round-2")
+    assert "--controller data/rounds/02/moved.npz --episodes 30 --seed 50000" in said(gate["new"]["losses"])
+    assert "--controller data/runs/round-01/controller.npz" in said(gate["old"]["losses"])
+
+
+def test_a_controller_that_another_encoder_does_not_fit_dreams_no_losses():
+    gate = commands(*ROUND_2, entry(2, "bundle"), vae="whole").gate(2)
+    assert [list(each) for each in gate.values()] == [["probe"], ["probe"]]
+
+
+def test_a_round_evolves_in_the_model_that_counts_with_a_seed_of_its_own():
+    refused = commands(*ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), run_flags="--generations 3")
+    words = said(refused.begin_run(2, ("tcp/127.0.0.1:7000",), ("--preset", "dream"), Path("start.npz")))
+    assert words == (
+        "coordinator --preset dream --generations 3 --run round-02 --bundle data/rounds/01/round-1.zip --seed 2 "
+        "--init start.npz --runs-dir data/runs --json --listen tcp/127.0.0.1:7000"
+    )
+    assert said(refused.resume_run(2, ("tcp/127.0.0.1:7000",))) == (
+        "coordinator --resume round-02 --runs-dir data/runs --json --listen tcp/127.0.0.1:7000"
+    )

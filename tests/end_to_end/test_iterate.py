@@ -1,0 +1,287 @@
+"""Two rounds of world models and evolutions, seconds long each, left alone and killed."""
+
+import json
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+from threading import Event
+
+import pytest
+
+from dreamfleet.common.bundle import Bundle, find_bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.runs import open_run
+from dreamfleet.common.stopping import never
+from dreamfleet.coordinator.iteration.commands import Commands
+from dreamfleet.coordinator.iteration.config import IterateConfig
+from dreamfleet.coordinator.iteration.layout import Layout
+from dreamfleet.coordinator.iteration.ledger import Entry, Ledger
+from dreamfleet.coordinator.iteration.phases import Phases
+from dreamfleet.coordinator.iteration.plan import Phase
+from dreamfleet.coordinator.iteration.process import ask
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import write_random_bundle
+from tests.support.processes import processes_in
+
+pytestmark = pytest.mark.timeout(600)
+SECONDS = 300  # that an iteration may take
+SMALL = (
+    "--rounds", 2, "--drives", 3, "--drive-steps", 12, "--own-drives", 2, "--means", 2, "--jobs", 1, "--local", 1,
+    "--vae-flags", "--updates 3 --batch 8 --latent 4 --channels 2 2 2 2 --validate-every 1", "--vae-updates", 2,
+    "--mdnrnn-flags", "--updates 3 --batch 2 --latent 4 --hidden 4 --validate-every 1", "--mdnrnn-updates", 2,
+    "--run-flags", "--generations 2 --population 4 --episodes 1 --horizon 10 --evaluate-every 1 --evaluation-episodes 1"
+    " --confirm-episodes 0 --collect-every 2 --collect-episodes 1",
+    "--gate-drives", 2, "--gate-losses", 0,
+)  # fmt: skip
+FIRST = ("collect", "vae", "encode", "mdnrnn", "bundle", "evolve")
+SECOND = ("take", "drive", "vae", "encode", "mdnrnn", "bundle", "gate", "evolve")
+PHASES = [*(Phase(1, name) for name in FIRST), *(Phase(2, name) for name in SECOND)]
+
+
+def words(folder, *more):
+    return ("iterate", "--data", folder, *SMALL, *more)
+
+
+def hashes(layout):
+    """Of all that follows from the settings. A run's files name it, a checkpoint's head has its words in any order."""
+    made = [each for entry in Ledger.load(layout.ledger).entries for each in entry.made]
+    return {
+        each.path: each.sha256 for each in made if not each.path.startswith("runs/") and "safetensors" not in each.path
+    }
+
+
+def left(folder):
+    """Command lines of processes that work in the folder."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            line = path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:  # it has just ended
+            continue
+        if str(folder) in line and int(path.parent.name) != os.getpid():
+            found.append(line)
+    return found
+
+
+def until(true, process=None):
+    """Look until it is so; a process that ends meanwhile ends the waiting."""
+    deadline = time.monotonic() + 120
+    while not true():
+        assert time.monotonic() < deadline, "it never came to be"
+        assert process is None or process.popen.poll() is None, process.lines
+        Event().wait(0.01)  # it works on this core too
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Bits are promised on equally many threads; and two of a process of updates this small wait for each other."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "1")
+        yield
+
+
+@pytest.fixture(scope="module")
+def undisturbed(one_thread, tmp_path_factory):
+    """The folder of an iteration that nobody disturbed, and what it answered; read only."""
+    with processes_in(tmp_path_factory.mktemp("iterate")) as processes:
+        layout = Layout(processes.folder / "data")
+        code, out, err = processes.call(*words(layout.root, "--json"), timeout=SECONDS)
+        assert code == 0, err
+        yield layout, json.loads(out), err
+
+
+def test_each_round_makes_a_model_from_all_drives_and_evolves_in_its_dream(undisturbed):
+    layout, told, err = undisturbed
+    ledger = Ledger.load(layout.ledger)
+    assert list(ledger.finished) == PHASES
+    assert [each["drives"] for each in told["rounds"]] == [3, 6]
+    for number in (1, 2):
+        bundle = Bundle.open(layout.bundle(number))
+        assert bundle.manifest.provenance["episodes"] == 3 * number
+        assert bundle.sha256 == told["rounds"][number - 1]["sha256"]
+        assert {"reconstruction_error", "nats_per_dimension"} <= bundle.manifest.provenance["quality"].keys()
+        with open_run(layout.runs, layout.run_name(number)) as run:
+            assert run.spec.task == "dream"
+            assert run.spec.bundle == Bundle.open(layout.bundle(ledger.kept(number))).sha256
+            assert run.settings.seed == number
+            assert told["rounds"][number - 1]["score"]["mean"] == max(each.mean for each in run.evaluations())
+    lines = [line for line in err.splitlines() if line.startswith("round ")]
+    assert [tuple(line.split()[1:3]) for line in lines] == [(str(number), name) for number, name in PHASES]
+
+
+def test_the_encoder_stays_and_what_evolved_drives_for_the_next_model(undisturbed):
+    layout, _, _ = undisturbed
+    one, two = (Bundle.open(layout.bundle(number)) for number in (1, 2))
+    assert one.read("encoder.onnx") == two.read("encoder.onnx")
+    assert one.read("decoder.onnx") != two.read("decoder.onnx")
+    assert one.read("dream.onnx") != two.read("dream.onnx")
+    with open_run(layout.runs, "round-01") as run:
+        reported = Controller.load(run.controller_path)
+        other = next(each for each in (0, 1) if each != reported.provenance["generation"])
+        vectors = [reported.parameters, run.evaluated(other)]
+    for row, vector in enumerate(vectors):
+        pilot = Controller.load(layout.means(1) / f"{row}.npz")
+        assert (pilot.parameters == vector).all()
+        assert pilot.bundle == one.sha256
+    (words,) = Ledger.load(layout.ledger).entry(2, "drive").commands
+    assert f"--noise 0.3 --controller {layout.means(1) / '0.npz'} {layout.means(1) / '1.npz'} " in " ".join(words)
+
+
+def test_a_gate_that_can_measure_nothing_refuses_nothing_and_says_so(undisturbed):
+    layout, _, err = undisturbed
+    gate = Ledger.load(layout.ledger).entry(2, "gate")
+    assert gate.figures["kept"]
+    assert "kept: nothing was measured of both" in err
+    told = json.loads(layout.measured(2).read_text())
+    assert told["old"] == told["new"]
+    assert told["new"]["probe"]["failed"].startswith("a probe needs two drives on the road at least")
+    moved = Controller.load(layout.moved(2))
+    assert moved.bundle == Bundle.open(layout.bundle(2)).sha256
+    assert moved.provenance == {"moved_from": Bundle.open(layout.bundle(1)).sha256}
+
+
+def gate(layout, new, **changes):
+    """The figures of a gate that holds the bundle `new` to `tiny`."""
+    tiny = find_bundle("tiny").path
+    places = {layout.bundle(1): tiny, layout.bundle(2): new, layout.run(1) / "bundle.zip": tiny}
+    for place, source in {**places, layout.run(1) / "controller.npz": tiny.with_suffix(".npz")}.items():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, place)
+    config = IterateConfig(**changes)
+    ledger = Ledger.begin(config, {}).add(Entry(1, "bundle", 0, 0.0, "")).add(Entry(2, "bundle", 0, 0.0, ""))
+    phases = Phases(Commands(config, layout, ledger), None, lambda words, log: ask(words, log, never), never)
+    return phases.do(Phase(2, "gate")).figures
+
+
+def test_a_model_that_knows_clearly_less_is_refused(tmp_path):
+    small = {"vae": VAEConfig(latent=2, channels=(2, 2, 2, 2)), "rnn": MDNRNNConfig(latent=2, hidden=2)}
+    ignorant = write_random_bundle(tmp_path / "ignorant.zip", **small)
+    figures = gate(Layout(tmp_path / "data"), ignorant.path, gate_drives=3, gate_losses=0)
+    assert not figures["kept"]
+    assert figures["old"]["knows"]["value"] > 0.4 > figures["new"]["knows"]["value"]
+    assert figures["why"].endswith("refused, clearly worse in knows")
+
+
+def test_the_same_model_loses_the_road_as_often_on_the_same_drives(tmp_path):
+    figures = gate(Layout(tmp_path / "data"), find_bundle("tiny").path, gate_drives=0, gate_losses=4)
+    assert figures["kept"]
+    assert figures["new"] == figures["old"]
+    assert abs(figures["old"]["loses"]["value"]) <= 1
+
+
+def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undisturbed, processes):
+    layout, told, _ = undisturbed
+    before = layout.ledger.read_bytes()
+    code, out, err = processes.call("iterate", "--data", layout.root)
+    assert code == 0, err
+    assert "14 phases are finished" in err
+    assert out.splitlines()[0].split("\t")[:3] == ["round", "drives", "frames"]
+    assert f"world model: {told['model']}" in out
+    assert layout.ledger.read_bytes() == before
+    for flags, said in (
+        (("--noise", 0.5), "was begun with noise 0.3, not 0.5: leave that out, or begin in another --data"),
+        (("--run-flags", "--generations 3"), "generations 2, not 3"),
+        (("--redo", "3/vae"), "3/vae is not finished"),
+    ):
+        code, _, err = processes.call("iterate", "--data", layout.root, *flags)
+        assert code == 2
+        assert said in err
+    assert layout.ledger.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--run-flags", "--population 4"), "would never end"),
+        (("--run-flags", "--generations 1 --bundle tiny"), "--bundle in --run-flags: each round's run has its own"),
+        (("--run-flags", "--generations 1 --sigma0 -1"), "--sigma0 must be a positive number"),
+        (("--vae-flags", "--updates 0"), "--vae-flags: --updates must be at least 1"),
+        (("--local", 0), "nobody would score"),
+    ],
+)
+def test_what_could_not_work_is_refused_before_anything_is_driven(processes, flags, said):
+    code, _, err = processes.call("iterate", "--data", processes.folder / "data", *flags)
+    assert code == 2
+    assert said in err
+    assert not (processes.folder / "data" / "episodes").exists()
+
+
+def kill(process, layout):
+    """At once; nothing of it works on."""
+    process.popen.send_signal(signal.SIGKILL)
+    process.popen.wait()
+    until(lambda: not left(layout.root))
+
+
+# What is there once a phase is under way.
+BEGUN = {
+    Phase(1, "collect"): "episodes/000000.npz", Phase(1, "vae"): "rounds/01/vae.safetensors",
+    Phase(1, "encode"): "encoded/000000.npz", Phase(1, "mdnrnn"): "rounds/01/mdnrnn.safetensors",
+    Phase(1, "bundle"): "rounds/01", Phase(1, "evolve"): "runs/round-01/journal.sqlite",
+    Phase(2, "take"): "rounds/02", Phase(2, "drive"): "episodes/000004.npz",
+    Phase(2, "vae"): "rounds/02/vae.safetensors", Phase(2, "encode"): "encoded/000003.npz",
+    Phase(2, "mdnrnn"): "rounds/02/mdnrnn.safetensors", Phase(2, "bundle"): "rounds/02/logs/mdnrnn.log",
+    Phase(2, "gate"): "rounds/02/moved.npz", Phase(2, "evolve"): "runs/round-02/journal.sqlite",
+}  # fmt: skip
+
+
+def disturb(processes, layout, phases):
+    """Kill an iteration in the middle of each of these phases and as each is finished, and let it end."""
+    for phase in phases:
+        process = processes.start(*words(layout.root))
+        until(lambda phase=phase: (layout.root / BEGUN[phase]).exists(), process)
+        kill(process, layout)
+        process = processes.start(*words(layout.root))
+        process.wait_for(f"round {phase.round}  {phase.name} ", timeout=120)
+        kill(process, layout)
+    code, out, err = processes.call(*words(layout.root, "--json"), timeout=SECONDS)
+    assert code == 0, err
+    return json.loads(out)
+
+
+def test_killed_it_goes_on_to_the_same_models(undisturbed, processes):
+    whole, told, _ = undisturbed
+    layout = Layout(processes.folder / "data")
+    again = disturb(processes, layout, [Phase(1, "vae"), Phase(1, "evolve"), Phase(2, "drive"), Phase(2, "mdnrnn")])
+    assert hashes(layout) == hashes(whole)
+    assert [each["sha256"] for each in again["rounds"]] == [each["sha256"] for each in told["rounds"]]
+    assert [each["score"] for each in again["rounds"]] == [each["score"] for each in told["rounds"]]
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_killed_in_every_phase_it_goes_on_to_the_same_models(undisturbed, processes):
+    whole, _, _ = undisturbed
+    layout = Layout(processes.folder / "data")
+    disturb(processes, layout, PHASES)
+    assert hashes(layout) == hashes(whole)
+    assert list(Ledger.load(layout.ledger).finished) == PHASES
+
+
+def test_one_iteration_works_in_a_folder_and_ctrl_c_ends_all_that_it_started(processes):
+    layout = Layout(processes.folder / "data")
+    process = processes.start(*words(layout.root))
+    until((layout.root / "episodes").exists, process)
+    code, _, err = processes.call(*words(layout.root))
+    assert code == 2
+    assert f"another iteration works in {layout.root}: stop it first" in err
+    process.popen.send_signal(signal.SIGINT)
+    assert process.finish()[0] == 130
+    assert "what is finished is kept, and goes on with: " in process.last_words()
+    assert not left(layout.root)
+
+
+def test_damage_is_said_and_made_good(undisturbed, processes):
+    whole, _, _ = undisturbed
+    layout = Layout(processes.folder / "data")
+    shutil.copytree(whole.root, layout.root, symlinks=True)
+    layout.bundle(2).write_bytes(b"")
+    code, _, err = processes.call("iterate", "--data", layout.root)
+    assert code == 1
+    assert err.strip().splitlines()[-1].startswith(f"dreamfleet: {layout.bundle(2)} is not what was made: put it back")
+    code, _, err = processes.call("iterate", "--data", layout.root, "--redo", "2/bundle", timeout=SECONDS)
+    assert code == 0, err
+    assert hashes(layout) == hashes(whole)

@@ -1,0 +1,71 @@
+"""Drives under disturbed actions."""
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.bundle import find_bundle
+from dreamfleet.common.shelf import find_controller
+from dreamfleet.worker.scoring.disturbance import Disturbance, pushed
+from dreamfleet.worker.scoring.disturbed import Disturbed
+from dreamfleet.worker.scoring.hand import ControllersHand
+from dreamfleet.worker.scoring.mind import Mind
+
+
+def test_noise_is_as_large_as_is_said_and_touches_no_action_at_its_bound():
+    disturbance = Disturbance(0, STEERING_GAS_BRAKE, 0.3)
+    pushes = np.concatenate([disturbance.next() for _ in range(20_000)])
+    np.testing.assert_allclose(pushes.std(axis=0), [0.3, 0.15, 0.15], rtol=0.1)
+    chosen = np.array([[0.9, 0.0, 1.0], [0.0, 0.5, 0.2]], np.float32)
+    done = pushed(STEERING_GAS_BRAKE, chosen, np.array([[0.3, 0.3, -0.3]], np.float32))
+    np.testing.assert_allclose(done, [[1.0, 0.0, 1.0], [0.3, 0.8, 0.0]], atol=1e-6)
+
+
+class Recorder(Disturbed):
+    """Writes down what is done, and of it the disturbance."""
+
+    def note(self, action, push):
+        self.noted = (*getattr(self, "noted", ()), (action, push))
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return find_bundle("tiny")
+
+
+def driver(tiny, tmp_path, noise, watching=None):
+    controller, _ = find_controller("tiny", tmp_path)
+    mind = Mind(tiny)
+    return mind, Recorder(ControllersHand(controller, tiny, mind), Disturbance(3, STEERING_GAS_BRAKE, noise), watching)
+
+
+def pictures(count):
+    return np.random.default_rng(0).integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
+
+
+def test_every_mind_remembers_what_was_done_and_not_what_was_chosen(tiny, tmp_path):
+    watching = Mind(tiny)
+    mind, policy = driver(tiny, tmp_path, 0.5, watching)
+    calm = Mind(tiny)
+    for picture in pictures(5):
+        done = policy.act(picture)
+        calm.see(picture)
+        calm.remember(done[None])
+    assert np.array_equal(mind.state, calm.state)
+    assert np.array_equal(watching.state, calm.state)
+    assert all(np.abs(push).max() > 0 for _, push in policy.noted)
+    policy.begin()
+    assert not mind.state.any()
+    assert not watching.state.any()
+
+
+def test_without_noise_it_does_what_the_hand_chooses(tiny, tmp_path):
+    mind, policy = driver(tiny, tmp_path, 0.0)
+    controller, _ = find_controller("tiny", tmp_path)
+    hand = ControllersHand(controller, tiny, mind)
+    for picture in pictures(3):
+        policy.begin()
+        done = policy.act(picture)
+        policy.begin()
+        mind.see(picture)
+        assert np.array_equal(hand.choose()[0], done)

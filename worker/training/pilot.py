@@ -1,0 +1,44 @@
+"""A controller that drives for a data set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dreamfleet.common.actions import Continuous
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import ControllerError
+from dreamfleet.worker.scoring.disturbance import Disturbance
+from dreamfleet.worker.scoring.disturbed import Disturbed
+from dreamfleet.worker.scoring.hand import ControllersHand
+from dreamfleet.worker.scoring.mind import Mind
+from dreamfleet.worker.training.world import WORLD, find_world
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """A controller and the world model that it was evolved with."""
+
+    controller: Controller
+    bundle: Bundle
+
+    def check(self, preprocessing: str) -> None:
+        """`ControllerError` unless it drives the world of data sets, and sees the pictures of this preprocessing."""
+        manifest = self.bundle.manifest
+        if self.controller.bundle != self.bundle.sha256:
+            raise ControllerError(
+                f"the controller is of the world model {self.controller.bundle[:12]}..., not of {self.bundle.path}"
+            )
+        if (manifest.task, manifest.preprocessing) != (WORLD, preprocessing):
+            raise ControllerError(
+                f"the controller sees {manifest.preprocessing!r} of {manifest.task}, and the data set holds "
+                f"{preprocessing!r} of {WORLD}: choose another --picture, or another --controller"
+            )
+
+    def policy(self, noise: float, seed: int) -> Disturbed:
+        """It at the wheel of one drive, under a noise that follows from the seed."""
+        actions = find_world().world.actions
+        if not isinstance(actions, Continuous):
+            raise ControllerError(f"{WORLD} has no continuous actions: its drives cannot be disturbed")
+        hand = ControllersHand(self.controller, self.bundle, Mind(self.bundle.fitting(self.controller)))
+        return Disturbed(hand, Disturbance(seed, actions, noise))
