@@ -34,6 +34,7 @@ class Moment(NamedTuple):
     step: int  # from 1
     ended: bool  # the environment says so
     cut: bool  # patience is at its end
+    info: dict[str, Any]  # what else the environment says
 
 
 Begin = Callable[[gymnasium.Env[Any, Any], Any], Any]
@@ -56,14 +57,14 @@ def play(
     idle, over = 0, False
     for step in range(1, course.horizon + 1):
         seen, action = observation, policy.act(observation)
-        observation, given, terminated, truncated, _ = environment.step(action)
+        observation, given, terminated, truncated, info = environment.step(action)
         reward = float(given)
         if tell is not None:
             tell(reward)
         idle = 0 if reward > 0 else idle + 1
         ended = bool(terminated or truncated)
         over = not ended and 0 < course.patience <= idle
-        yield Moment(seen, action, reward, step, ended, over)
+        yield Moment(seen, action, reward, step, ended, over, info)
         if ended or over:
             return
 
@@ -75,8 +76,11 @@ def score(
     course: Course,
     on_step: Callable[[int], None] = lambda _steps: None,
     rollout: Rollout | None = None,
+    see: Callable[[Moment], None] | None = None,
 ) -> Score:
-    """The episode's fitness: the sum of its rewards, in step order, in double precision. `rollout` keeps what happens.
+    """The episode's fitness: the sum of its rewards, in step order, in double precision.
+
+    `rollout` keeps what happens, and `see` is shown each moment.
 
     An episode that patience cuts is charged what standing still would have cost up to the horizon, so that cut and
     uncut candidates compare.
@@ -91,6 +95,8 @@ def score(
         if rollout is not None:
             rollout.add(moment.seen, moment.action, moment.reward)
             rollout.ended = moment.ended
+        if see is not None:
+            see(moment)
         on_step(steps)
         if moment.cut:
             fitness -= course.idle_cost * (course.horizon - steps)
