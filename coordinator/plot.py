@@ -21,7 +21,7 @@ from dreamfleet.coordinator.learning import LearningCurve, Mark, Point
 
 KINDS = (".png", ".svg")
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive")
-PAPERS_NAME = "Ha & Schmidhuber 2018, their public log (1024 tracks)"
+PAPERS_NAME = "Ha & Schmidhuber 2018, their public log (1024 tracks; of its time the end alone is known)"
 REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # names of an SVG's parts are drawn at random otherwise
 
 
@@ -82,6 +82,7 @@ def plot_learning(curves: Sequence[LearningCurve], marks: Sequence[Mark], path: 
     over_hours.set(xlabel="core-hours: time that slots worked on accepted results")
     for axes in (over_steps, over_hours):
         axes.set_xscale("log")
+        axes.margins(y=0.1)
         axes.grid(alpha=0.3, which="major")
     figure.legend(*over_steps.get_legend_handles_labels(), loc="outside lower center", fontsize=9, frameon=False)
     _save(figure, path)
@@ -109,8 +110,9 @@ def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]]) -> None:
     if not marks:
         return
     axes.plot(*zip(*marks, strict=True), "s--", color="black", markersize=5, linewidth=1, label=PAPERS_NAME)
-    for spent, score in marks:
-        axes.annotate(f"{score:.0f}", (spent, score), (0, -14), textcoords="offset points", ha="center", fontsize=9)
+    for number, (spent, score) in enumerate(marks):  # neighbours on two sides, so that none lies on another
+        place = (0, 7 if number % 2 else -14)
+        axes.annotate(f"{score:g}", (spent, score), place, textcoords="offset points", ha="center", fontsize=9)
 
 
 def _score_axis(curves: Sequence[LearningCurve]) -> str:
