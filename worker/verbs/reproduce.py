@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.site import offer
+from dreamfleet.common.threads import pin_thread_pools
 
 if TYPE_CHECKING:
     from dreamfleet.common.judgement import Judgement
@@ -31,6 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Say of each report whether it holds; exit 1 if one does not."""
+    pin_thread_pools()  # of NumPy, which is not loaded yet
     from dreamfleet.common.judgement import read_judgement
 
     if args.jobs < 1 or (args.episodes is not None and args.episodes < 1):
