@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
-.PHONY: demo test setup check wheel long box2d-py simulate chaos sanitize bundle worker-size stranger clean
+.PHONY: demo test setup check wheel long box2d-py simulate chaos sanitize bundle worker-size stranger reproduce \
+  reproduce-evolution clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(ARGS)
@@ -61,6 +62,12 @@ sanitize: $(VENV)/.dev  ## 200,000 steps of the native picture under AddressSani
 bundle: $(VENV)/.dev  ## a world model like the shipped one, from nothing: an hour of two cores; ROUNDS=1: 20 minutes
 	$(BIN)/dreamfleet iterate --data data/tiny --rounds $(or $(ROUNDS),2) --more-drives 580 --own-drives 0 \
 	  --run-flags "--generations 32 --collect-every 2 --collect-episodes 5" $(ARGS)
+
+reproduce: $(VENV)/.demo  ## drive the shipped controllers again and compare with docs/results; REPRODUCE=NAME: one of them
+	$(BIN)/dreamfleet reproduce $(if $(REPRODUCE),docs/results/$(REPRODUCE).json,$(sort $(wildcard docs/results/*.json))) $(ARGS)
+
+reproduce-evolution: $(VENV)/.demo  ## the run again that REPRODUCE=NAME came from (tiny), by its receipt; the same bits
+	$(BIN)/python deploy/reproduce_evolution.py $(or $(REPRODUCE),tiny) $(ARGS)
 
 stranger:  ## both commands as a stranger runs them: a fresh clone of what is committed, no settings, an empty home
 	deploy/stranger.sh

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 
 from dreamfleet.common import schema
 from dreamfleet.common.bounds import finite, saturated
+from dreamfleet.common.effort import Effort, GenerationEffort
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files import check_regular, is_folder, is_there
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.printable import one_line
+from dreamfleet.common.seeds import CHOOSING
 from dreamfleet.common.stored import (
     RunSettings,
     StoredConfirmation,
@@ -146,6 +148,13 @@ class RunFolder:
         found = StoredConfirmation.from_json(text)
         return found if found.covers(best_of(evaluations)) else None
 
+    def efforts(self) -> list[GenerationEffort]:
+        """What accepted results took, by generation; the drives that chose and confirmed the report stand apart."""
+        task = self.spec.task
+        rows = self._typed(self._all(_EFFORTS), "siiff")
+        return [GenerationEffort(generation, bool(confirming), Effort.of(task, kind, steps, microseconds))
+                for kind, generation, confirming, steps, microseconds in rows]  # fmt: skip
+
     def rollouts(self) -> list[Path]:
         """Every collected drive that was accepted, oldest first."""
         query = "SELECT generation, episode FROM result WHERE kind = 'collect' ORDER BY generation, episode"
@@ -203,6 +212,11 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "i": (int,), "f": (int, float), "F": (int, float, NoneType), "s": (str,), "b": (bytes,),
 }  # fmt: skip
 _RESULT = "kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint"
+SUMS = "total(steps), total(CAST(seconds * 1e6 AS INTEGER))"  # of results; a float, since old journals hold huge ones
+_EFFORTS = (
+    f"SELECT kind, generation, kind = 'evaluate' AND episode >= {CHOOSING}, {SUMS} FROM result GROUP BY 1, 2, 3 "  # noqa: S608
+    "ORDER BY 2, 3, 1"
+)
 
 
 def rollout_path(folder: Path, generation: int, episode: int) -> Path:

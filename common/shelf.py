@@ -1,13 +1,13 @@
-"""Where a controller named on the command line lies: a file, a run's own, or one that ships."""
+"""Where a controller named on the command line lies, and its world model: files, a run's own, or what ships."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from dreamfleet.common.bundle import pretrained
+from dreamfleet.common.bundle import Bundle, BundleStore, default_cache, find_bundle, pretrained
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.errors import ControllerError
-from dreamfleet.common.files import is_file
+from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.common.files import is_file, is_there
 from dreamfleet.common.runs import BUNDLE, CONTROLLER, JOURNAL
 
 
@@ -27,3 +27,24 @@ def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]
         )
     names = ", ".join(sorted(each.stem for each in pretrained().glob("*.npz"))) or "none"
     raise ControllerError(f"no controller {name!r}: give a file, a run, or one that ships: {names}")
+
+
+def bundle_for(controller: Controller, named: str | None, beside: Path | None = None) -> Bundle | None:
+    """The world model that a controller was evolved with: as named, beside the controller, cached or shipped.
+
+    `None` for a task that needs none.
+    """
+    if not controller.bundle:
+        return None
+    if named is not None:
+        bundle = find_bundle(named)
+    elif beside is not None and is_there(beside):
+        bundle = Bundle.open(beside, controller.bundle)
+    else:
+        found = BundleStore(default_cache()).find(controller.bundle)
+        if found is None:
+            raise BundleError(
+                f"the controller's world model {controller.bundle[:12]}... is not here: name it with --bundle FILE"
+            )
+        bundle = found
+    return bundle.fitting(controller)

@@ -20,6 +20,7 @@ from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 GROUP = "dreamfleet.tasks"
 _NAME = re.compile(r"[\w-][\w.-]*(:\S+)?", re.ASCII)
 GYM = "gym"  # the family of gymnasium's environments: they need no bundle
+DREAM = "dream"  # whose candidates take no step in reality
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from dreamfleet.common import schema
 from dreamfleet.common.bounds import LARGEST_FITNESS, LONGEST_EPISODE, finite, most_steps
+from dreamfleet.common.effort import Effort
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.files import sync_folder, write_aside
 from dreamfleet.common.messages import Job, Result
-from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder
+from dreamfleet.common.runs import BUNDLE, JOURNAL, SUMS, RunFolder
 from dreamfleet.common.stored import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.collection import Collection
@@ -54,6 +55,7 @@ class Journal:
         self._incarnation = 0
         self._stamp: tuple[int, int] | None = None  # of the file, as the last commit left it
         self._opened: int | None = None  # the latest generation
+        self._effort: Effort | None = None  # of every result, once somebody asked
         self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
         with _translated(path):
             self._connection = sqlite3.connect(path, timeout=5)
@@ -219,6 +221,17 @@ class Journal:
             job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], result.fitness,
             result.steps, result.seconds, worker, fingerprint, incarnation,
         )  # fmt: skip
+        if self._effort is not None:
+            self._effort += Effort.of(job.task, job.kind, result.steps, int(result.seconds * 1e6))
+
+    @property
+    def effort(self) -> Effort:
+        """What all results took: summed up once, then counted with each, so that it costs the same however many."""
+        if self._effort is None:
+            task = RunSettings.from_json(self.fact("settings") or "").task.task
+            rows = self._read(f"SELECT kind, {SUMS} FROM result GROUP BY kind")  # noqa: S608
+            self._effort = sum((Effort.of(task, *row) for row in rows), Effort())
+        return self._effort
 
     def drop_excessive(self, horizon: int) -> int:
         """Forget what older versions took in and what would spoil what is still to be told; how many results that is.
@@ -230,6 +243,7 @@ class Journal:
         query = f"DELETE FROM result WHERE NOT ({within}) AND ({still}) RETURNING digest"  # noqa: S608
         bounds = LARGEST_FITNESS, most_steps(LONGEST_EPISODE), most_steps(horizon)
         dropped = len(self._read(query, *bounds))
+        self._effort = None
         self.commit()
         return dropped
 

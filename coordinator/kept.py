@@ -49,6 +49,11 @@ def choose_addresses(own: NetworkConfig, site: SiteConfig, kept: Table) -> Netwo
     return replace(own, listen=listen or (() if connect else (DEFAULT_ENDPOINT,)), connect=connect)
 
 
+def is_mixed(network: str | None) -> bool:
+    """Whether hosts of any fingerprint may join, by the fact that is kept of the network."""
+    return bool(json.loads(network or "{}").get("mixed", False))
+
+
 def _read(stored: RunFolder, name: str, section: type[Any]) -> dict[str, Any]:
     try:
         return read_table(section, f"the {name} kept with run {stored.name}", json.loads(stored.fact(name) or "{}"))

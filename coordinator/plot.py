@@ -1,7 +1,8 @@
-"""A run's fitness over its generations, as a picture."""
+"""Pictures of runs: the fitness of one over its generations, and what several learnt from what they spent."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,19 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from dreamfleet.common.runs import RunFolder
+from dreamfleet.common.saving import saving
 from dreamfleet.common.stages import begun_stages, in_turn
+from dreamfleet.common.tasks import DREAM
+from dreamfleet.coordinator.learning import LearningCurve, Mark, Point
 
-DREAM = "dream"
+KINDS = (".png", ".svg")
+COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive")
+PAPERS_NAME = "Ha & Schmidhuber 2018, their public log (1024 tracks; of its time the end alone is known)"
+REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # names of an SVG's parts are drawn at random otherwise
 
 
 def plot_fitness(run: RunFolder, path: Path) -> None:
-    """Write a PNG: each generation's mean, spread and best; evaluations and the confirmed mean where there are any."""
+    """Draw each generation's mean, spread and best; evaluations and the confirmed mean where there are any."""
     history, evaluations, settings = run.history(), run.evaluations(), run.settings
     number = np.array([each.number for each in history])
     mean = np.array([each.mean for each in history])
@@ -56,7 +63,68 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    figure.savefig(path, dpi=120)
+    _save(figure, path)
+
+
+def plot_learning(curves: Sequence[LearningCurve], marks: Sequence[Mark], path: Path) -> None:
+    """Draw evaluated scores over environment steps and over core-hours; `marks` are published ones.
+
+    Environment steps are all that were made in reality: those of candidates, kept rollouts, evaluations, and what the
+    run began from. Dreamt ones are told in the legend.
+    """
+    figure, (over_steps, over_hours) = plt.subplots(1, 2, figsize=(11, 5.6), sharey=True, layout="constrained")
+    for curve, colour in zip(curves, COLOURS * len(curves), strict=False):
+        _draw_curve(over_steps, curve, colour, [each.effort.steps for each in _all(curve)])
+        _draw_curve(over_hours, curve, colour, [each.effort.core_hours for each in _all(curve)])
+    _draw_marks(over_steps, [(each.steps, each.score) for each in marks])
+    _draw_marks(over_hours, [(each.core_hours, each.score) for each in marks if each.core_hours is not None])
+    over_steps.set(xlabel="environment steps in reality, evaluations included", ylabel=_score_axis(curves))
+    over_hours.set(xlabel="core-hours: time that slots worked on accepted results")
+    for axes in (over_steps, over_hours):
+        axes.set_xscale("log")
+        axes.margins(y=0.1)
+        axes.grid(alpha=0.3, which="major")
+    figure.legend(*over_steps.get_legend_handles_labels(), loc="outside lower center", fontsize=9, frameon=False)
+    _save(figure, path)
+
+
+def _all(curve: LearningCurve) -> list[Point]:
+    return [*curve.points, *([curve.confirmed] if curve.confirmed else [])]
+
+
+def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Sequence[float]) -> None:
+    """Evaluations as a line, and apart from it, as a star, the confirmed score."""
+    count = len(curve.points)
+    axes.errorbar(
+        spent[:count], [each.score for each in curve.points], [each.error for each in curve.points], fmt="o-",
+        color=colour, markersize=4, linewidth=1.2, capsize=2, label=f"{curve.name}: {curve.total.told}",
+    )  # fmt: skip
+    if curve.confirmed is not None:
+        axes.errorbar(
+            spent[count], curve.confirmed.score, curve.confirmed.error, fmt="*", color=colour, markersize=13, capsize=3,
+            markeredgecolor="black", label=f"{curve.name}, confirmed on fresh tracks: {curve.confirmed.score:.0f}",
+        )  # fmt: skip
+
+
+def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]]) -> None:
+    if not marks:
+        return
+    axes.plot(*zip(*marks, strict=True), "s--", color="black", markersize=5, linewidth=1, label=PAPERS_NAME)
+    for number, (spent, score) in enumerate(marks):  # neighbours on two sides, so that none lies on another
+        place = (0, 7 if number % 2 else -14)
+        axes.annotate(f"{score:g}", (spent, score), place, textcoords="offset points", ha="center", fontsize=9)
+
+
+def _score_axis(curves: Sequence[LearningCurve]) -> str:
+    (world,) = {each.world for each in curves}
+    return f"{world}: score of the mean, whole episodes\non validation tracks, ± standard error"
+
+
+def _save(figure: Any, path: Path) -> None:
+    """Whole or not at all, of the kind that its name ends in; equal pictures are equal files."""
+    told = {"Date": None} if path.suffix == ".svg" else None
+    with saving(path) as file, mpl.rc_context(REPEATABLE):
+        figure.savefig(file, format=path.suffix.removeprefix("."), dpi=120, metadata=told)
     plt.close(figure)
 
 

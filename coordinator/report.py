@@ -6,13 +6,16 @@ mean that was confirmed, with a score that chose nothing. Without evaluations, t
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import JournalError
+from dreamfleet.common.fields import written
+from dreamfleet.common.receipt import RECEIPT, Receipt
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation
 
 PACE = 5.0  # seconds between two writings of a mean that was not evaluated: each waits for the disk
@@ -65,13 +68,14 @@ class Reported:
 
 
 class Report:
-    """Follows a run's means and keeps the file at `path` up to date."""
+    """Follows a run's means and keeps the file at `path` up to date; `receipt` is drawn up as it is written."""
 
-    def __init__(self, path: Path, run_uid: str, settings: RunSettings) -> None:
+    def __init__(self, path: Path, run_uid: str, settings: RunSettings, receipt: Callable[[], Receipt]) -> None:
         self.current: Reported | None = None  # `None` before the first generation is closed
         self._path = path
         self._run_uid = run_uid
         self._settings = settings
+        self._receipt = receipt
         self._saved: Reported | None = None
         self._due = False
         self._next = float("-inf")  # when a mean that was not evaluated may be written again
@@ -100,8 +104,10 @@ class Report:
         """Write the controller if it is due, or if it is not what the file holds and must be written `at_once`."""
         if self.current is None or self.current == self._saved or not (self._due or at_once):
             return
+        controller = self.current.controller()
+        told = {**controller.provenance, RECEIPT: written(self._receipt())}
         try:
-            self.current.controller().save(self._path)
+            replace(controller, provenance=told).save(self._path)
         except OSError as error:
             raise JournalError(
                 f"cannot write {self._path}: {error.strerror}; make room and continue the run"

@@ -14,6 +14,7 @@ from dreamfleet.coordinator.evaluation import Evaluation, Evaluations
 from dreamfleet.coordinator.history import History
 from dreamfleet.coordinator.jobs import Work
 from dreamfleet.coordinator.journal import Journal
+from dreamfleet.coordinator.receipts import draw_up
 from dreamfleet.coordinator.report import Report
 
 
@@ -28,7 +29,7 @@ class Slack:
         folder = journal.path.parent
         self.evaluations = Evaluations(evaluations)
         self.collections = Collections(folder)
-        self.report = Report(folder / CONTROLLER, run_uid, settings)
+        self.report = Report(folder / CONTROLLER, run_uid, settings, lambda: draw_up(journal, settings, len(history)))
         self._journal = journal
         self._settings = settings
         self._history = history

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import base64
+import json
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.codec import MalformedError, from_plain
+from dreamfleet.common.effort import Effort
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
+from dreamfleet.common.fields import known, written
 from dreamfleet.common.files import is_file, is_there
 from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.receipt import receipt_of
 from dreamfleet.common.runs import JOURNAL, RunFolder, open_run
 from dreamfleet.common.shelf import find_controller
 from dreamfleet.common.stored import RunSettings
@@ -20,7 +26,7 @@ from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.config import RunConfig
 from dreamfleet.coordinator.journal import Journal
 
-SOURCE, MEAN = "start", "start_mean"  # the facts' names
+SOURCE, MEAN, EFFORT = "start", "start_mean", "start_effort"  # the facts' names
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,7 @@ class Start:
     bundle: str  # SHA-256; empty: none
     source: str
     options: str = ""  # of the task, as its specification has them
+    effort: Effort | None = None  # what was spent on it, where that is known
 
     def under(self, config: RunConfig) -> RunConfig:
         """The configuration with the options that this start was evolved under, where it names none."""
@@ -42,7 +49,9 @@ class Start:
     @property
     def facts(self) -> dict[str, str]:
         """What the journal keeps of it, whole: the file that it came from may be gone when the run is continued."""
-        return {SOURCE: self.source, MEAN: base64.b64encode(self.mean.astype("<f8").tobytes()).decode()}
+        mean = base64.b64encode(self.mean.astype("<f8").tobytes()).decode()
+        spent = {} if self.effort is None else {EFFORT: json.dumps(written(self.effort))}
+        return {SOURCE: self.source, MEAN: mean, **spent}
 
     def check(self, settings: RunSettings) -> None:
         """Refuse parameters that mean nothing to this world model, these options and this controller."""
@@ -89,14 +98,29 @@ def find_start(name: str, runs_dir: Path) -> Start:
             if stored.ended is None:  # what it reports so far is an older mean than the one that it stands at
                 return start_of(stored)
     controller, _ = find_controller(name, runs_dir)
-    mean = controller.parameters.astype(np.float64)
-    return Start(mean, controller.bundle, f"controller {name}", controller.options)
+    mean, effort = controller.parameters.astype(np.float64), None
+    with suppress(ControllerError):  # a file may come from anywhere
+        effort = receipt_of(controller).total
+    return Start(mean, controller.bundle, f"controller {name}", controller.options, effort)
 
 
 def start_of(stored: RunFolder) -> Start:
     """The mean of a run's latest generation."""
     mean, _ = latest(stored)
-    return Start(mean, stored.spec.bundle, f"run {stored.name}", stored.spec.options)
+    return Start(mean, stored.spec.bundle, f"run {stored.name}", stored.spec.options, effort_of(stored))
+
+
+def effort_of(stored: RunFolder) -> Effort:
+    """What a run took so far, and what had been spent on its start."""
+    return sum((each.effort for each in stored.efforts()), start_effort(stored.fact(EFFORT)) or Effort())
+
+
+def start_effort(kept: str | None) -> Effort | None:
+    """What had been spent on a run's start, by the fact that is kept of it; `None` where that is not known."""
+    try:
+        return None if kept is None else from_plain(Effort, known(Effort, json.loads(kept)))
+    except (ValueError, MalformedError) as error:
+        raise JournalError(f"what the journal tells of the run's start is damaged: {error}; restore it") from error
 
 
 def latest(stored: RunFolder) -> tuple[NDArray[np.float64], float]:

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from dreamfleet.common.client import Client
     from dreamfleet.common.controller import Controller
     from dreamfleet.common.errors import DreamfleetError
+    from dreamfleet.common.evaluated import Evaluated
     from dreamfleet.common.messages import TaskSpec
     from dreamfleet.common.runs import RunFolder as Run
     from dreamfleet.common.tasks import Description
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Task, World
-    from dreamfleet.worker.tools.evaluation import Evaluated
     from dreamfleet.worker.tools.face import evaluate, find_controller, make_environment, make_policy, open_run
 
 _HOMES = {
@@ -36,7 +36,7 @@ _HOMES = {
     "Description": "common.tasks",
     "Discrete": "common.actions",
     "DreamfleetError": "common.errors",
-    "Evaluated": "worker.tools.evaluation",
+    "Evaluated": "common.evaluated",
     "Run": "common.runs:RunFolder",
     "Scorer": "worker.scoring.scorer",
     "Task": "worker.tasks.api",

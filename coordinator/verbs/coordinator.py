@@ -7,7 +7,7 @@ import logging
 import signal
 import sys
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.config import Table, add_flags, given, load
@@ -29,6 +29,15 @@ SUMMARY = "start a run: CMA-ES decides, workers score"
 EXTRAS: tuple[str, ...] = ()
 LEFT_OPEN = 130
 log = logging.getLogger("dreamfleet.coordinator")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a verb has to say of a run that ended, beside what is always said, and its exit code."""
+
+    text: str = ""
+    facts: dict[str, Any] = field(default_factory=dict)
+    code: int = 0
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -67,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 def serve(args: argparse.Namespace, base: Table, start: Start | None) -> int:
     """Serve a new run, whose settings are those of `base` where nothing else is said."""
     config, limits = configured(args, base)
-    return _serve(args, _request(args, args.run_name, config, limits, {}, start))
+    return serve_request(args, request_of(args, args.run_name, config, limits, {}, start))
 
 
 def configured(args: argparse.Namespace, base: Table) -> tuple[RunConfig, LimitsConfig]:
@@ -98,15 +107,16 @@ def _resume(args: argparse.Namespace) -> int:
         _tell_frozen(args, stored)
         limits = load(LimitsConfig, "limits", base=kept_limits(stored), **args.sources)
         _check_target(limits, stored.settings.evaluate_every)
-        request = _request(args, args.resume, None, limits, kept_network(stored), None)
+        request = request_of(args, args.resume, None, limits, kept_network(stored), None)
         before = len(stored.history())
-    return _serve(args, request, before)
+    return serve_request(args, request, before)
 
 
-def _request(
+def request_of(
     args: argparse.Namespace, name: str, config: RunConfig | None, limits: LimitsConfig, kept: Table,
     start: Start | None,
 ) -> RunRequest:  # fmt: skip
+    """What is to be served where the arguments say, else where it was `kept`; without `config` it is continued."""
     from dreamfleet.coordinator.kept import choose_addresses
     from dreamfleet.coordinator.main import RunRequest
 
@@ -115,15 +125,20 @@ def _request(
     return RunRequest(name, args.runs_dir, config, limits, choose_addresses(own, args.site, kept), start)
 
 
-def _serve(args: argparse.Namespace, request: RunRequest, before: int | None = None) -> int:
+def serve_request(
+    args: argparse.Namespace, request: RunRequest, before: int | None = None,
+    judge: Callable[[], Outcome] = Outcome,
+) -> int:  # fmt: skip
+    """Serve until the run ends, and say how; of a run that ended, what `judge` finds too."""
     from dreamfleet.coordinator.main import serve_run
 
     unblock_stderr()
     raise_limit()
     run = serve_run(request, _stop_on_signals)
     _end_on_signals()  # its last word may wait for a reader of stdout
-    _report(args, run, request, nothing_new=len(run.history) == before)
-    return 0 if run.ended is not None else LEFT_OPEN
+    outcome = Outcome(code=LEFT_OPEN) if run.ended is None else judge()
+    _report(args, run, request, outcome, nothing_new=len(run.history) == before)
+    return outcome.code
 
 
 def _check_target(limits: LimitsConfig, evaluate_every: int) -> None:
@@ -166,7 +181,9 @@ def _end_on_signals() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
-def _report(args: argparse.Namespace, run: Run, request: RunRequest, *, nothing_new: bool) -> None:
+def _report(
+    args: argparse.Namespace, run: Run, request: RunRequest, outcome: Outcome, *, nothing_new: bool
+) -> None:  # fmt: skip
     from dreamfleet.common.processes import spoken
     from dreamfleet.common.runs import CONTROLLER
     from dreamfleet.common.stored import told
@@ -184,8 +201,8 @@ def _report(args: argparse.Namespace, run: Run, request: RunRequest, *, nothing_
     else:
         where = f"; controller: {controller}" if controller else "; it has no controller yet"
         more = f"; it goes on with wider limits, such as: {again} --generations 0 --minutes 30" if nothing_new else ""
-        text = f"run {request.name} ended after {run.ended}{score}{where}{more}"
+        text = f"run {request.name} ended after {run.ended}{score}{where}{outcome.text or more}"
     if run.ended is None and not args.json:
         print(text, file=sys.stderr)
     else:
-        answer(args, text, **facts)
+        answer(args, text, **facts, **outcome.facts)

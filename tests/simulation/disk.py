@@ -8,6 +8,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, Protocol
 
+from dreamfleet.common.effort import Effort
 from dreamfleet.common.messages import Job, Result
 from dreamfleet.common.runs import JOURNAL
 from dreamfleet.common.stored import StoredEvaluation, StoredGeneration
@@ -76,6 +77,11 @@ class MemoryJournal:
 
     def fingerprint(self) -> str | None:
         return self.fact("fingerprint")
+
+    @property
+    def effort(self) -> Effort:
+        """No rule hangs on it."""
+        return Effort()
 
     def drop_excessive(self, horizon: int) -> int:
         """No older version wrote here."""

@@ -23,8 +23,8 @@ class Course:
     horizon: int
     patience: int = 0
     idle_cost: float = 0.0  # the world's: charged for each step that is cut off
-    time_cost: float = 0.0  # charged for each step until the goal is reached, or the horizon
-    goal: str = ""  # the world's, of an episode's last info; empty: there is none
+    time_cost: float = 0.0  # charged for each step until the course is finished, or the horizon
+    finish: str = ""  # the world's
 
 
 class Moment(NamedTuple):
@@ -36,7 +36,7 @@ class Moment(NamedTuple):
     step: int  # from 1
     ended: bool  # the environment says so
     cut: bool  # patience is at its end
-    reached: bool  # it ended at the world's goal
+    info: dict[str, Any]  # what else the environment says
 
 
 Begin = Callable[[gymnasium.Env[Any, Any], Any], Any]
@@ -66,7 +66,7 @@ def play(
         idle = 0 if reward > 0 else idle + 1
         ended = bool(terminated or truncated)
         over = not ended and 0 < course.patience <= idle
-        yield Moment(seen, action, reward, step, ended, over, reached=ended and bool(info.get(course.goal)))
+        yield Moment(seen, action, reward, step, ended, over, info)
         if ended or over:
             return
 
@@ -78,28 +78,33 @@ def score(
     course: Course,
     on_step: Callable[[int], None] = lambda _steps: None,
     rollout: Rollout | None = None,
+    see: Callable[[Moment], None] | None = None,
 ) -> Score:
-    """The episode's fitness: the sum of its rewards, in step order, in double precision. `rollout` keeps what happens.
+    """The episode's fitness: the sum of its rewards, in step order, in double precision.
+
+    `rollout` keeps what happens, and `see` is shown each moment.
 
     An episode that patience cuts is charged what standing still would have cost up to the horizon, so that cut and
-    uncut candidates compare. Time costs up to the horizon too, unless the goal is reached: to crash saves nothing.
+    uncut candidates compare. Time costs up to the horizon too, unless the course is finished: to crash saves nothing.
     """
     if not np.isfinite(parameters).all():
         raise ValueError("the controller's parameters hold NaN or infinity")
     policy.begin(parameters)
-    fitness, steps, reached = 0.0, 0, False
+    fitness, steps, finished = 0.0, 0, False
     for moment in play(environment, policy, course):
         fitness += moment.reward
         steps = moment.step
         if rollout is not None:
             rollout.add(moment.seen, moment.action, moment.reward)
             rollout.ended = moment.ended
+        if see is not None:
+            see(moment)
         on_step(steps)
         if moment.cut:
             fitness -= course.idle_cost * (course.horizon - steps)
-        reached = moment.reached
+        finished = moment.ended and bool(moment.info.get(course.finish))
     if course.time_cost:
-        fitness -= course.time_cost * (steps if reached else course.horizon)
+        fitness -= course.time_cost * (steps if finished else course.horizon)
     if not math.isfinite(fitness):
         raise ValueError("the episode's rewards do not add up to a number")
     return Score(fitness, steps)

@@ -12,9 +12,9 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.messages import Kind, TaskSpec
 from dreamfleet.common.variants import Variant
-from dreamfleet.worker.scoring.episode import Course, score
+from dreamfleet.worker.scoring.episode import Course, Moment, score
 from dreamfleet.worker.scoring.rollout import Rollout
-from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Score
+from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Score, Truthful
 from dreamfleet.worker.tasks.registry import find_task
 
 DRIVER = "controller"  # as a kept rollout names who drove
@@ -49,6 +49,8 @@ class Scorer:
         self._environment = task.make_judge(assignment) if judge else task.make_environment(assignment)
         self._policy = task.make_policy(assignment)
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
+        reality = task.reality(assignment)
+        self._truthful = reality if isinstance(reality, Truthful) else None
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,
@@ -88,6 +90,16 @@ class Scorer:
         course = self.course("collect", seed, spec)
         return score(self._environment, self._policy, parameters, course, on_step, rollout), rollout
 
+    def judge(self, parameters: NDArray[np.float32], seed: int, see: Callable[[Moment], None]) -> Score:
+        """A whole episode, as an evaluation drives it; `see` is shown each of its moments."""
+        return score(self._environment, self._policy, parameters, self.course("evaluate", seed), see=see)
+
+    @property
+    def truth(self) -> Callable[[], dict[str, float]] | None:
+        """Tells the true state behind the last observation; `None` in a world that keeps it to itself."""
+        truthful = self._truthful
+        return None if truthful is None else lambda: truthful.truth(self._environment)
+
     @property
     def drawn_by(self) -> str:
         """Who draws the environment's picture; `-` where a task does not say."""
@@ -99,7 +111,7 @@ class Scorer:
             return Course(seed, self.world.horizon)
         spec, world = spec or self.spec, self.world
         time_cost = world.time_cost if kind == "score" else 0.0
-        return Course(seed, spec.horizon, spec.patience, world.idle_cost, time_cost, world.goal)
+        return Course(seed, spec.horizon, spec.patience, world.idle_cost, time_cost, world.finish)
 
     def close(self) -> None:
         """Release the environment."""

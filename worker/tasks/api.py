@@ -98,13 +98,11 @@ class World:
     idle_cost: float = 0.0  # what a step without a reward costs: charged for steps that `patience` cuts off
     horizon: int = ENVIRONMENTS_OWN  # steps of a judged episode at most
     version: int = 1  # to be raised whenever the same parameters and seeds give another fitness
-    time_cost: float = (
-        0.0  # what a candidate pays for each step until `goal` is reached, or its horizon; not the judged
-    )
-    goal: str = ""  # of an episode's last info: true where what it is about was reached, such as a whole lap
+    time_cost: float = 0.0  # what a candidate pays for each step until `finish`, or its horizon; nobody who is judged
     frames_per_second: int = 30  # of a video
     action_names: tuple[str, ...] = ()  # of continuous actions, for people
     dream_reward: DreamReward | None = None  # of worlds that world models are trained on
+    finish: str = ""  # of the environment's `info`: whether the course was driven to its end; empty: it does not say
 
 
 @dataclass(frozen=True)
@@ -159,6 +157,10 @@ class Task:
     def world_of(self, assignment: Assignment) -> World:  # noqa: ARG002 - a dream asks its bundle
         """The world that is scored in."""
         return self.world
+
+    def reality(self, assignment: Assignment) -> Task:  # noqa: ARG002 - a dream asks its bundle
+        """The task of the world that whole episodes are driven in: itself, unless it dreams."""
+        return self
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """A new environment; its observations are what the policy takes."""
@@ -226,10 +228,14 @@ class Collected(Protocol):
 
 @runtime_checkable
 class Truthful(Protocol):
-    """A task whose worlds tell their true state, which `dreamfleet inspect` measures world models against."""
+    """A task whose worlds tell their true state.
+
+    `dreamfleet inspect` measures world models against it, and `dreamfleet evaluate` tells how a controller drove.
+    """
 
     def truth(self, environment: gymnasium.Env[Any, Any]) -> dict[str, float]:
         """The true state behind the last observation, the same names at every step.
 
-        A world whose road can be lost names `off_road`, 1 or 0, and how far off it is `lateral_offset`.
+        A world whose road can be lost names `off_road`, 1 or 0, and how far off it is `lateral_offset`; one in which
+        something drives names its `speed`.
         """

@@ -7,7 +7,6 @@ import signal
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -15,66 +14,27 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import Bundle, BundleStore, default_cache, find_bundle
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.errors import BundleError, DreamfleetError
-from dreamfleet.common.files import is_there
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.evaluated import Drive
+from dreamfleet.common.fingerprint import fingerprint
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.threads import pin_thread_pools
-from dreamfleet.worker.scoring.scorer import Scorer
-from dreamfleet.worker.tasks.api import ENVIRONMENTS_OWN
+from dreamfleet.worker.tasks.api import ENVIRONMENTS_OWN, Assignment
+from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tools.judge import Judge
 
 
-@dataclass(frozen=True)
-class Evaluated:
-    """Scores of whole episodes, one a seed."""
-
-    seeds: tuple[int, ...]
-    scores: tuple[float, ...]
-
-    @property
-    def mean(self) -> float:
-        """Mean score."""
-        return float(np.mean(self.scores))
-
-    @property
-    def std(self) -> float:
-        """Standard deviation between tracks."""
-        return float(np.std(self.scores))
-
-
-def bundle_for(controller: Controller, named: str | None, beside: Path | None = None) -> Bundle | None:
-    """The world model that a controller was evolved with: as named, beside the controller, cached or shipped.
-
-    `None` for a task that needs none.
-    """
-    if not controller.bundle:
-        return None
-    if named is not None:
-        bundle = find_bundle(named)
-    elif beside is not None and is_there(beside):
-        bundle = Bundle.open(beside, controller.bundle)
-    else:
-        found = BundleStore(default_cache()).find(controller.bundle)
-        if found is None:
-            raise BundleError(
-                f"the controller's world model {controller.bundle[:12]}... is not here: name it with --bundle FILE"
-            )
-        bundle = found
-    return bundle.fitting(controller)
-
-
-def evaluate(
-    controller: Controller, bundle: Bundle | None, seeds: tuple[int, ...], jobs: int
-) -> Iterator[tuple[int, float]]:
-    """Drive one whole episode a seed in `jobs` processes, in this one if it is 1; yields (seed, score) as each ends."""
+def evaluate(controller: Controller, bundle: Bundle | None, seeds: tuple[int, ...], jobs: int) -> Iterator[Drive]:
+    """Drive one whole episode a seed in `jobs` processes, in this one if it is 1; yields each as it ends."""
     pin_thread_pools()
     spec = spec_for(controller, bundle)
     if jobs == 1:  # here: a script of one's own need not guard its main part
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-        scorer = Scorer(spec, bundle, judge=True)
-        yield from ((seed, scorer.score("evaluate", controller.parameters, seed).fitness) for seed in seeds)
-        scorer.close()
+        judge = Judge(spec, bundle)
+        yield from (judge.drive(controller.parameters, seed) for seed in seeds)
+        judge.close()
         return
     pool = ProcessPoolExecutor(min(jobs, len(seeds)), get_context("spawn"), _start_process)
     try:
@@ -99,16 +59,23 @@ def spec_for(controller: Controller, bundle: Bundle | None) -> TaskSpec:
     )  # fmt: skip
 
 
+def judged_in(controller: Controller, bundle: Bundle | None) -> tuple[str, str]:
+    """The task of the world that a controller is judged in, and the fingerprint of this host for it."""
+    assignment = Assignment(spec_for(controller, bundle), bundle)
+    task = find_task(controller.task)
+    return task.reality(assignment).name, fingerprint(task.world_of(assignment).packages)
+
+
 def _start_process() -> None:
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches the whole group: end without a traceback
 
 
-def _drive(spec: TaskSpec, bundle: Path | None, parameters: NDArray[np.float32], seed: int) -> tuple[int, float]:
-    return seed, _scorer(spec, bundle).score("evaluate", parameters, seed).fitness
+def _drive(spec: TaskSpec, bundle: Path | None, parameters: NDArray[np.float32], seed: int) -> Drive:
+    return _judge(spec, bundle).drive(parameters, seed)
 
 
 @cache
-def _scorer(spec: TaskSpec, bundle: Path | None) -> Scorer:
+def _judge(spec: TaskSpec, bundle: Path | None) -> Judge:
     """One a process, made by its first drive, so that whatever is wrong is that drive's error."""
-    return Scorer(spec, Bundle.open(bundle, spec.bundle) if bundle else None, judge=True)
+    return Judge(spec, Bundle.open(bundle, spec.bundle) if bundle else None)

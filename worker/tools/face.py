@@ -12,11 +12,11 @@ from dreamfleet.common import runs, shelf
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.evaluated import Evaluated
 from dreamfleet.common.seeds import TEST
 from dreamfleet.worker.tasks.api import Assignment, Policy
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.tools import evaluation
-from dreamfleet.worker.tools.evaluation import Evaluated
 
 
 def find_controller(name: str, runs_dir: Path | str | None = None) -> Controller:
@@ -52,20 +52,19 @@ def evaluate(
     controller: Controller, bundle: Bundle | None = None, episodes: int = 100, first_seed: int = TEST.start,
     jobs: int | None = None,
 ) -> Evaluated:  # fmt: skip
-    """Scores of whole episodes, one a seed, in `jobs` processes (one a core), as `dreamfleet evaluate` gives them.
+    """Whole episodes, one a seed, in `jobs` processes (one a core), as `dreamfleet evaluate` drives them.
 
     With more than one job a script calls this under `if __name__ == "__main__":`, for processes are spawned.
     """
     if episodes < 1 or first_seed < 0 or (jobs is not None and jobs < 1):
         raise UsageError("episodes and jobs must be at least 1, first_seed at least 0")
     seeds = tuple(range(first_seed, first_seed + episodes))
-    world_model = bundle or evaluation.bundle_for(controller, None)
-    scores = dict(evaluation.evaluate(controller, world_model, seeds, jobs or os.cpu_count() or 1))
-    return Evaluated(seeds, tuple(scores[seed] for seed in seeds))
+    world_model = bundle or shelf.bundle_for(controller, None)
+    return Evaluated.of(evaluation.evaluate(controller, world_model, seeds, jobs or os.cpu_count() or 1))
 
 
 def _assignment(controller: Controller, bundle: Bundle | None) -> Assignment:
-    found = bundle or evaluation.bundle_for(controller, None)
+    found = bundle or shelf.bundle_for(controller, None)
     fitting = None if found is None else found.fitting(controller)
     return Assignment(evaluation.spec_for(controller, fitting), fitting)
 

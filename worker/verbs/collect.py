@@ -81,8 +81,7 @@ def run(args: argparse.Namespace) -> int:
 def _pilots(args: argparse.Namespace) -> tuple[Pilot, ...]:
     if not args.controller:
         return ()
-    from dreamfleet.common.shelf import find_controller
-    from dreamfleet.worker.tools.evaluation import bundle_for
+    from dreamfleet.common.shelf import bundle_for, find_controller
     from dreamfleet.worker.training.pilot import Pilot
 
     found = []

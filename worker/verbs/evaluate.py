@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
+from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.saving import check_out, saving
 from dreamfleet.common.seeds import TEST
 from dreamfleet.common.site import offer
+from dreamfleet.common.threads import pin_thread_pools
 
 if TYPE_CHECKING:
     from dreamfleet.common.bundle import Bundle
     from dreamfleet.common.controller import Controller
+    from dreamfleet.common.evaluated import Drive
+    from dreamfleet.common.judgement import Judgement
 
 SUMMARY = "judge a controller on unseen tracks, in gymnasium's own unmodified environment"
 EXTRAS = ("worker",)
@@ -30,49 +35,55 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
     offer(parser, "runs_dir")
-    parser.add_argument("--json", action="store_true", help="print mean, std, scores and seeds as JSON")
+    parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
+    parser.add_argument("--out", type=Path, help="write the same JSON here too, for `compare` and `reproduce`")
 
 
 def run(args: argparse.Namespace) -> int:
     """Drive and print the scores."""
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.tools.evaluation import Evaluated, evaluate
-
+    pin_thread_pools()  # of NumPy, which is not loaded yet: its threads take three times the time of a drive otherwise
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
-    controller, bundle = _choose(args)
+    if args.out:
+        check_out(args.out)
+    name, controller, bundle = _choose(args)
     seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
     if seeds[0] not in TEST or seeds[-1] not in TEST:
         print(f"note: test tracks are {TEST.start} to {TEST.stop - 1}; some of these are not", file=sys.stderr)
-    scores: dict[int, float] = {}
-    with progress_bar("evaluate", len(seeds), "tracks") as bar:
-        for seed, score in evaluate(controller, bundle, seeds, args.jobs):
-            scores[seed] = score
-            bar.move(len(scores), f"mean {sum(scores.values()) / len(scores):.1f}")
-    done = Evaluated(seeds, tuple(scores[seed] for seed in seeds))
-    if args.json:
-        report = {"mean": done.mean, "std": done.std, "scores": done.scores, "seeds": done.seeds}
-        print(
-            json.dumps(
-                {**report, "task": controller.task, "bundle": bundle.sha256 if bundle else "", "judge": "gymnasium"}
-            )
-        )
-    else:
-        low, high = min(done.scores), max(done.scores)
-        error = done.std / len(seeds) ** 0.5
-        print(
-            f"{done.mean:.1f} ± {error:.1f} (standard error) on {len(seeds)} seeds, {low:.0f} to {high:.0f}, "
-            f"standard deviation {done.std:.1f}; judged by gymnasium's own environment"
-        )
+    judgement = judge(name, controller, bundle, seeds, args.jobs)
+    print(judgement.to_json() if args.json else judgement.told, flush=True)
+    if args.out:
+        with saving(args.out) as file:
+            file.write(f"{judgement.to_json()}\n".encode())
     return 0
 
 
-def _choose(args: argparse.Namespace) -> tuple[Controller, Bundle | None]:
-    """What to judge, and its world model: from here, or from a live run."""
+def judge(name: str, controller: Controller, bundle: Bundle | None, seeds: tuple[int, ...], jobs: int) -> Judgement:
+    """Drive one whole episode a seed, with a progress bar."""
+    from dreamfleet.common.evaluated import Evaluated
+    from dreamfleet.common.fingerprint import package_version
+    from dreamfleet.common.judgement import Judgement
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.tools.evaluation import evaluate, judged_in
+
+    drives: list[Drive] = []
+    began = perf_counter()
+    with progress_bar("evaluate", len(seeds), "tracks") as bar:
+        for drive in evaluate(controller, bundle, seeds, jobs):
+            drives.append(drive)
+            bar.move(len(drives), f"mean {sum(each.score for each in drives) / len(drives):.1f}")
+    seconds, (world, host) = perf_counter() - began, judged_in(controller, bundle)
+    return Judgement(
+        name, controller.sha256, controller.task, world, bundle.sha256 if bundle else "", host,
+        package_version("dreamfleet") or "", seconds, Evaluated.of(drives).drives,
+    )  # fmt: skip
+
+
+def _choose(args: argparse.Namespace) -> tuple[str, Controller, Bundle | None]:
+    """What to judge, by name, and its world model: from here, or from a live run."""
     from dreamfleet.common.client import Client
-    from dreamfleet.common.shelf import find_controller
+    from dreamfleet.common.shelf import bundle_for, find_controller
     from dreamfleet.worker.service.bundle_fetch import fetch_for
-    from dreamfleet.worker.tools.evaluation import bundle_for
 
     live = bool(args.run_name) or "connect" in args.given
     if live and not args.controller:
@@ -80,9 +91,9 @@ def _choose(args: argparse.Namespace) -> tuple[Controller, Bundle | None]:
             run = args.run_name or client.status().run
             controller = client.controller(run)
             if args.bundle is None:
-                return controller, fetch_for(controller, client.session, run)
-        return controller, bundle_for(controller, args.bundle)
+                return run, controller, fetch_for(controller, client.session, run)
+        return run, controller, bundle_for(controller, args.bundle)
     if live or not args.controller:
         raise UsageError("give either --controller, or --run (and --connect) to judge what a live run reports")
     controller, beside = find_controller(args.controller, args.runs_dir)
-    return controller, bundle_for(controller, args.bundle, beside)
+    return args.controller, controller, bundle_for(controller, args.bundle, beside)

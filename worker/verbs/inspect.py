@@ -162,9 +162,8 @@ def _temperature(args: argparse.Namespace, subject: Subject) -> float:
 
 def _choose(args: argparse.Namespace, subject: Subject) -> tuple[Bundle, Driving]:
     """What is measured, and who drives."""
-    from dreamfleet.common.shelf import find_controller
+    from dreamfleet.common.shelf import bundle_for, find_controller
     from dreamfleet.worker.inspection.measuring import Driving
-    from dreamfleet.worker.tools.evaluation import bundle_for
 
     controller, own = subject.controller, subject.bundle
     if args.controller:

@@ -35,10 +35,9 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--out {args.out}: give a name that ends in .mp4")
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.common.progress import progress_bar
-    from dreamfleet.common.shelf import find_controller
+    from dreamfleet.common.shelf import bundle_for, find_controller
     from dreamfleet.common.stopping import heeding_signals
     from dreamfleet.worker.dream.daydream import DaydreamConfig
-    from dreamfleet.worker.tools.evaluation import bundle_for
     from dreamfleet.worker.tools.recording import record
 
     daydream = DaydreamConfig(args.temperature, seed=args.seed)

@@ -16,7 +16,7 @@ except NoDisplayError:
     pass
 """
 DRIVING_UNSEEN = """
-from dreamfleet.worker.tools.evaluation import bundle_for
+from dreamfleet.common.shelf import bundle_for
 from dreamfleet.worker.car_racing.check import make_car_racing
 environment = make_car_racing(preprocessing="box-64", render_mode="rgb_array")
 environment.reset(seed=1)

@@ -81,8 +81,8 @@ def test_a_hopeless_episode_is_cut_and_charged_what_standing_still_costs():
         ([1.0] + [0.0] * 39, {}, 20),  # it was given up
     ],
 )
-def test_time_costs_until_the_goal_is_reached_and_to_crash_saves_nothing(rewards, info, paid):
-    free = Course(1, 20, patience=5, goal="lap")
+def test_time_costs_until_the_course_is_finished_and_to_crash_saves_nothing(rewards, info, paid):
+    free = Course(1, 20, patience=5, finish="lap")
     found = [score(Scripted(rewards, info), Still(), PARAMETERS, each) for each in (free, replace(free, time_cost=0.5))]
     assert found[0].fitness - found[1].fitness == 0.5 * paid
     assert found[0].steps == found[1].steps

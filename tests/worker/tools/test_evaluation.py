@@ -6,10 +6,12 @@ import pytest
 
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, ControllerError, DreamfleetError, UsageError
+from dreamfleet.common.judgement import read_judgement
+from dreamfleet.common.shelf import bundle_for
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.episode import Course
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.tools.evaluation import Evaluated, bundle_for, evaluate
+from dreamfleet.worker.tools.evaluation import evaluate, judged_in
 from tests.support import tasks
 
 SEEDS = (10_000, 10_001, 10_002)
@@ -34,7 +36,9 @@ def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
         for seed in SEEDS
     }
     for jobs in (1, 2):
-        assert dict(evaluate(controller(tasks.JUDGED), random_bundle, SEEDS, jobs)) == alone
+        drives = list(evaluate(controller(tasks.JUDGED), random_bundle, SEEDS, jobs))
+        assert {each.seed: each.score for each in drives} == alone
+        assert {each.steps for each in drives} == {10}
 
 
 @pytest.mark.parametrize(
@@ -81,6 +85,30 @@ def test_the_verb_reports_every_score_and_warns_of_tracks_that_are_no_test_track
     assert (report["task"], report["bundle"]) == (tasks.TOY, random_bundle.sha256)
 
 
-def test_the_summary_is_mean_and_standard_deviation():
-    done = Evaluated((1, 2), (100.0, 300.0))
-    assert (done.mean, done.std) == (200.0, 100.0)
+def test_what_it_writes_is_what_it_prints_and_drives_again_to_the_bit(processes, controller, random_bundle, tmp_path):
+    controller().save(tmp_path / "toy.npz")
+    (tmp_path / "bundle.zip").write_bytes(random_bundle.path.read_bytes())
+    out = tmp_path / "results" / "toy.json"
+    judged = ("evaluate", "--controller", tmp_path / "toy.npz", "--episodes", 3, "--jobs", 1, "--out", out)
+    code, said, err = processes.call(*judged, "--json")
+    assert code == 0, err
+    assert json.loads(said) == json.loads(out.read_text())
+    recorded = read_judgement(out)
+    assert (recorded.controller, recorded.bundle) == (controller().sha256, random_bundle.sha256)
+    assert (recorded.world, recorded.fingerprint) == judged_in(controller(), random_bundle)
+    assert [each.finished for each in recorded.drives] == [None] * 3
+    code, said, err = processes.call("reproduce", out, "--episodes", 2, "--jobs", 1)
+    assert (code, "the same 2 scores to the bit" in said) == (0, True), err
+    out.write_text(replace(recorded, drives=(replace(recorded.drives[0], steps=9), *recorded.drives[1:])).to_json())
+    code, said, err = processes.call("reproduce", out, "--jobs", 1, "--json")
+    assert (code, json.loads(said)["reproduced"]) == (1, False), err
+    out.write_text(replace(recorded, controller="ef" * 32).to_json())
+    code, _, err = processes.call("reproduce", out)
+    assert (code, "records the controller efefefefefef" in err) == (1, True)
+
+
+def test_where_no_report_can_be_written_is_said_before_anybody_drives(processes, controller, random_bundle, tmp_path):
+    controller(tasks.HANGING).save(tmp_path / "toy.npz")
+    judged = ("evaluate", "--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--out", tmp_path)
+    code, _, err = processes.call(*judged)
+    assert (code, "is a folder" in err) == (2, True)

@@ -98,9 +98,9 @@ def test_it_dreams_is_driven_in_reality_and_collects_drives_that_its_data_set_ta
 
 def test_a_controller_of_it_is_evaluated(bundle, parameters):
     straight = Controller(bundle.controller_shape, np.zeros_like(parameters), "dream", bundle.sha256)
-    ((seed, score),) = evaluate(straight, bundle, (10_000,), jobs=1)
-    assert seed == 10_000
-    assert np.isfinite(score)
+    (drive,) = evaluate(straight, bundle, (10_000,), jobs=1)
+    assert drive.seed == 10_000
+    assert np.isfinite(drive.score)
 
 
 def test_its_dream_is_driven_at_the_size_of_any_other(bundle, random_bundle):

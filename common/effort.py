@@ -1,0 +1,72 @@
+"""What a run's results took: environment steps in reality and in the dream, and time of slots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from dreamfleet.common.bounds import finite, saturated
+from dreamfleet.common.fields import OPTIONAL
+from dreamfleet.common.messages import Count
+from dreamfleet.common.tasks import DREAM
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Of accepted results alone: what was lost with a worker, or done twice, is not in it.
+
+    Whole numbers, so that a sum is the same in any order.
+    """
+
+    driven: Count = field(default=0, metadata=OPTIONAL)  # environment steps of candidates and kept rollouts, in reality
+    judged: Count = field(default=0, metadata=OPTIONAL)  # environment steps of evaluations and confirmation
+    dreamt: Count = field(default=0, metadata=OPTIONAL)  # steps of candidates in the dream
+    microseconds: Count = field(default=0, metadata=OPTIONAL)  # that slots worked
+
+    @classmethod
+    def of(cls, task: str, kind: str, steps: float, microseconds: float) -> Effort:
+        """Of results of one kind in a run of this task."""
+        told = saturated(int(finite(steps))), saturated(int(finite(microseconds)))
+        if kind == "evaluate":
+            return cls(judged=told[0], microseconds=told[1])
+        if kind == "score" and task == DREAM:
+            return cls(dreamt=told[0], microseconds=told[1])
+        return cls(driven=told[0], microseconds=told[1])
+
+    def __add__(self, other: Effort) -> Effort:
+        return Effort(
+            saturated(self.driven + other.driven), saturated(self.judged + other.judged),
+            saturated(self.dreamt + other.dreamt), saturated(self.microseconds + other.microseconds),
+        )  # fmt: skip
+
+    @property
+    def steps(self) -> int:
+        """All environment steps in reality."""
+        return saturated(self.driven + self.judged)
+
+    @property
+    def core_hours(self) -> float:
+        """Hours that one core would have worked; a slot is a core."""
+        return self.microseconds / 3.6e9
+
+    @property
+    def told(self) -> str:
+        """In words."""
+        dreamt = f", {counted(self.dreamt)} dreamt" if self.dreamt else ""
+        return f"{counted(self.steps)} steps in reality{dreamt}, {self.core_hours:.3g} core-hours"
+
+
+@dataclass(frozen=True)
+class GenerationEffort:
+    """What a run's generation took; `confirming`: the drives of its mean that chose and confirmed the report."""
+
+    generation: int
+    confirming: bool
+    effort: Effort
+
+
+def counted(steps: int) -> str:
+    """A number of steps as it is said: 930, 12k, 2.85M."""
+    for unit, name in ((10**9, "G"), (10**6, "M"), (10**3, "k")):
+        if steps >= unit:
+            return f"{steps / unit:.3g}{name}"
+    return str(steps)

@@ -1,0 +1,96 @@
+"""The document that `dreamfleet evaluate` writes: a controller's drives, and all that is needed to have them again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+from dreamfleet.common.codec import MalformedError, from_plain
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.evaluated import Drive, Evaluated
+from dreamfleet.common.fields import known
+from dreamfleet.common.files import read_text
+from dreamfleet.common.messages import Length, Seconds
+
+MARKS = (800, 900)  # scores of CarRacing that people ask about
+MOST_BYTES, MOST_DRIVES = 64 << 20, 10**5
+Drives = Annotated[tuple[Drive, ...], Length(1, MOST_DRIVES)]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Who drove, in what and where, and what came of it, one drive a seed."""
+
+    name: str  # of the controller, as it was asked for
+    controller: str  # SHA-256 of its parameters
+    task: str  # that it was evolved in
+    world: str  # the task that it was judged in: of one from a dream another
+    bundle: str  # SHA-256; empty: none
+    fingerprint: str  # of the host that judged
+    version: str  # of dreamfleet
+    seconds: Seconds
+    drives: Drives
+    judge: str = "gymnasium"
+
+    @cached_property
+    def evaluated(self) -> Evaluated:
+        """The drives with their figures."""
+        return Evaluated(self.drives)
+
+    def to_json(self) -> str:
+        """One line: the figures, then the fields, of which the drives are most."""
+        return json.dumps({**figures(self.evaluated), **asdict(self)}, allow_nan=False)
+
+    @property
+    def told(self) -> str:
+        """In words, for people: the score, how it was driven, and what by."""
+        lines = (_score(self.evaluated), _manner(self.evaluated), self._origin)
+        return "\n".join(filter(None, lines))
+
+    @property
+    def _origin(self) -> str:
+        model = f", world model {self.bundle[:12]}" if self.bundle else ""
+        made = f"{self.evaluated.steps:,} environment steps in {self.seconds:.0f} s"
+        return f"{made}; controller {self.controller[:12]}{model}; dreamfleet {self.version} on {self.fingerprint}"
+
+
+def figures(evaluated: Evaluated) -> dict[str, Any]:
+    """What is told of drives together; `error`, `finished`, `speed` and `braking` may be `None`."""
+    names = ("mean", "std", "error", "median", "least", "most", "steps", "finished", "speed", "braking")
+    found: dict[str, Any] = {"n": len(evaluated.drives), **{name: getattr(evaluated, name) for name in names}}
+    found |= {f"above_{mark}": evaluated.above(mark) for mark in MARKS}
+    return {**found, "scores": evaluated.scores, "seeds": evaluated.seeds}
+
+
+def read_judgement(path: Path) -> Judgement:
+    """What `evaluate --out` wrote; `UsageError` for anything else."""
+    try:
+        return from_plain(Judgement, known(Judgement, json.loads(read_text(path, MOST_BYTES))))
+    except FileNotFoundError:
+        raise UsageError(f"no report at {path}: `dreamfleet evaluate --out {path}` writes one") from None
+    except (OSError, ValueError, TypeError, MalformedError, RecursionError) as error:
+        raise UsageError(f"{path} is no report of `dreamfleet evaluate --out` ({error}): write it again") from error
+
+
+def _score(found: Evaluated) -> str:
+    error = "" if found.error is None else f" ± {found.error:.1f} (standard error)"
+    return (
+        f"{found.mean:.1f}{error} on {len(found.drives)} seeds, {found.least:.0f} to {found.most:.0f}, "
+        f"median {found.median:.0f}, standard deviation {found.std:.1f}; judged by gymnasium's own environment"
+    )
+
+
+def _manner(found: Evaluated) -> str:
+    """How it was driven, in a world that tells of it; empty in others."""
+    said = []
+    if found.finished is not None:
+        said += [f"above {mark}: {found.above(mark):.0%}" for mark in MARKS]
+        said.append(f"laps finished: {found.finished} of {len(found.drives)}")
+    if found.speed is not None:
+        said.append(f"mean speed {found.speed:.1f}")
+    if found.braking is not None:
+        said.append(f"brake on in {found.braking:.0%} of the steps")
+    return ", ".join(said)

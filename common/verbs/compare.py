@@ -1,0 +1,50 @@
+"""`dreamfleet compare`: whether one controller drives better than another."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from dreamfleet.common.difference import Difference
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.judgement import Judgement, read_judgement
+from dreamfleet.common.listing import add_json, answer
+
+SUMMARY = "tell the paired difference of reports that `evaluate --out` wrote, each against the first"
+EXTRAS = ()
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("reports", metavar="REPORT", nargs="+", type=Path, help="files of `evaluate --out`, 2 or more")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print each mean, and its difference from the first on equal seeds."""
+    if len(args.reports) < 2:
+        raise UsageError("give two reports or more: each is compared with the first")
+    (first, base), *others = [(path, read_judgement(path)) for path in args.reports]
+    lines, rows = [_line(first, base)], []
+    for path, each in others:
+        _warn(first, base, path, each)
+        found = Difference.between(base.evaluated, each.evaluated)
+        lines += [_line(path, each), f"{path} less {first}: {found.told}"]
+        rows.append({"report": path, "against": first, **asdict(found), "clear": found.clear})
+    answer(args, "\n".join(lines), differences=rows)
+    return 0
+
+
+def _line(path: Path, found: Judgement) -> str:
+    error = "" if found.evaluated.error is None else f" ± {found.evaluated.error:.1f}"
+    return f"{path}: {found.name}, {found.evaluated.mean:.1f}{error} on {len(found.drives)} seeds"
+
+
+def _warn(first: Path, base: Judgement, path: Path, other: Judgement) -> None:
+    """Say what else than the controllers may make a difference."""
+    for what in ("world", "fingerprint"):
+        one, another = getattr(base, what), getattr(other, what)
+        if one != another:
+            print(f"note: {first} and {path} are of different {what}s: {one!r} and {another!r}", file=sys.stderr)

@@ -1,0 +1,101 @@
+"""A run that is had a second time, by the receipt of the controller that it reported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.config import Table
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files import is_there
+from dreamfleet.common.receipt import Receipt, receipt_of, settings_in
+from dreamfleet.common.runs import CONTROLLER, JOURNAL, RunFolder, open_run
+from dreamfleet.common.stored import RunSettings
+from dreamfleet.coordinator.config import LimitsConfig, RunConfig, settings_of
+from dreamfleet.coordinator.kept import kept_network
+from dreamfleet.coordinator.receipts import versions
+from dreamfleet.coordinator.start import Start
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What the run reported the second time, beside the first."""
+
+    same: bool  # to the bit
+    told: str
+    why: str = ""  # what differs, and may be the cause
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """What it takes to have a controller's run again."""
+
+    controller: Controller
+    bundle: Bundle | None
+    settings: RunSettings
+    receipt: Receipt
+
+    @classmethod
+    def of(cls, controller: Controller, bundle: Bundle | None) -> Repetition:
+        """By the controller's receipt; `ControllerError` where it has none."""
+        return cls(controller, bundle, settings_in(controller), receipt_of(controller))
+
+    @property
+    def limits(self) -> LimitsConfig:
+        """As many generations as were closed, whatever ended the run the first time."""
+        return LimitsConfig(generations=self.receipt.generations)
+
+    @property
+    def start(self) -> Start | None:
+        """Where the run began, whole."""
+        kept, spec = self.receipt.start, self.settings.task
+        return None if kept is None else Start(kept.vector, spec.bundle, kept.source, spec.options, kept.effort)
+
+    def plan(self, folder: Path) -> tuple[RunConfig | None, Table]:
+        """How to begin the run in a folder, or `None` and the network it had, where it was begun there before.
+
+        `UsageError` where another run lies there, or this version would begin another one.
+        """
+        if not is_there(folder / JOURNAL):
+            return self._config(), {}
+        with open_run(folder.parent, folder.name) as stored:
+            if stored.settings != self.settings:
+                raise UsageError(f"run {folder.name} exists and is another one: choose another --run")
+            return None, kept_network(stored)
+
+    def compare(self, folder: Path) -> Compared:
+        """What the run in a folder reports, with the controller."""
+        again = Controller.load(folder / CONTROLLER)
+        if again.sha256 == self.controller.sha256:
+            return Compared(True, f"the same controller as the first time, to the bit ({again.sha256[:12]})")
+        with RunFolder(folder) as stored:
+            why = self._cause(stored)
+        names = f"({again.sha256[:12]} instead of {self.controller.sha256[:12]})"
+        return Compared(False, f"NOT the same controller as the first time {names}: {why}", why)
+
+    def _config(self) -> RunConfig:
+        path = self.bundle.path if self.bundle is not None else Path()
+        config = RunConfig(**settings_of(self.settings, path))
+        made = config.settings(self.bundle)
+        others = [each.name for each in fields(made) if getattr(made, each.name) != getattr(self.settings, each.name)]
+        if others:
+            raise UsageError(
+                f"this version would begin another run than the receipt's ({', '.join(others)} would differ): install "
+                f"dreamfleet {(self.receipt.versions or {}).get('dreamfleet', 'as it was')}"
+            )
+        return config
+
+    def _cause(self, stored: RunFolder) -> str:
+        """What is known to differ between the first time and now."""
+        first, here = self.receipt, versions()
+        if first.mixed:
+            return "the first run took hosts of any kind, so that its last bits are its own"
+        if first.fingerprint is None:
+            return "the receipt names no fingerprint, and only equal hosts give equal bits"
+        if first.fingerprint != stored.fingerprint:
+            return f"its hosts were of another fingerprint: [{first.fingerprint}], now [{stored.fingerprint}]"
+        others = [f"{name} {each}, now {here.get(name)}" for name, each in (first.versions or {}).items()
+                  if here.get(name) != each]  # fmt: skip
+        return f"the coordinator's versions differ: {'; '.join(others)}" if others else "hosts and versions are equal"

@@ -1,0 +1,61 @@
+"""`dreamfleet runs plot`: what runs learnt, as a picture."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.runs import open_run
+from dreamfleet.common.saving import check_out
+from dreamfleet.common.site import offer
+
+SUMMARY = "draw runs' evaluated scores over environment steps and core-hours, or one run's fitness over generations"
+EXTRAS = ("views",)
+LEARNING, FITNESS = "learning.png", "fitness.png"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("run_names", metavar="RUN", nargs="+", help="names of runs of one world")
+    parser.add_argument("--fitness", action="store_true", help="draw what one run's candidates scored instead")
+    parser.add_argument("--out", type=Path, help=f"a PNG or SVG to write (default {LEARNING}, or {FITNESS})")
+    offer(parser, "runs_dir")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw, and print where it lies."""
+    from dreamfleet.coordinator.plot import KINDS
+
+    out = args.out or Path(FITNESS if args.fitness else LEARNING)
+    if out.suffix not in KINDS:
+        raise UsageError(f"--out {out}: give a name that ends in {' or '.join(KINDS)}")
+    check_out(out)
+    (_draw_fitness if args.fitness else _draw_learning)(args, out)
+    answer(args, str(out), picture=out, runs=args.run_names)
+    return 0
+
+
+def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
+    from dreamfleet.coordinator.plot import plot_fitness
+
+    if len(args.run_names) > 1:
+        raise UsageError("--fitness is of one run: name one")
+    with open_run(args.runs_dir, args.run_names[0]) as stored:
+        plot_fitness(stored, out)
+
+
+def _draw_learning(args: argparse.Namespace, out: Path) -> None:
+    from dreamfleet.coordinator.learning import CAR_RACING, PAPER, LearningCurve
+    from dreamfleet.coordinator.plot import plot_learning
+
+    curves = []
+    for name in dict.fromkeys(args.run_names):
+        with open_run(args.runs_dir, name) as stored:
+            curves.append(LearningCurve.of(stored))
+    worlds = sorted({each.world for each in curves})
+    if len(worlds) > 1:
+        raise UsageError(f"these runs are of the worlds {', '.join(worlds)}: draw those of one world together")
+    plot_learning(curves, PAPER if worlds == [CAR_RACING] else (), out)

@@ -1,0 +1,137 @@
+"""Drives of a controller: their figures, the document they are told in, and whether another's are better."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common import cli
+from dreamfleet.common.difference import Difference
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.evaluated import Drive, Evaluated
+from dreamfleet.common.judgement import Judgement, read_judgement
+from dreamfleet.common.reproduction import Reproduction
+
+DRIVES = (
+    Drive(10_000, 850.0, 1000, False, 50.0, 0.0),
+    Drive(10_001, 910.0, 500, True, 80.0, 0.3),
+    Drive(10_002, 250.0, 500, False, 60.0, 0.1),
+)
+JUDGEMENT = Judgement("tiny", "cd" * 32, "dream", "car-racing", "ab" * 32, "x86_64 avx2", "0.1.0", 12.5, DRIVES)
+
+
+def scored(*scores, first=10_000, **others):
+    """A report of a world that tells nothing but scores."""
+    drives = tuple(Drive(seed, float(score), 10) for seed, score in enumerate(scores, first))
+    return replace(JUDGEMENT, drives=drives, **others)
+
+
+def test_figures_are_of_all_drives_and_a_long_one_counts_for_more():
+    found = Evaluated.of(reversed(DRIVES))
+    assert found.seeds == (10_000, 10_001, 10_002)
+    assert (found.mean, found.median, found.least, found.most) == (670.0, 850.0, 250.0, 910.0)
+    assert found.std == pytest.approx(np.std(found.scores))
+    assert found.error == pytest.approx(np.std(found.scores, ddof=1) / np.sqrt(3))
+    assert (found.above(800), found.above(910), found.steps, found.finished) == (2 / 3, 0.0, 2000, 1)
+    assert (found.speed, found.braking) == (pytest.approx(60.0), pytest.approx(0.1))
+
+
+def test_a_world_that_tells_nothing_leaves_its_figures_out():
+    found = scored(1.0).evaluated
+    assert (found.finished, found.speed, found.braking, found.error) == (None, None, None, None)
+    assert "laps" not in scored(1.0).told
+    assert "standard error" not in scored(1.0).told
+
+
+def test_people_are_told_how_it_drove_and_what_with():
+    score, manner, origin = JUDGEMENT.told.splitlines()
+    assert score.startswith("670.0 ± 210.7 (standard error) on 3 seeds, 250 to 910, median 850")
+    assert manner == (
+        "above 800: 67%, above 900: 33%, laps finished: 1 of 3, mean speed 60.0, brake on in 10% of the steps"
+    )
+    assert origin.startswith(f"2,000 environment steps in 12 s; controller {'cd' * 6}, world model {'ab' * 6}; ")
+
+
+def test_a_report_is_read_as_it_was_written_and_tells_its_figures(tmp_path):
+    path = tmp_path / "report.json"
+    path.write_text(JUDGEMENT.to_json())
+    plain = json.loads(path.read_text())
+    assert read_judgement(path) == JUDGEMENT
+    assert {"mean", "std", "scores", "seeds", "task", "bundle", "judge"} < plain.keys(), "as ever"
+    assert (plain["n"], plain["above_900"], plain["finished"], plain["controller"]) == (3, 1 / 3, 1, "cd" * 32)
+    assert plain["drives"][1]["steps"] == 500
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"drives": []}', JUDGEMENT.to_json().replace("910.0", '"910"')])
+def test_what_is_no_report_is_refused_in_one_line(tmp_path, text):
+    path = tmp_path / "report.json"
+    path.write_text(text)
+    with pytest.raises(UsageError, match="write it again"):
+        read_judgement(path)
+    with pytest.raises(UsageError, match="no report at"):
+        read_judgement(tmp_path / "nowhere.json")
+
+
+def test_a_difference_is_of_equal_seeds_and_what_tracks_have_in_common_falls_out():
+    found = Difference.between(scored(100, 500, 900).evaluated, scored(110, 512, 908, 0).evaluated)
+    assert (found.seeds, found.mean) == (3, 10.0)
+    assert found.error == pytest.approx(np.std([10, 12, 8], ddof=1) / np.sqrt(3))
+    assert found.clear
+    assert found.told.endswith("on 3 equal seeds: better")
+
+
+def test_a_difference_under_two_standard_errors_is_none():
+    found = Difference.between(scored(100, 500, 900).evaluated, scored(200, 400, 930).evaluated)
+    assert not found.clear
+    assert found.told.endswith("none, for a difference under two standard errors is none")
+    assert Difference.between(*[JUDGEMENT.evaluated] * 2).told == "the same scores, to the bit, on 3 equal seeds"
+    with pytest.raises(UsageError, match="1 seeds are in both"):
+        Difference.between(scored(1, 2).evaluated, scored(1, 2, first=10_001).evaluated)
+
+
+def test_the_verb_compares_each_report_with_the_first(tmp_path, capsys):
+    paths = [tmp_path / f"{name}.json" for name in "abc"]
+    for path, scores in zip(paths, [(100, 500, 900), (110, 512, 908), (100, 500, 900)], strict=True):
+        path.write_text(scored(*scores).to_json())
+    assert cli.main(["compare", *map(str, paths)]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 5
+    assert said[2].endswith("better")
+    assert "to the bit" in said[4]
+    assert cli.main(["compare", *map(str, paths), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["differences"]
+    assert [(each["mean"], each["clear"]) for each in rows] == [(10.0, True), (0.0, False)]
+    assert cli.main(["compare", str(paths[0])]) == UsageError.exit_code
+
+
+def test_what_else_differs_than_the_controllers_is_noted(tmp_path, capsys):
+    for name, changes in {"a": {}, "b": {"task": "car-racing"}, "c": {"fingerprint": "arm"}}.items():
+        (tmp_path / f"{name}.json").write_text(scored(1, 2, **changes).to_json())
+    assert cli.main(["compare", *(str(tmp_path / f"{name}.json") for name in "abc")]) == 0
+    notes = capsys.readouterr().err.splitlines()
+    assert len(notes) == 1, "a dream's controllers are driven in reality too"
+    assert "of different fingerprints" in notes[0]
+
+
+ELSEWHERE = {"fingerprint": "aarch64"}
+
+
+@pytest.mark.parametrize(
+    ("scores", "changes", "holds", "says"),
+    [
+        ((100, 500, 900), {}, True, "reproduced: the same 3 scores to the bit"),
+        ((100, 500, 900), ELSEWHERE, True, "though this host is of another fingerprint"),
+        ((100, 500, 900.0001), {}, False, "NOT reproduced: 1 of 3 drives differ (seeds 10002)"),
+        ((110, 480, 900), ELSEWHERE, True, "reproduced: mean 496.7"),
+        ((110, 511, 909), ELSEWHERE, False, "NOT reproduced: mean 510.0"),
+        ((100, 500), {}, True, "the same 2 scores"),
+    ],
+)
+def test_a_record_holds_to_the_bit_on_an_equal_host_and_within_two_standard_errors_elsewhere(
+    scores, changes, holds, says
+):
+    found = Reproduction(scored(100, 500, 900), scored(*scores, **changes))
+    assert found.holds == holds
+    assert says in found.told
+    assert found.told.startswith("tiny: ")

@@ -1,0 +1,44 @@
+"""What `--out` names is looked at before the work, and is whole or not there."""
+
+import os
+from contextlib import suppress
+
+import pytest
+
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.saving import check_out, saving
+
+
+def test_a_folder_is_made_and_a_file_is_whole(tmp_path):
+    path = tmp_path / "results" / "tiny.json"
+    check_out(path)
+    with saving(path) as file:
+        file.write(b"all of it")
+    assert path.read_bytes() == b"all of it"
+
+
+def test_where_no_file_can_be_is_said_before_the_work(tmp_path):
+    with pytest.raises(UsageError, match="is a folder"):
+        check_out(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="cannot be made"):
+        check_out(tmp_path / "file" / "tiny.json")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_nobody_may_write_in_is_said_before_the_work(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(UsageError, match="cannot be written in"):
+        check_out(tmp_path / "tiny.json")
+
+
+def test_what_fails_half_way_leaves_what_was_there(tmp_path):
+    path = tmp_path / "tiny.json"
+    path.write_text("before")
+    with suppress(RuntimeError), saving(path) as file:
+        file.write(b"half")
+        raise RuntimeError
+    assert [each.name for each in tmp_path.iterdir()] == ["tiny.json"]
+    assert path.read_text() == "before"
+    with pytest.raises(DreamfleetError, match="cannot write"), saving(tmp_path / ("n" * 300)):
+        pass

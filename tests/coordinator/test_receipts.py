@@ -1,0 +1,160 @@
+"""The receipt in a reported controller: drawn up from the journal, and enough to begin the run again."""
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.effort import Effort
+from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.messages import Result
+from dreamfleet.common.receipt import receipt_of, settings_in
+from dreamfleet.common.runs import CONTROLLER
+from dreamfleet.common.shelf import bundle_for, find_controller
+from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.journal import Journal
+from dreamfleet.coordinator.kept import facts_of
+from dreamfleet.coordinator.repetition import Repetition
+from dreamfleet.coordinator.start import EFFORT, Start, find_start
+from tests.coordinator.test_report import EVALUATED, Reporting
+
+
+class Spending(Reporting):
+    """Each result took a tenth of a second and ten steps."""
+
+    start, network = None, NetworkConfig()
+
+    def begin(self):
+        if self.start is not None:
+            for name, text in {**self.start.facts, **facts_of(self.limits, self.network)}.items():
+                self.journal.set_fact(name, text)
+            self.journal.commit()
+        super().begin()
+
+    def end(self):
+        while self.run.ended is None:
+            self.step()
+        return Controller.load(self.path / CONTROLLER)
+
+
+@pytest.fixture
+def make(tmp_path, random_bundle):
+    made = []
+
+    def begin(start=None, network=None, **changes):
+        kind = type("One", (Spending,), {"start": start, "network": network or NetworkConfig()})
+        settings = replace(EVALUATED, **changes)
+        made.append(kind(tmp_path / "runs" / f"night-{len(made)}", random_bundle.path, settings, 4))
+        return made[-1]
+
+    yield begin
+    for each in made:
+        each.journal.close()
+
+
+def test_it_tells_generations_effort_fingerprint_versions_and_seeds(make):
+    bench = make()
+    receipt = receipt_of(bench.end())
+    settings = bench.settings
+    scored = 4 * settings.population * settings.episodes
+    assert receipt.generations == 4
+    assert receipt.effort == Effort(10 * scored, 10 * 2 * 2, 0, 100_000 * (scored + 4))
+    assert (receipt.fingerprint, receipt.mixed, receipt.start) == ("f", False, None)
+    assert {"dreamfleet", "numpy", "cma", "python"} <= receipt.versions.keys()
+    assert receipt.seeds == {"evaluation": (20_000, 2)}
+    assert settings_in(bench.saved()) == settings
+
+
+def test_effort_is_counted_on_as_it_would_be_summed_up(make):
+    bench = make()
+    before = bench.journal.effort
+    bench.step()
+    bench.run.commit()
+    assert bench.journal.effort == before + Effort(10, 0, 0, 100_000)
+    again = Journal(bench.path / "journal.sqlite")
+    assert again.effort == bench.journal.effort
+    again.close()
+
+
+def test_a_start_is_in_it_whole_with_what_had_been_spent(make, tmp_path):
+    size = EVALUATED.controller.size
+    start = Start(np.linspace(0, 1, size), EVALUATED.task.bundle, "controller a", "", Effort(5, 6, 7, 8))
+    bench = make(start, NetworkConfig(mixed=True))
+    found = receipt_of(bench.end())
+    assert np.array_equal(found.start.vector, start.mean)
+    assert (found.start.source, found.start.effort, found.mixed) == ("controller a", start.effort, True)
+    assert found.total == start.effort + found.effort
+    follower = find_start(str(bench.path / CONTROLLER), tmp_path)
+    assert follower.effort == found.total
+    assert json.loads(follower.facts[EFFORT])["driven"] == found.total.driven
+
+
+def test_a_start_of_unknown_origin_has_no_effort(tmp_path, random_bundle):
+    shape = random_bundle.controller_shape
+    Controller(shape, np.zeros(shape.size, np.float32), "dream", random_bundle.sha256).save(tmp_path / "a.npz")
+    start = find_start(str(tmp_path / "a.npz"), tmp_path)
+    assert start.effort is None
+    assert EFFORT not in start.facts
+
+
+def test_what_ships_can_be_begun_again_as_it_was(tmp_path):
+    controller, _ = find_controller("tiny", tmp_path)
+    bundle = bundle_for(controller, None)
+    again = Repetition.of(controller, bundle)
+    config, kept = again.plan(tmp_path / "tiny-again")
+    assert config.settings(bundle) == settings_in(controller)
+    assert (again.limits, again.start, kept) == (LimitsConfig(generations=25), None, {})
+
+
+def test_another_run_is_not_gone_on_with_and_another_version_is_named(tmp_path, random_bundle):
+    controller, settings = begun(random_bundle, population=6), RunConfig(population=5).settings(random_bundle)
+    folder = tmp_path / "other"
+    folder.mkdir()
+    Journal.create(folder, settings, random_bundle.path).close()
+    again = Repetition.of(controller, random_bundle)
+    with pytest.raises(UsageError, match="run other exists and is another one"):
+        again.plan(folder)
+    strange = replace(again, settings=replace(again.settings, packages=("rocks",)))
+    with pytest.raises(UsageError, match=r"packages would differ\): install dreamfleet as it was"):
+        strange.plan(tmp_path / "new")
+
+
+def begun(bundle, **changes):
+    """A controller of a run that has just begun."""
+    settings = RunConfig(**changes).settings(bundle)
+    told = {"settings": asdict(settings), "generation": 0, "steps": 10}
+    still = np.zeros(settings.controller.size, np.float32)
+    return Controller(settings.controller, still, settings.task.task, bundle.sha256, told)
+
+
+def test_why_a_second_time_differs_is_said_as_far_as_it_is_known(make):
+    first, second = make(), make(seed=2)
+    controller = first.end()
+    second.end()
+    again = Repetition.of(controller, None)
+    assert again.compare(first.path).same
+    found = again.compare(second.path)
+    assert (found.same, found.why) == (False, "hosts and versions are equal")
+    for changes, says in (
+        ({"mixed": True}, "hosts of any kind"),
+        ({"fingerprint": None}, "names no fingerprint"),
+        ({"fingerprint": "g"}, "now [f]"),
+        ({"versions": {"cma": "1"}}, "cma 1, now"),
+    ):
+        other = replace(again, receipt=replace(again.receipt, **changes))
+        assert says in other.compare(second.path).told
+    with pytest.raises(ControllerError):
+        again.compare(first.path.parent)
+
+
+def test_a_result_is_counted_once_whoever_says_it_again(make):
+    bench = make()
+    for send in bench.run.exchange.dispatch(bench.now):
+        bench.given += [work.job for work in send.content.work]
+    job = bench.given.pop(0)
+    before = bench.journal.effort
+    for _ in range(2):
+        bench.deliver("a/00000001", Result(job.digest, 1.0, 10, 0.1, None, None))
+    assert bench.journal.effort == before + Effort(10, 0, 0, 100_000)

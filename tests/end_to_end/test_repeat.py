@@ -1,0 +1,84 @@
+"""A run is had again from its controller's receipt alone, with real processes, to the bit."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.receipt import receipt_of
+from dreamfleet.common.runs import CONTROLLER, open_run
+from tests.support import tasks
+from tests.support.processes import DEADLINE, ROOT
+
+pytestmark = pytest.mark.timeout(300)
+STAGES = """
+[[stage]]
+generations = 2
+horizon = 4
+
+[[stage]]
+horizon = 10
+population = 7
+sigma0 = 0.3
+"""
+
+
+@pytest.fixture
+def first(processes, random_bundle, tmp_path):
+    """The controller of a run of two stages that began from another controller; its journal is gone."""
+    (tmp_path / "stages.toml").write_text(STAGES)
+    shape = random_bundle.controller_shape
+    start = np.linspace(-1, 1, shape.size, dtype=np.float32)
+    Controller(shape, start, tasks.TOY, random_bundle.sha256).save(tmp_path / "start.npz")
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", tasks.TOY, "--population", 5, "--episodes", 2, "--evaluate-every", 2,
+        "--evaluation-episodes", 3, "--confirm-episodes", 4, "--steps", 400, "--schedule", tmp_path / "stages.toml",
+        "--init", tmp_path / "start.npz", name="first",
+    )  # fmt: skip
+    processes.worker("--task", tasks.TOY, "--run", "first", "--exit-when-done")
+    assert coordinator.finish()[0] == 0
+    kept = tmp_path / "kept.npz"
+    (processes.runs / "first" / CONTROLLER).rename(kept)
+    (tmp_path / "start.npz").unlink()
+    assert processes.call("runs", "delete", "first", "--yes", "--runs-dir", processes.runs)[0] == 0
+    return kept
+
+
+def test_a_run_is_repeated_to_the_bit_through_a_kill(processes, first, random_bundle):
+    words = ("repeat", first, "--bundle", random_bundle.path, "--runs-dir", processes.runs, "--listen",
+             processes.endpoint, "--beat", 0.2, "--json")  # fmt: skip
+    again = processes.start(*words)
+    processes.worker("--task", tasks.TOY, "--run", "kept-again")
+    again.wait_for("generation 1: mean")
+    again.end()
+    again = processes.start(*words)
+    code, out = again.finish()
+    told = json.loads(out)
+    assert (code, told["same"], told["run"]) == (0, True, "kept-again"), told
+    before, after = Controller.load(first), Controller.load(processes.runs / "kept-again" / CONTROLLER)
+    assert after.sha256 == before.sha256
+    assert after.provenance["validation_mean"] == before.provenance["validation_mean"]
+    assert receipt_of(after).start == receipt_of(before).start
+    with open_run(processes.runs, "kept-again") as run:
+        assert len(run.history()) == receipt_of(before).generations
+        assert len(run.settings.stages) == 2
+
+
+def test_a_script_runs_both_sides_and_its_exit_code_says_whether_it_is_the_same(processes, first):
+    receipt = Controller.load(first)
+    told = {**receipt.provenance, "settings": {**receipt.provenance["settings"], "seed": 2}}
+    moved = processes.folder / "moved.npz"
+    Controller(receipt.shape, receipt.parameters, receipt.task, receipt.bundle, told).save(moved)
+    done = subprocess.run(
+        [sys.executable, ROOT / "deploy" / "reproduce_evolution.py", moved, "--workers", "1", "--port",
+         str(processes.port), "--runs-dir", processes.runs, "--task", tasks.TOY],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "DREAMFLEET_CACHE": str(processes.cache)}, capture_output=True,
+        text=True, timeout=DEADLINE, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert "NOT the same controller as the first time" in done.stdout
+    assert "hosts and versions are equal" in done.stdout

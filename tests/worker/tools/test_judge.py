@@ -1,0 +1,78 @@
+"""A judge tells how an episode was driven, and drives it as it would unwatched."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+from dreamfleet.common.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.bundle import find_bundle
+from dreamfleet.common.evaluated import Drive
+from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.shelf import find_controller
+from dreamfleet.worker.scoring.episode import Course, Moment
+from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tasks.api import Score, World
+from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tools.judge import Judge, Watch
+
+STEPS = 12
+SEED = 20_003
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return find_bundle("tiny")
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Whole episodes are a few steps long."""
+    monkeypatch.setattr(Scorer, "course", lambda _self, _kind, seed, _spec=None: Course(seed, STEPS))
+
+
+@pytest.mark.parametrize("task", ["car-racing", "dream"])
+def test_it_tells_speed_and_brake_of_a_drive_that_is_the_same_unwatched(tiny, short, tmp_path, task):
+    parameters = find_controller("tiny", tmp_path)[0].parameters.copy()
+    parameters[2 * 288 : 3 * 288], parameters[-1] = 0.0, 5.0  # the brake's weights and bias: it is always on
+    spec = TaskSpec(task, tiny.sha256, 1000, 0)
+    judge, unwatched = Judge(spec, tiny), Scorer(spec, tiny, judge=True)
+    drive = judge.drive(parameters, SEED)
+    alone = unwatched.score("evaluate", parameters, SEED)
+    judge.close()
+    unwatched.close()
+    assert (drive.seed, drive.score, drive.steps) == (SEED, alone.fitness, STEPS)
+    assert drive.finished is False
+    assert drive.braking == 1.0
+    assert 0 <= drive.speed < 20
+
+
+def test_of_a_world_that_tells_nothing_nothing_is_told():
+    watch = Watch(World(STEERING_GAS_BRAKE, action_names=("steer", "gas", "brake")), None)
+    watch.see(moment({"lap_finished": True}))
+    assert watch.drive(3, Score(5.0, 1)) == Drive(3, 5.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("last", "finished"), [({"lap_finished": True}, True), ({"lap_finished": False}, False), ({}, False)]
+)
+def test_a_lap_is_finished_where_the_environment_says_so_as_it_ends(last, finished):
+    watch = Watch(find_task("car-racing").world, lambda: {"speed": 30.0})
+    for info in ({}, last):
+        watch.see(moment(info))
+    drive = watch.drive(1, Score(900.0, 2))
+    assert (drive.finished, drive.speed, drive.braking) == (finished, 30.0, 0.0)
+
+
+def test_gymnasium_says_so_of_a_lap():
+    """The rule that is relied on: all tiles visited, and the flag in `info`; off the field it is there, and false."""
+    environment = gymnasium.make("CarRacing-v3")
+    environment.reset(seed=1)
+    inner = environment.unwrapped
+    inner.new_lap = True
+    *_, terminated, truncated, info = environment.step(np.zeros(3, np.float32))
+    environment.close()
+    assert (terminated, truncated, info) == (True, False, {"lap_finished": True})
+
+
+def moment(info):
+    return Moment(None, np.zeros(3), 1.0, 1, bool(info), False, info)

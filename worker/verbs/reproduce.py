@@ -1,0 +1,67 @@
+"""`dreamfleet reproduce`: recorded scores again."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.site import offer
+from dreamfleet.common.threads import pin_thread_pools
+
+if TYPE_CHECKING:
+    from dreamfleet.common.judgement import Judgement
+    from dreamfleet.common.reproduction import Reproduction
+
+SUMMARY = "drive recorded controllers again on their recorded seeds, and compare with what `evaluate --out` wrote"
+EXTRAS = ("worker",)
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("reports", metavar="REPORT", nargs="+", type=Path, help="files of `evaluate --out`")
+    parser.add_argument("--episodes", type=int, help="drive only the first so many seeds of each (default all)")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
+    offer(parser, "runs_dir")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Say of each report whether it holds; exit 1 if one does not."""
+    pin_thread_pools()  # of NumPy, which is not loaded yet
+    from dreamfleet.common.judgement import read_judgement
+
+    if args.jobs < 1 or (args.episodes is not None and args.episodes < 1):
+        raise UsageError("--episodes and --jobs must be at least 1")
+    found = [_again(args, path, recorded) for path, recorded in [(each, read_judgement(each)) for each in args.reports]]
+    rows = [{"report": path, **_row(each)} for path, each in zip(args.reports, found, strict=True)]
+    holds = all(each.holds for each in found)
+    answer(args, "\n".join(each.told for each in found), reproduced=holds, reports=rows)
+    return 0 if holds else 1
+
+
+def _again(args: argparse.Namespace, path: Path, recorded: Judgement) -> Reproduction:
+    """Drive one report's controller again."""
+    from dreamfleet.common.reproduction import Reproduction
+    from dreamfleet.common.shelf import bundle_for, find_controller
+    from dreamfleet.worker.verbs.evaluate import judge
+
+    controller, beside = find_controller(recorded.name, args.runs_dir)
+    if controller.sha256 != recorded.controller:
+        raise ControllerError(
+            f"{path} records the controller {recorded.controller[:12]}, and {recorded.name} is "
+            f"{controller.sha256[:12]}: take the one that was recorded, or record this one with `dreamfleet evaluate`"
+        )
+    seeds = recorded.evaluated.seeds[: args.episodes]
+    again = judge(recorded.name, controller, bundle_for(controller, None, beside), seeds, args.jobs)
+    return Reproduction(recorded, again)
+
+
+def _row(found: Reproduction) -> dict[str, object]:
+    difference = asdict(found.difference) if len(found.pairs) > 1 else None
+    return {"name": found.recorded.name, "reproduced": found.holds, "same_host": found.same_host,
+            "differing": found.differing, "mean": found.again.evaluated.mean, "difference": difference}  # fmt: skip
