@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
+from dreamfleet.common.bounds import LARGEST_FITNESS
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.evaluated import Drive, Evaluated
@@ -68,11 +69,21 @@ def figures(evaluated: Evaluated) -> dict[str, Any]:
 def read_judgement(path: Path) -> Judgement:
     """What `evaluate --out` wrote; `UsageError` for anything else."""
     try:
-        return from_plain(Judgement, known(Judgement, json.loads(read_text(path, MOST_BYTES))))
+        found = from_plain(Judgement, known(Judgement, json.loads(read_text(path, MOST_BYTES))))
+        _check(found.drives)
+        return found
     except FileNotFoundError:
         raise UsageError(f"no report at {path}: `dreamfleet evaluate --out {path}` writes one") from None
     except (OSError, ValueError, TypeError, MalformedError, RecursionError) as error:
         raise UsageError(f"{path} is no report of `dreamfleet evaluate --out` ({error}): write it again") from error
+
+
+def _check(drives: tuple[Drive, ...]) -> None:
+    """`ValueError` for drives that nothing can be computed from."""
+    if len({each.seed for each in drives}) < len(drives):
+        raise ValueError("a seed stands there twice")
+    if not all(abs(each.score) <= LARGEST_FITNESS for each in drives):  # false of NaN too
+        raise ValueError(f"a score lies beyond ±{LARGEST_FITNESS:g}")
 
 
 def _score(found: Evaluated) -> str:

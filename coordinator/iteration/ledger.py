@@ -12,10 +12,17 @@ from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files import read_text, write_aside
 from dreamfleet.coordinator.iteration.config import HARMLESS, IterateConfig
-from dreamfleet.coordinator.iteration.plan import BUNDLE, GATE, Phase
+from dreamfleet.coordinator.iteration.plan import ALL, BUNDLE, DATA, EVOLVE, GATE, Phase
 
 FORMAT = 1
 MOST_BYTES = 256 << 20
+FIGURES: dict[str, dict[str, Any]] = {  # that later phases, or people, are told of a finished one
+    **{phase: {"new": int, "episodes": int} for phase in DATA},
+    BUNDLE: {"sha256": str, "frames": int, "quality": dict},
+    GATE: {"kept": bool, "why": str, "new": dict},
+    EVOLVE: {"generations": int, "ended": str, "score": (dict, type(None))},
+}
+SCORE = {"mean": (int, float), "error": (int, float), "episodes": int, "confirmed": bool}
 
 
 @dataclass(frozen=True)
@@ -120,6 +127,8 @@ class Ledger:
         if unknown := sorted(set(found.settings) - known):
             raise ValueError(f"it has settings that this version does not know: {', '.join(unknown)}")
         IterateConfig(**found.settings)
+        for each in found.entries:
+            _check(each)
         return found
 
     def save(self, path: Path) -> None:
@@ -139,6 +148,22 @@ class Ledger:
             return None
         except (OSError, ValueError, TypeError, RecursionError, MalformedError, UsageError) as error:
             raise DatasetError(f"{path} is damaged ({error}); put it back from a copy") from error
+
+
+def _check(entry: Entry) -> None:
+    """`ValueError` for an entry that cannot have been written of a phase."""
+    if entry.phase not in ALL:
+        raise ValueError(f"there is no phase {entry.phase!r:.40}")
+    told = _unfit(entry.figures, FIGURES.get(entry.phase, {}))
+    told = told or _unfit(entry.figures.get("score") or {}, SCORE if entry.figures.get("score") else {})
+    if told:
+        raise ValueError(f"phase {entry.of} does not tell its {told}")
+
+
+def _unfit(figures: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    return next(
+        (name for name, kind in wanted.items() if name not in figures or not isinstance(figures[name], kind)), ""
+    )
 
 
 def _differing(begun: Mapping[str, Any], wanted: Mapping[str, Any], free: frozenset[str] = frozenset()) -> list[str]:

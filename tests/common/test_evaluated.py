@@ -105,6 +105,23 @@ def test_the_verb_compares_each_report_with_the_first(tmp_path, capsys):
     assert cli.main(["compare", str(paths[0])]) == UsageError.exit_code
 
 
+@pytest.mark.parametrize("scores", [(1e308, 2, 3), (float("nan"), 2, 3)])
+def test_scores_that_nothing_can_be_computed_from_are_no_report(tmp_path, scores):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps({**json.loads(scored(1, 2, 3).to_json()), "drives": [
+        {"seed": seed, "score": score, "steps": 9} for seed, score in enumerate(scores)
+    ]}))  # fmt: skip
+    with pytest.raises(UsageError, match="no report"):
+        read_judgement(path)
+
+
+def test_a_seed_that_stands_twice_is_no_report(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text(scored(1, 2).to_json().replace("10001", "10000"))
+    with pytest.raises(UsageError, match="a seed stands there twice"):
+        read_judgement(path)
+
+
 def test_what_else_differs_than_the_controllers_is_noted(tmp_path, capsys):
     for name, changes in {"a": {}, "b": {"task": "car-racing"}, "c": {"fingerprint": "arm"}}.items():
         (tmp_path / f"{name}.json").write_text(scored(1, 2, **changes).to_json())

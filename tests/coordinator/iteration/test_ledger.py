@@ -23,7 +23,7 @@ def ledger(*entries):
 
 
 def test_it_is_kept_whole(tmp_path):
-    written = ledger(entry(1, "collect", [Made("episodes/000000.npz", "ab" * 32)], episodes=1))
+    written = ledger(entry(1, "collect", [Made("episodes/000000.npz", "ab" * 32)], episodes=1, new=1))
     written.save(tmp_path / "iteration.json")
     assert Ledger.load(tmp_path / "iteration.json") == written
     assert Ledger.load(tmp_path / "absent.json") is None
@@ -37,12 +37,15 @@ def test_it_is_kept_whole(tmp_path):
         lambda text: text.replace('"noise": 0.3', '"noise": -1'),
         lambda text: text.replace('"noise": 0.3', '"noise": 0.3, "nosie": 1'),
         lambda text: text.replace('"seconds": 1.5', '"seconds": "long"'),
+        lambda text: text.replace('"episodes": 1,', '"episodes": "one",'),
+        lambda text: text.replace('"collect"', '"gate"'),
+        lambda text: text.replace('"collect"', '"sing"'),
         lambda _text: "[" * 100_000,
     ],
 )
 def test_damage_is_one_line_with_a_remedy(tmp_path, damage):
     path = tmp_path / "iteration.json"
-    path.write_text(damage(ledger(entry(1, "collect", episodes=1)).to_json()))
+    path.write_text(damage(ledger(entry(1, "collect", episodes=1, new=1)).to_json()))
     with pytest.raises(DatasetError, match=r"iteration\.json is damaged \(.*\); put it back from a copy"):
         Ledger.load(path)
 
