@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from dreamfleet.worker.inspection.mind import Mind
+from dreamfleet.worker.scoring.mind import Mind
 
 from dreamfleet.common.variants import Variant
 from dreamfleet.worker.inspection.imagination import Beginning, Imagination
