@@ -53,8 +53,8 @@ class RunConfig:
     task_options: str | None = option(None, "the task's own options as `runs show` prints them, instead of these two")
     variant: tuple[str, ...] = option(
         (),
-        "NAME=VALUE of how car-racing is driven, in its dream too: pedals=one, pedal_shift=, decide_every=, "
-        "feedback=last, time_cost= (docs/tasks.md)",
+        "NAME=VALUE of how car-racing is driven: pedals=one, pedal_shift=, decide_every=, feedback=last, in its dream "
+        "too, and time_cost= (docs/tasks.md)",
     )
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
     hidden_units: int = option(8, "units of a hidden controller's layer")
@@ -186,7 +186,9 @@ class RunConfig:
         if not variant.plain and self.task not in (WORLD, DREAM):
             raise UsageError(f"task {self.task} has no variants: {WORLD} has, and its dream")
         if variant.time_cost and self.task == DREAM:
-            raise UsageError("time_cost is of candidates that drive: no lap is ever over in a dream; leave it out")
+            raise UsageError(
+                "time_cost is of candidates that drive: no lap is ever over in a dream; name --variant without it"
+            )
         return variant
 
     def _described(self) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:

@@ -68,11 +68,11 @@ class Confirmation:
         """The open round in words."""
         tracks = len(self._digests) // len(self._standing)
         if len(self._standing) == 1:
-            return (
-                f"confirming: generation {self._standing[0].generation}'s mean on {tracks} fresh tracks, for its score"
-            )
+            fresh = f"{tracks} fresh tracks" if tracks > 1 else "a fresh track"
+            return f"confirming: generation {self._standing[0].generation}'s mean on {fresh}, for its score"
         names = ", ".join(str(each.generation) for each in self._standing)
-        return f"confirming: the means of generations {names} on {tracks} more tracks each; the better half goes on"
+        more = f"{tracks} more tracks" if tracks > 1 else "another track"
+        return f"confirming: the means of generations {names} on {more} each; the better half goes on"
 
     @property
     def in_progress(self) -> bool:

@@ -8,13 +8,14 @@ from pathlib import Path
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.config import Table
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.files import is_there
 from dreamfleet.common.receipt import Receipt, receipt_of, settings_in
 from dreamfleet.common.runs import CONTROLLER, JOURNAL, RunFolder, open_run
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.config import LimitsConfig, RunConfig, settings_of
 from dreamfleet.coordinator.kept import kept_network
+from dreamfleet.coordinator.optimisers.registry import known_optimisers
 from dreamfleet.coordinator.receipts import versions
 from dreamfleet.coordinator.start import Start
 
@@ -39,8 +40,20 @@ class Repetition:
 
     @classmethod
     def of(cls, controller: Controller, bundle: Bundle | None) -> Repetition:
-        """By the controller's receipt; `ControllerError` where it has none."""
-        return cls(controller, bundle, settings_in(controller), receipt_of(controller))
+        """By the controller's receipt; `ControllerError` where it has none, or its run closed no generation."""
+        found = cls(controller, bundle, settings_in(controller), receipt_of(controller))
+        if found.receipt.generations < 1:
+            raise ControllerError("the controller's run closed no generation: there is nothing to repeat")
+        return found
+
+    def check_optimiser(self, allowed: str | None) -> None:
+        """`UsageError` where the file names somebody's module, which runs as it is imported, and nobody allowed it."""
+        wanted = self.settings.optimiser
+        if wanted not in known_optimisers() and wanted != allowed:
+            raise UsageError(
+                f"the run's optimiser was {wanted!r}, and no file may choose what is imported: if you trust that "
+                f"module, say --optimiser {wanted}"
+            )
 
     @property
     def limits(self) -> LimitsConfig:

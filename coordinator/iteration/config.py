@@ -12,6 +12,9 @@ from dreamfleet.common.presets import check_preset, preset_help
 
 # They change no round that is finished, nor what it means; what `--run-flags` lead to is compared instead of them.
 HARMLESS = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
+MOST_SEED = 2**31 - 1  # each round's training multiplies its own
+# Flags of a training that are iterate's to give.
+TAKEN = ("--data", "--preset", "--device", "--seed", "--continue-from", "--summary", "--json")
 LEAST = {
     "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
     "mdnrnn_updates": 1, "gate_drives": 0, "gate_losses": 0, "seed": 0, "local": 0, "jobs": 1,
@@ -46,7 +49,7 @@ class IterateConfig:
     seed: int = option(0, "makes the iteration: drives, training, populations and tracks follow from it")
     local: int | None = option(None, "scoring processes here (default one a core, or none where --listen is given)")
     jobs: int | None = option(None, "processes that drive for the data set here (default one a core)")
-    device: str = option("cpu", "that trains: cpu, cuda, or auto")
+    device: Literal["cpu", "cuda", "auto"] = option("cpu", "that trains: cpu, cuda, or auto")
 
     def __post_init__(self) -> None:
         for name, least in LEAST.items():
@@ -60,8 +63,17 @@ class IterateConfig:
             raise UsageError("--gate-drives must be 0 or at least 2, --gate-losses 0 or at least 4")
         if self.go_on and self.vae == "whole":
             raise UsageError("--go-on begins with a controller, and another encoder fits none: leave --vae whole out")
+        if self.seed > MOST_SEED:
+            raise UsageError(f"--seed must be at most {MOST_SEED}, not {self.seed}")
         for name in ("vae_flags", "mdnrnn_flags", "run_flags"):
-            words(name, getattr(self, name))
+            _check_words(name, words(name, getattr(self, name)))
+
+
+def _check_words(name: str, given: tuple[str, ...]) -> None:
+    said = {word.partition("=")[0] for word in given if word.startswith("--")}
+    taken = [flag for flag in TAKEN if any(flag.startswith(word) for word in said)]  # flags may be shortened
+    if taken and name != "run_flags":
+        raise UsageError(f"--{name.replace('_', '-')}: {', '.join(taken)} of each training is iterate's own to give")
 
 
 def words(name: str, text: str) -> tuple[str, ...]:

@@ -105,8 +105,9 @@ class Ledger:
 
     def take(self, config: IterateConfig, run: Mapping[str, Any], folder: Path) -> Ledger:
         """With what may change; `UsageError` names what was begun otherwise and may not."""
-        wanted = asdict(config)
-        differing = [*_differing(self.settings, wanted, HARMLESS), *_differing(self.run, run)]
+        wanted, begun = asdict(config), {**asdict(IterateConfig()), **self.settings}  # what is newer was its default
+        known = {name: value for name, value in run.items() if name in self.run}
+        differing = [*_differing(begun, wanted, HARMLESS), *_differing(self.run, known)]
         if differing:
             raise UsageError(
                 f"{folder} was begun with {'; '.join(differing)}: leave that out, or begin in another --data"

@@ -28,7 +28,7 @@ class Phase(NamedTuple):
     def of(cls, text: str) -> Phase:
         """The phase that is written so; `UsageError` if it is none."""
         number, _, name = text.partition("/")
-        if not (number.isascii() and number.isdigit() and int(number) and name in ALL):
+        if not (number.isascii() and number.isdigit() and len(number) < 10 and int(number) and name in ALL):
             raise UsageError(f"{text!r} is no phase: write ROUND/PHASE, such as 2/mdnrnn; phases are {', '.join(ALL)}")
         return cls(int(number), name)
 

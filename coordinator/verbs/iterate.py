@@ -26,7 +26,7 @@ SUMMARY = "make world models and evolve in their dreams in turn, each learning f
 EXTRAS = ("train", "views")
 PACKAGES = ("gymnasium", "matplotlib", "onnx", "onnxruntime", "safetensors", "torch")
 OURS = {"run_name": "run", "resume": None, "init": None}  # of the rounds' runs, beside those of the next line
-OURS |= dict.fromkeys(("bundle", "seed", "runs_dir", "listen", "connect"))
+OURS |= dict.fromkeys(("bundle", "seed", "runs_dir", "listen", "connect", "config"))
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -98,7 +98,7 @@ def _run_settings(args: argparse.Namespace, flags: list[str], *, new: bool) -> d
     told = parser_of("coordinator", coordinator).parse_all(flags)
     if taken := [name for name, default in OURS.items() if getattr(told, name, default) != default]:
         names = ", ".join(f"--{name.replace('_name', '').replace('_', '-')}" for name in taken)
-        raise UsageError(f"{names} in --run-flags: each round's run has its own")
+        raise UsageError(f"{names} in --run-flags: each round's run has its own, and --config is a flag of iterate")
     sources = {**args.sources, "flags": told}
     config, limits = coordinator.configured(
         argparse.Namespace(sources=sources, given=frozenset(vars(told))), base={}

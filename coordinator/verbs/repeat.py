@@ -18,6 +18,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("controller", metavar="CONTROLLER", help="a file, a run, or one that ships; it is only read")
     parser.add_argument("--run", dest="run_name", help="the new run, or one to go on with (default CONTROLLER-again)")
+    parser.add_argument("--optimiser", metavar="MODULE:ATTRIBUTE", help="an optimiser of one's own that the run had")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     offer(parser, "runs_dir")
     add_json(parser)
@@ -32,6 +33,7 @@ def run(args: argparse.Namespace) -> int:
 
     controller, beside = find_controller(args.controller, args.runs_dir)
     again = Repetition.of(controller, bundle_for(controller, args.bundle, beside))
+    again.check_optimiser(args.optimiser)
     folder = args.runs_dir / (args.run_name or f"{Path(args.controller).stem}-again")
     config, kept = again.plan(folder)
     request = request_of(args, folder.name, config, again.limits, kept, again.start if config else None)

@@ -129,6 +129,22 @@ def begun(bundle, **changes):
     return Controller(settings.controller, still, settings.task.task, bundle.sha256, told)
 
 
+def test_a_run_that_closed_nothing_cannot_be_repeated(random_bundle):
+    controller = begun(random_bundle)
+    told = {**controller.provenance, "receipt": {"generations": 0, "effort": {}}}
+    with pytest.raises(ControllerError, match="closed no generation"):
+        Repetition.of(replace(controller, provenance=told), random_bundle)
+
+
+def test_no_file_chooses_what_is_imported(random_bundle):
+    again = Repetition.of(begun(random_bundle), random_bundle)
+    again.check_optimiser(None)
+    strange = replace(again, settings=replace(again.settings, optimiser="os:abort"))
+    with pytest.raises(UsageError, match="if you trust that module, say --optimiser os:abort"):
+        strange.check_optimiser(None)
+    strange.check_optimiser("os:abort")
+
+
 def test_why_a_second_time_differs_is_said_as_far_as_it_is_known(make):
     first, second = make(), make(seed=2)
     controller = first.end()

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.iteration.commands import Commands
 from dreamfleet.coordinator.iteration.config import IterateConfig
 from dreamfleet.coordinator.iteration.layout import Layout
@@ -79,3 +80,10 @@ def test_a_round_evolves_in_the_model_that_counts_with_a_seed_of_its_own():
     assert said(refused.resume_run(2, ("tcp/127.0.0.1:7000",))) == (
         "coordinator --resume round-02 --runs-dir data/runs --json --listen tcp/127.0.0.1:7000"
     )
+
+
+@pytest.mark.parametrize("flags", ["--data elsewhere", "--updates 3 --seed=9", "--continue other.safetensors"])
+def test_what_a_training_is_told_by_the_iteration_is_no_flag_of_it(flags):
+    with pytest.raises(UsageError, match="of each training is iterate's own to give"):
+        IterateConfig(vae_flags=flags)
+    assert IterateConfig(run_flags=flags)

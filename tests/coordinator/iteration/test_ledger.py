@@ -1,6 +1,7 @@
 """What is finished, as the folder keeps it."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -69,6 +70,18 @@ def test_other_settings_are_refused_with_what_differs(tmp_path):
     with pytest.raises(UsageError, match=r"was begun with noise 0.3, not 0.5; seed 0, not 4; population 64, not 32: "):
         begun.take(IterateConfig(noise=0.5, seed=4), {**RUN, "population": 32}, tmp_path)
     assert begun.take(IterateConfig(), json.loads(json.dumps(RUN)), tmp_path) == begun
+
+
+def test_a_ledger_from_before_a_setting_had_its_default(tmp_path):
+    begun = ledger()
+    del begun.settings["noise"]
+    older = Ledger.from_json(begun.to_json())
+    run = {name: value for name, value in RUN.items() if name != "population"}
+    assert older.take(IterateConfig(), RUN, tmp_path).settings == ledger().settings
+    before = Ledger.from_json(replace(older, run=run).to_json())
+    assert before.take(IterateConfig(), RUN, tmp_path).run == before.run
+    with pytest.raises(UsageError, match=r"begun with noise 0\.3, not 0\.5"):
+        older.take(IterateConfig(noise=0.5), RUN, tmp_path)
 
 
 @pytest.mark.parametrize("changes", [{"rounds": 9}, {"local": 1}, {"jobs": 3}, {"device": "cuda"}])
