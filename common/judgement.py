@@ -55,7 +55,7 @@ class Judgement:
     def _origin(self) -> str:
         model = f", world model {self.bundle[:12]}" if self.bundle else ""
         made = f"{self.evaluated.steps:,} environment steps in {self.seconds:.0f} s"
-        return f"{made}; controller {self.controller[:12]}{model}; dreamfleet {self.version} on {self.fingerprint}"
+        return f"{made}; controller {self.controller[:12]}{model}; dreamfleet {self.version}"
 
 
 def figures(evaluated: Evaluated) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-SUMMARY = "start a new run from another one's mean, step size, temperature and stage; any setting may change"
+SUMMARY = "start a new run from another one's mean, step size, temperature and stage; other settings may change"
 EXTRAS = ()
 
 
