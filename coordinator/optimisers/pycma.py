@@ -68,7 +68,8 @@ class Pycma:
         self._asked = []
         # Histories by which pycma would stop by itself, which nothing else reads: a state must not grow with the run.
         del self._strategy.fit.histbest[HISTORY:], self._strategy.fit.histmedian[HISTORY:]
-        if self._diagonal and not 1 / FAR < self._strategy.sigma_vec.scaling.min() < FAR:
+        scaling = self._strategy.sigma_vec.scaling
+        if self._diagonal and (scaling.min() < 1 / FAR or scaling.max() > FAR) and self.sigma > 0:
             self._balance()
 
     def prepare(self) -> None:
