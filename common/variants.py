@@ -1,4 +1,4 @@
-"""Variants of driving CarRacing: a controller's actions and features, and what a candidate pays for time.
+"""Variants of driving CarRacing: a controller's actions and features, and what a candidate pays for time and grass.
 
 They are the task's own options. A run's specification names what differs from the plain way, which is named by nothing:
 so what is plain stays as it was before there were any.
@@ -22,6 +22,7 @@ KNOWN = {
     "decide_every": "a whole number from 1 to 50",
     "feedback": "none or last",
     "time_cost": "a number from 0 to 100",
+    "offroad_cost": "a number from 0 to 100",
 }
 
 
@@ -37,6 +38,7 @@ class Variant:
     decide_every: int = 1  # steps for which a choice is held
     feedback: Literal["none", "last"] = "none"  # last: the last choice and its change are features too
     time_cost: float = 0.0  # what a candidate pays for each step before its lap is over
+    offroad_cost: float = 0.0  # what it pays for each step with a wheel off the road
 
     def __post_init__(self) -> None:
         fits = {
@@ -45,6 +47,7 @@ class Variant:
             "decide_every": type(self.decide_every) is int and 1 <= self.decide_every <= 50,
             "feedback": self.feedback in ("none", "last"),
             "time_cost": _within(self.time_cost, 0, 100),
+            "offroad_cost": _within(self.offroad_cost, 0, 100),
         }
         for name, fit in fits.items():
             if not fit:
@@ -61,7 +64,8 @@ class Variant:
         if unknown := sorted(set(names) - set(KNOWN)):
             raise UsageError(f"{WORLD} knows no option {', '.join(unknown)}: known are {', '.join(KNOWN)}")
         found = cls(**names)
-        return replace(found, pedal_shift=float(found.pedal_shift), time_cost=float(found.time_cost))
+        shift, time, offroad = map(float, (found.pedal_shift, found.time_cost, found.offroad_cost))
+        return replace(found, pedal_shift=shift, time_cost=time, offroad_cost=offroad)
 
     @property
     def options(self) -> str:
@@ -81,12 +85,14 @@ class Variant:
     @property
     def version(self) -> int:
         """Of the task: a worker that knows no variants must not score one as if it were plain."""
-        return 1 if self.plain else 2
+        if self.plain:
+            return 1
+        return 3 if self.driving.plain else 2  # version 2 drove plain controllers that pay by other products
 
     @property
     def driving(self) -> Variant:
         """What a controller's parameters depend on: all but what candidates pay."""
-        return replace(self, time_cost=0.0)
+        return replace(self, time_cost=0.0, offroad_cost=0.0)
 
     @property
     def actions(self) -> Continuous:

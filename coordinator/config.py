@@ -54,7 +54,7 @@ class RunConfig:
     variant: tuple[str, ...] = option(
         (),
         "NAME=VALUE of how car-racing is driven: pedals=one, pedal_shift=, decide_every=, feedback=last, in its dream "
-        "too, and time_cost= (docs/tasks.md)",
+        "too, and time_cost=, offroad_cost= (docs/tasks.md)",
     )
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
     hidden_units: int = option(8, "units of a hidden controller's layer")
@@ -185,9 +185,10 @@ class RunConfig:
         variant = Variant.named(_arguments("--variant", self.variant, "pedals=one"))
         if not variant.plain and self.task not in (WORLD, DREAM):
             raise UsageError(f"task {self.task} has no variants: {WORLD} has, and its dream")
-        if variant.time_cost and self.task == DREAM:
+        if (variant.time_cost or variant.offroad_cost) and self.task == DREAM:
+            cost = "time_cost" if variant.time_cost else "offroad_cost"
             raise UsageError(
-                "time_cost is of candidates that drive: no lap is ever over in a dream; name --variant without it"
+                f"{cost} is of candidates that drive: a dream knows of no lap and no road; name --variant without it"
             )
         return variant
 

@@ -15,6 +15,7 @@ from dreamfleet.common.variants import KNOWN, PLAIN, Variant
         '{"decide_every": 4}',
         '{"feedback": "last"}',
         '{"time_cost": 0.5}',
+        '{"offroad_cost": 2.0}',
         '{"decide_every": 2, "feedback": "last", "pedals": "one", "time_cost": 1.0}',
     ],
 )
@@ -22,7 +23,7 @@ def test_a_variant_is_its_options_and_back(options):
     variant = Variant.of(options)
     assert variant.options == options
     assert Variant.of(variant.options) == variant
-    assert (variant.plain, variant.version) == (False, 2)
+    assert (variant.plain, variant.version) == (False, 3 if variant.driving.plain else 2)
 
 
 def test_the_plain_way_is_named_by_nothing():
@@ -43,7 +44,7 @@ def test_a_variant_can_be_said_as_a_run_is_told_it():
 
 
 def test_what_candidates_pay_is_no_part_of_how_they_drive():
-    assert Variant(time_cost=0.5).driving == PLAIN
+    assert Variant(time_cost=0.5, offroad_cost=2.0).driving == PLAIN
     assert Variant(pedals="one", time_cost=0.5).driving == Variant(pedals="one")
 
 
@@ -69,6 +70,7 @@ def test_an_unknown_option_names_those_that_there_are():
         ("decide_every", [0, 51, 2.0, True, "4"]),
         ("feedback", ["first", False]),
         ("time_cost", [-0.1, 101, float("nan"), "1", True]),
+        ("offroad_cost", [-0.1, 101, float("inf"), "1", False]),
     ],
 )
 def test_a_value_out_of_its_range_is_refused_with_what_it_must_be(name, values):

@@ -30,6 +30,7 @@ WORLD = World(
     frames_per_second=50,
     action_names=("steer", "gas", "brake"),
     dream_reward=DreamReward(gain=3.5, cost=0.1),  # a tile gives 1000 / N, of a track's N tiles: 3.5 on average
+    stray="off_road",  # `OffRoad` says so
     finish="lap_finished",  # gymnasium says so as an episode ends; one that runs out of time says nothing
 )
 
@@ -45,11 +46,15 @@ class CarRacing(Task):
     def world_of(self, assignment: Assignment) -> World:
         """The world as the run's variant drives it."""
         variant = assignment.world_model.variant
-        return replace(WORLD, actions=variant.actions, version=variant.version, time_cost=variant.time_cost)
+        return replace(
+            WORLD, actions=variant.actions, version=variant.version, time_cost=variant.time_cost,
+            stray_cost=variant.offroad_cost,
+        )  # fmt: skip
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """The environment with the native picture, where that is exact; it observes the bundle's pictures."""
-        return self.make_recorded(self.preprocessing(assignment.world_model).name)
+        made = self.make_recorded(self.preprocessing(assignment.world_model).name)
+        return OffRoad(made) if assignment.world_model.variant.offroad_cost else made
 
     def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
         """The same, observing the pictures of a preprocessing by name."""
@@ -58,7 +63,8 @@ class CarRacing(Task):
     def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The unmodified environment of gymnasium, preprocessed here."""
         preprocessing = self.preprocessing(assignment.world_model)
-        return PictureObservation(gymnasium.make(ENVIRONMENT, render_mode=render_mode), preprocessing)
+        made = PictureObservation(gymnasium.make(ENVIRONMENT, render_mode=render_mode), preprocessing)
+        return OffRoad(made) if assignment.world_model.variant.offroad_cost else made
 
     def make_policy(self, assignment: Assignment) -> CarRacingPolicy:
         """Encoder, controller and MDN-RNN of a bundle that was trained on this task's pictures."""
@@ -105,6 +111,21 @@ class PictureObservation(gymnasium.ObservationWrapper[NDArray[np.uint8], Any, ND
     def observation(self, observation: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The picture."""
         return self._preprocessing.picture(observation)
+
+
+class OffRoad(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """CarRacing whose `info` says in `off_road` whether a wheel touches no tile of the road."""
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """The environment's step, and that beside it."""
+        *given, info = self.env.step(action)
+        info["off_road"] = not all(wheel.tiles for wheel in self._car.wheels)
+        return (*given, info)
+
+    @property
+    def _car(self) -> Any:
+        inner: Any = self.env.unwrapped
+        return inner.car
 
 
 class CarRacingPolicy:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from dreamfleet.worker.scoring.rollout import Rollout
 from dreamfleet.worker.tasks.api import Policy, Score
 
+STRAYS = 100  # steps off the course that an episode pays for at most: one that is lost is one loss, however long
+
 
 @dataclass(frozen=True)
 class Course:
@@ -25,6 +27,8 @@ class Course:
     idle_cost: float = 0.0  # the world's: charged for each step that is cut off
     time_cost: float = 0.0  # charged for each step until the course is finished, or the horizon
     finish: str = ""  # the world's
+    stray_cost: float = 0.0  # charged for each step off the course, of the first `STRAYS`
+    stray: str = ""  # the world's
 
 
 class Moment(NamedTuple):
@@ -86,11 +90,12 @@ def score(
 
     An episode that patience cuts is charged what standing still would have cost up to the horizon, so that cut and
     uncut candidates compare. Time costs up to the horizon too, unless the course is finished: to crash saves nothing.
+    Steps off the course cost too: they foretell a loss long before one is seen in rewards.
     """
     if not np.isfinite(parameters).all():
         raise ValueError("the controller's parameters hold NaN or infinity")
     policy.begin(parameters)
-    fitness, steps, finished = 0.0, 0, False
+    fitness, steps, strays, finished = 0.0, 0, 0, False
     for moment in play(environment, policy, course):
         fitness += moment.reward
         steps = moment.step
@@ -102,9 +107,11 @@ def score(
         on_step(steps)
         if moment.cut:
             fitness -= course.idle_cost * (course.horizon - steps)
+        strays += bool(course.stray_cost and moment.info.get(course.stray))
         finished = moment.ended and bool(moment.info.get(course.finish))
     if course.time_cost:
         fitness -= course.time_cost * (steps if finished else course.horizon)
+    fitness -= course.stray_cost * min(strays, STRAYS)
     if not math.isfinite(fitness):
         raise ValueError("the episode's rewards do not add up to a number")
     return Score(fitness, steps)

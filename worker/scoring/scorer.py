@@ -110,8 +110,10 @@ class Scorer:
         if kind == "evaluate":
             return Course(seed, self.world.horizon)
         spec, world = spec or self.spec, self.world
-        time_cost = world.time_cost if kind == "score" else 0.0
-        return Course(seed, spec.horizon, spec.patience, world.idle_cost, time_cost, world.finish)
+        time_cost, stray_cost = (world.time_cost, world.stray_cost) if kind == "score" else (0.0, 0.0)
+        return Course(
+            seed, spec.horizon, spec.patience, world.idle_cost, time_cost, world.finish, stray_cost, world.stray
+        )
 
     def close(self) -> None:
         """Release the environment."""

@@ -99,9 +99,11 @@ class World:
     horizon: int = ENVIRONMENTS_OWN  # steps of a judged episode at most
     version: int = 1  # to be raised whenever the same parameters and seeds give another fitness
     time_cost: float = 0.0  # what a candidate pays for each step until `finish`, or its horizon; nobody who is judged
+    stray_cost: float = 0.0  # what it pays for each step of which the environment's `info` says `stray`, of so many
     frames_per_second: int = 30  # of a video
     action_names: tuple[str, ...] = ()  # of continuous actions, for people
     dream_reward: DreamReward | None = None  # of worlds that world models are trained on
+    stray: str = ""  # of the environment's `info`: whether it left the course in this step; empty: it does not say
     finish: str = ""  # of the environment's `info`: whether the course was driven to its end; empty: it does not say
 
 

@@ -71,7 +71,7 @@ class PolicyStep:
         self.shape = bundle.controller_shape
         self.hidden_size = bundle.manifest.hidden
         self._reward = RewardLabel(bundle)
-        self._whole = bundle.variant.plain and self.shape == bundle.default_shape
+        self._whole = bundle.variant.driving.plain and self.shape == bundle.default_shape
         if self._whole:
             session = open_part(bundle, POLICY)
             manifest = bundle.manifest
@@ -130,7 +130,7 @@ class Controllers:
         remembered = self.shape.features - variant.seen > bundle.manifest.latent
         self._hidden = bundle.manifest.hidden if remembered else 0
         self._actions = variant.actions
-        self._run = open_part(bundle, LAYERED if self.shape.hidden else LINEAR).run if variant.plain else None
+        self._run = open_part(bundle, LAYERED if self.shape.hidden else LINEAR).run if variant.driving.plain else None
         self._parameters = np.zeros((0, self.shape.size), dtype=np.float32)
         self._layers: list[Layer] = []
         self._feed: dict[str, Floats] = {}

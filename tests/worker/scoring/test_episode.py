@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from dreamfleet.worker.scoring.episode import Course, score
+from dreamfleet.worker.scoring.episode import STRAYS, Course, score
 
 PARAMETERS = np.zeros(3, np.float32)
 
@@ -85,6 +85,27 @@ def test_time_costs_until_the_course_is_finished_and_to_crash_saves_nothing(rewa
     free = Course(1, 20, patience=5, finish="lap")
     found = [score(Scripted(rewards, info), Still(), PARAMETERS, each) for each in (free, replace(free, time_cost=0.5))]
     assert found[0].fitness - found[1].fitness == 0.5 * paid
+    assert found[0].steps == found[1].steps
+
+
+class Straying(Scripted):
+    """Says in its `info` which steps leave the course: these."""
+
+    def __init__(self, rewards, strays):
+        super().__init__(rewards)
+        self._strays = strays
+
+    def step(self, action):
+        *given, _ = super().step(action)
+        return (*given, {"off": self._step in self._strays})
+
+
+@pytest.mark.parametrize(("strays", "paid"), [((), 0), ((3,), 1), (range(5, 9), 4), (range(1, 180), STRAYS)])
+def test_steps_off_the_course_cost_so_much_and_one_loss_no_more(strays, paid):
+    free = Course(1, 200, stray="off")
+    course = [free, replace(free, stray_cost=2.0)]
+    found = [score(Straying([0.0] * 199, strays), Still(), PARAMETERS, each) for each in course]
+    assert found[0].fitness - found[1].fitness == 2 * paid
     assert found[0].steps == found[1].steps
 
 

@@ -138,6 +138,23 @@ def test_only_candidates_pay_for_time(random_bundle):
         each.close()
 
 
+def test_only_candidates_pay_for_steps_off_the_road(random_bundle):
+    (plain, vector), (dear, _) = (varied(random_bundle, horizon=150, **each) for each in ({}, {"offroad_cost": 2.0}))
+    vector = np.zeros_like(vector)
+    vector[-3:] = 1, 2, -1  # gas, and always to one side
+    scorers = [Scorer(each, random_bundle) for each in (plain, dear)]
+    free, paid = (each.score("score", vector, 3) for each in scorers)
+    assert free.steps == paid.steps
+    assert 2 <= free.fitness - paid.fitness <= 200
+    for kind in ("evaluate", "collect"):
+        assert scorers[1].course(kind, 3).stray_cost == 0
+    assert scorers[1].judge(vector, 3, lambda _: None) == scorers[0].judge(vector, 3, lambda _: None)
+    judge = Scorer(dear, random_bundle, judge=True)
+    assert judge.score("score", vector, 3) == paid
+    for each in (*scorers, judge):
+        each.close()
+
+
 def test_a_lap_that_is_over_costs_no_more_time(random_bundle):
     course = Scorer(varied(random_bundle, time_cost=0.5)[0], random_bundle).course("score", 3)
     assert (course.time_cost, course.finish) == (0.5, "lap_finished")
