@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dreamfleet.common.archives import Archive, DamagedError, Limits, open_archive
 from dreamfleet.common.codec import MalformedError, from_plain
@@ -35,6 +36,7 @@ FORMAT = 1
 MANIFEST = "manifest.json"
 ENCODER, DECODER, POLICY, INITIAL = "encoder.onnx", "decoder.onnx", "policy.onnx", "initial_latents.npy"
 DREAM = "dream.onnx"  # a step of the dream; bundles from before it have none
+RECORDED = "recorded_states.npy"  # where recorded drives were: only in bundles whose dreams may begin there
 LINEAR, LAYERED = "controller-linear.onnx", "controller-hidden.onnx"  # controllers of any size, a row each
 WEIGHTS = "weights.safetensors"  # only in bundles that training goes on from
 REQUIRED = (ENCODER, DECODER, POLICY, INITIAL)
@@ -42,6 +44,7 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)
 MAX_BUNDLE = 256 << 20  # bytes, of the file and of all that it holds: the largest known is 16 MB
 _LIMITS = Limits(MAX_BUNDLE)
 _MAX_MANIFEST = 1_000_000
+MOST_RECORDED = 16_384  # states: 19 MB of the default layers'
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -155,6 +158,27 @@ class Bundle:
     def fitting(self, controller: Controller) -> Bundle:
         """This bundle under one controller's shape and variant; errors as of `under`."""
         return self.under(controller.shape, controller.variant)
+
+    @property
+    def recorded(self) -> int:
+        """How many recorded states its dreams may begin at."""
+        return len(self.read_recorded()) if RECORDED in self.manifest.parts else 0
+
+    def check_recorded(self) -> None:
+        """`BundleError` if no dream can begin at a recorded state."""
+        if RECORDED not in self.manifest.parts:
+            raise BundleError(
+                f"{self.path.name} holds no recorded states that dreams could begin at: build it again with "
+                "`dreamfleet bundle --recorded N`, or leave --recorded out"
+            )
+
+    def read_recorded(self) -> NDArray[np.float32]:
+        """Recorded states `(N, 2 * latent + state)`: mu, logvar and the recurrent state before the action.
+
+        `BundleError` if it has none.
+        """
+        self.check_recorded()
+        return read_array(self.read(RECORDED))
 
     def read(self, name: str) -> bytes:
         """One part's bytes; `BundleError` if the bundle has no such part.
@@ -299,19 +323,40 @@ def _look(path: Path, manifest: Manifest, name: str, data: bytes) -> None:
         )
     if name.endswith(".onnx") and not weights_finite(data):
         raise BundleError(f"{path}: {name} has weights that are NaN or infinite; train the model again")
-    if name != INITIAL:
-        return
+    if name == INITIAL:
+        _look_at_latents(path, manifest, data)
+    if name == RECORDED:
+        _look_at_states(path, manifest, data)
+
+
+def _look_at_latents(path: Path, manifest: Manifest, data: bytes) -> None:
     try:
         latents = read_array(data)
     except ValueError as error:
-        raise BundleError(f"{path}: {name} is no array of latents ({error}); build the bundle again") from error
+        raise BundleError(f"{path}: {INITIAL} is no array of latents ({error}); build the bundle again") from error
     if latents.ndim != 3 or latents.shape[1:] != (2, manifest.latent) or not len(latents):
         raise BundleError(
-            f"{path}: {name} must be (N, 2, {manifest.latent}) with N at least 1, not {latents.shape}; build the "
+            f"{path}: {INITIAL} must be (N, 2, {manifest.latent}) with N at least 1, not {latents.shape}; build the "
             "bundle again from encoded rollouts"
         )
     if not np.isfinite(latents).all():
-        raise BundleError(f"{path}: {name} holds NaN or infinity; encode the rollouts again")
+        raise BundleError(f"{path}: {INITIAL} holds NaN or infinity; encode the rollouts again")
+
+
+def _look_at_states(path: Path, manifest: Manifest, data: bytes) -> None:
+    """How wide a state is exactly, the graph of the dream says to whoever dreams."""
+    try:
+        states = read_array(data)
+    except ValueError as error:
+        raise BundleError(f"{path}: {RECORDED} is no array of states ({error}); build the bundle again") from error
+    least = 2 * (manifest.latent + manifest.hidden)
+    if states.ndim != 2 or not 1 <= len(states) <= MOST_RECORDED or states.shape[1] < least:
+        raise BundleError(
+            f"{path}: {RECORDED} must be (N, W) with N from 1 to {MOST_RECORDED} and W at least {least}, not "
+            f"{states.shape}; build the bundle again"
+        )
+    if not np.isfinite(states).all():
+        raise BundleError(f"{path}: {RECORDED} holds NaN or infinity; build the bundle again")
 
 
 def _bytes_of(path: Path) -> bytes | None:

@@ -55,6 +55,7 @@ Text = Annotated[str, Length(0, MAX_TEXT)]
 Part = Annotated[bytes, Length(0, MAX_PART)]
 Temperature = Annotated[float, Between(COLDEST, HOTTEST)]
 Horizon = Annotated[int, Between(1, 10**6)]  # an episode's steps at most, when scored for the strategy
+Share = Annotated[float, Between(0.0, 1.0)]
 Patience = Annotated[int, Between(0, 10**6)]  # steps without reward before a scored episode is cut; 0: never
 Packages = Annotated[tuple[Word, ...], Length(0, 64)]
 Kind = Literal["score", "evaluate", "collect"]
@@ -75,6 +76,7 @@ class TaskSpec:
     options: Annotated[str, Length(0, MAX_OPTIONS)] = field(default="", metadata=OPTIONAL)
     # The task's own version: another one gives other fitnesses.
     version: Annotated[int, Between(1, 10**6)] = field(default=1, metadata=OPTIONAL)
+    recorded: Share = field(default=0.0, metadata=OPTIONAL)  # of the dreams: begins where recorded drives were
 
     def option(self, name: str, default: Any = None) -> Any:
         """One of the task's own options."""

@@ -69,6 +69,11 @@ class RunConfig:
     horizon: int = option(1000, "steps of a scored episode at most")
     patience: int = option(0, "cut a scored episode after so many steps without reward; 0: never")
     temperature: float | None = option(None, "of a dream's sampling; above 1 it is harder, and harder to exploit")
+    recorded: float = option(
+        0.0,
+        "share of the dreams, 0 to 1, that begins where recorded drives were, with what the model remembered there; "
+        "the bundle must hold such states",
+    )
     heat: float = option(
         1.0, "multiply the temperature by this each time that the evaluated mean falls clearly behind; 1: never"
     )
@@ -108,6 +113,10 @@ class RunConfig:
             raise UsageError(f"--sigma0 must be a positive number of at most {LARGEST_STEP:g}, not {self.sigma0}")
         if self.temperature is not None and not COLDEST <= self.temperature <= HOTTEST:
             raise UsageError(f"--temperature must be from {COLDEST:g} to {HOTTEST:g}, not {self.temperature}")
+        if not 0 <= self.recorded <= 1:
+            raise UsageError(f"--recorded must be from 0 to 1, not {self.recorded}")
+        if self.recorded and self.task != DREAM:
+            raise UsageError(f"--recorded is of task {DREAM}, not of {self.task}: leave it out, or say 0")
         if not 1 <= self.heat < float("inf"):
             raise UsageError(f"--heat must be a number of at least 1, not {self.heat}")
         if self.heat > 1 and (self.temperature is None or not self.evaluate_every):
@@ -171,12 +180,14 @@ class RunConfig:
             raise UsageError(f"{self.task} is scored without a world model: leave --bundle out, or give --bundle none")
         if self.environment or self.normalise or self.task_options:
             raise UsageError("--environment, --normalise and --task-options are of tasks without a world model")
+        if self.recorded:
+            bundle.check_recorded()
         variant = self._variant()
         shape = bundle.under(bundle.shape_of(self.features, self._hidden, variant), variant).controller_shape
         named = None if shape == bundle.default_shape else shape
         spec = TaskSpec(
             self.task, bundle.sha256, self.horizon, self.patience, named, self.temperature, variant.options,
-            variant.version,
+            variant.version, self.recorded,
         )  # fmt: skip
         return spec, shape, NUMERIC_PACKAGES
 
@@ -276,7 +287,7 @@ def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:
     frozen = {each.name: getattr(run, each.name) for each in fields(RunConfig) if hasattr(run, each.name)}
     spec, hidden = run.task, run.controller.hidden
     frozen |= {"controller": "hidden", "hidden_units": hidden} if hidden else {"controller": "linear"}
-    frozen |= {name: getattr(spec, name) for name in ("task", "horizon", "patience", "temperature")}
+    frozen |= {name: getattr(spec, name) for name in ("task", "horizon", "patience", "temperature", "recorded")}
     if not spec.bundle:
         return {**frozen, "bundle": NO_BUNDLE, "task_options": spec.options}
     return {**frozen, "bundle": str(bundle), "variant": Variant.of(spec.options).texts}

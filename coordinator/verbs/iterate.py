@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -106,7 +106,7 @@ def _run_settings(args: argparse.Namespace, flags: list[str], *, new: bool) -> d
     if limits == LimitsConfig():
         raise UsageError("a round's run would never end: give --run-flags a limit, such as --generations 32")
     if new:
-        config.settings(find_bundle(DEFAULT_BUNDLE))
+        replace(config, recorded=0.0).settings(find_bundle(DEFAULT_BUNDLE))  # which holds no recorded states
     return {**asdict(config), **asdict(limits), "preset": None, "schedule": None, "bundle": None}
 
 

@@ -2,6 +2,7 @@ import os
 import shutil
 import zipfile
 
+import numpy as np
 import onnx
 import pytest
 
@@ -20,7 +21,7 @@ from dreamfleet.common.bundle import (
     write_bundle,
 )
 from dreamfleet.common.errors import BundleError
-from tests.support.bundles import write_random_bundle
+from tests.support.bundles import states, write_random_bundle
 
 LARGEST_SHIPPED = 16_000_000
 
@@ -127,6 +128,16 @@ def test_an_empty_graph_is_refused_by_its_name(random_bundle, tmp_path, name, ch
     parts = parts_of(random_bundle)
     with pytest.raises(BundleError, match=rf"b\.zip: {name} is an empty graph; .*build it again"):
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, name: change(parts[name])})
+
+
+def test_a_bundle_says_how_many_recorded_states_it_has(random_bundle, tmp_path):
+    assert random_bundle.recorded == 0
+    with pytest.raises(BundleError, match="holds no recorded states"):
+        random_bundle.read_recorded()
+    kept = states(7)
+    some = write_random_bundle(tmp_path / "some.zip", recorded=kept)
+    assert some.recorded == 7
+    assert np.array_equal(some.read_recorded(), kept)
 
 
 def test_a_missing_bundle_names_those_that_ship(tmp_path):

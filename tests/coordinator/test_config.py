@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.errors import ControllerError, DreamfleetError, UsageError
 from dreamfleet.common.fields import written
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.stored import RunSettings
@@ -11,6 +11,7 @@ from dreamfleet.common.tasks import Description
 from dreamfleet.coordinator.config import RunConfig, settings_of
 from dreamfleet.coordinator.start import Start
 from dreamfleet.worker.tasks.api import Task
+from tests.support.bundles import states, write_random_bundle
 
 
 @pytest.mark.parametrize(
@@ -51,6 +52,36 @@ def test_jobs_of_other_controllers_have_other_digests(random_bundle):
     other = TaskSpec("car-racing", "ab" * 32, 10, 0, random_bundle.shape_of("z", 24))
     assert plain.digest("score", b"x", (1,)) != other.digest("score", b"x", (1,))
     assert written(other)["controller"] == {"features": 32, "actions": 3, "hidden": 24}
+
+
+def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured_again(tmp_path):
+    bundle = write_random_bundle(tmp_path / "b.zip", recorded=states(3))
+    settings = RunConfig(task="dream", recorded=0.5).settings(bundle)
+    assert (settings.task.recorded, settings.task.version, settings.task.options) == (0.5, 1, "")
+    assert RunSettings.from_json(settings.to_json()) == settings
+    assert RunConfig(**settings_of(settings, bundle.path)).settings(bundle) == settings
+    plain = RunConfig(task="dream").settings(bundle)
+    assert "recorded" not in plain.to_json()
+    assert RunConfig(task="dream", recorded=0.0).settings(bundle) == plain
+    assert settings.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
+    assert settings.task.at(2.0, 100, 50).recorded == 0.5
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"task": "dream", "recorded": -0.1}, "--recorded must be from 0 to 1, not -0.1"),
+        ({"task": "dream", "recorded": 1.5}, "--recorded must be from 0 to 1, not 1.5"),
+        ({"recorded": 0.5}, "--recorded is of task dream, not of car-racing: leave it out, or say 0"),
+        ({"task": "gym:CartPole-v1", "recorded": 0.5}, "--recorded is of task dream, not of gym:CartPole-v1"),
+        ({"task": "dream", "recorded": 0.5}, "holds no recorded states that dreams could begin at: build it again"),
+    ],
+)
+def test_recorded_states_that_there_are_not_are_refused_in_one_line(random_bundle, changes, says):
+    with pytest.raises(DreamfleetError) as told:
+        RunConfig(**changes).settings(random_bundle)
+    assert says in str(told.value)
+    assert "\n" not in str(told.value)
 
 
 @pytest.mark.parametrize(

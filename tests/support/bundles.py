@@ -5,7 +5,7 @@ import io
 import numpy as np
 import torch
 
-from dreamfleet.common.bundle import write_bundle
+from dreamfleet.common.bundle import RECORDED, write_bundle
 from dreamfleet.worker.training.assemble import graphs, manifest
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED
@@ -32,8 +32,16 @@ def weights(model):
     return {name: tensor.detach().numpy() for name, tensor in model.state_dict().items()}
 
 
-def write_random_bundle(path, seed=0, vae=PAPER, rnn=REWARDED, initial=None):
+def states(count, vae=PAPER, rnn=REWARDED, seed=0):
+    """So many made-up moments of drives, as a bundle holds them."""
+    return np.random.default_rng(seed).uniform(-1, 1, (count, 2 * vae.latent + rnn.state)).astype(np.float16)
+
+
+def write_random_bundle(path, seed=0, vae=PAPER, rnn=REWARDED, initial=None, recorded=None):
     models = [weights(each) for each in random_models(seed, vae, rnn)]
     if initial is None:
         initial = np.random.default_rng(seed).normal(size=(4, 2, vae.latent)).astype(np.float32)
-    return write_bundle(path, manifest("random", {"seed": seed}, vae, rnn), graphs(*models, initial, vae, rnn))
+    parts = graphs(*models, initial, vae, rnn)
+    if recorded is not None:
+        parts[RECORDED] = npy(recorded)
+    return write_bundle(path, manifest("random", {"seed": seed}, vae, rnn), parts)

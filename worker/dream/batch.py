@@ -24,7 +24,7 @@ class Dreamer:
         """`world` is the bundle's own; found by its name if it is not given."""
         self._size = bundle.controller_shape.size
         self._horizon = spec.horizon
-        self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, world)
+        self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, world, spec.recorded)
 
     def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None] = lambda _: None) -> list[Score]:
         """The summed reward of each dream, in step order, in double precision; `on_step` hears of all steps so far."""
@@ -40,9 +40,9 @@ class Dreamer:
         if parameters.shape[1] != self._size or not np.isfinite(parameters).all():
             raise UsageError(f"a dream needs controllers of {self._size} finite parameters")
         world, rows = self._world, np.arange(len(episodes))
-        noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.initial)
+        noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.beginnings)
         fitness, steps = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
-        latent, state, made = noise.first, world.begin(len(rows)), 0
+        latent, state, made = noise.first.latent, world.begin(len(rows), noise.first.memory), 0
         for _ in range(self._horizon):
             moment = world.live(latent, parameters, state, noise.next(rows))
             fitness[rows] += moment.reward

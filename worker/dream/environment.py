@@ -43,17 +43,17 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
     """One dream: observes the latent `(latent,)`, takes CarRacing's actions `(3,)`.
 
     An episode is a pure function of its seed and actions. It ends where the model's done head says so, and is
-    truncated after `horizon` steps.
+    truncated after `horizon` steps. `recorded` is the share of dreams that begin where recorded drives were.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012 - gymnasium's name
 
     def __init__(
         self, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int = 1000,
-        render_mode: str | None = None,
+        render_mode: str | None = None, recorded: float = 0.0,
     ) -> None:  # fmt: skip
         self._bundle = open_bundle(bundle)
-        self._world = DreamWorld(self._bundle, temperature)
+        self._world = DreamWorld(self._bundle, temperature, recorded=recorded)
         self._horizon = horizon
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
@@ -61,14 +61,15 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         self.action_space = action_space(self._world.world.actions)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Begin a dream; without a seed, one after the last."""
+        """Begin a dream; without a seed, one after the last. Of `info`: the `memory` that the model has there."""
         super().reset(seed=seed, options=options)
         dream = int(self.np_random.integers(2**31)) if seed is None else seed
         self._noise = Noise(dream, self._world.chance)
-        self._latent = self._noise.begin(self._world.initial)[None]
-        self._state = self._world.begin(1)
+        begun = self._noise.begin(self._world.beginnings)
+        self._latent = begun.latent[None]
+        self._state = self._world.begin(1, begun.memory)
         self._steps = 0
-        return self._latent[0], {}
+        return self._latent[0], {"memory": begun.memory}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Dream one step under `action` `(3,)`."""
@@ -96,10 +97,10 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
 
     def __init__(
         self, num_envs: int, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int = 1000,
-        render_mode: str | None = None,
+        render_mode: str | None = None, recorded: float = 0.0,
     ) -> None:  # fmt: skip
         self._bundle = open_bundle(bundle)
-        self._world = DreamWorld(self._bundle, temperature)
+        self._world = DreamWorld(self._bundle, temperature, recorded=recorded)
         self._horizon = horizon
         self.num_envs = num_envs
         self.render_mode = render_mode
@@ -112,19 +113,20 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin every dream; `seed` is the first one's, or a list of all."""
+        """Begin every dream; `seed` is the first one's, or a list of all. Of `info`: each one's `memory`."""
         super().reset(seed=seed if isinstance(seed, int) else None, options=options)
         seeds: list[int | None] = list(seed) if isinstance(seed, (list, tuple)) else [None] * self.num_envs
         if isinstance(seed, int):
             seeds = [seed + index for index in range(self.num_envs)]
         self._latent = np.zeros((self.num_envs, self._world.chance.latent), dtype=np.float32)
         self._state = self._world.begin(self.num_envs)
+        self._memory = self._state[:, : self._world.memory_size].copy()
         self._noise: list[Noise] = [Noise(0, self._world.chance)] * self.num_envs
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.zeros(self.num_envs, dtype=bool)
         for index, each in enumerate(seeds):
             self._begin(index, each)
-        return self._latent.copy(), {}
+        return self._latent.copy(), {"memory": self._memory.copy()}
 
     def step(
         self, actions: Floats
@@ -136,11 +138,13 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self._latent, self._state = moment.latent.copy(), moment.state.copy()
         self._steps += 1
         reward, done, truncated = moment.reward.copy(), moment.done.copy(), self._steps >= self._horizon
-        for index in np.flatnonzero(self._over):
+        begun = self._over
+        for index in np.flatnonzero(begun):
             self._begin(int(index), None)
             reward[index], done[index], truncated[index] = 0.0, False, False
         self._over = done | truncated
-        return self._latent.copy(), reward, done, truncated, {}
+        info = {"memory": self._memory.copy(), "_memory": begun} if begun.any() else {}
+        return self._latent.copy(), reward, done, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Each dream's picture `(side, side, 3)`."""
@@ -149,6 +153,6 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
     def _begin(self, index: int, seed: int | None) -> None:
         dream = int(self.np_random.integers(2**31)) if seed is None else seed
         self._noise[index] = Noise(dream, self._world.chance)
-        self._latent[index] = self._noise[index].begin(self._world.initial)
-        self._state[index] = 0
+        self._latent[index], self._memory[index] = self._noise[index].begin(self._world.beginnings)
+        self._state[index] = self._world.begin(1, self._memory[index])
         self._steps[index] = 0

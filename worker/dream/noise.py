@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.worker.dream.beginnings import Beginnings
 from dreamfleet.worker.worldmodel.inference import Chance
 
 Floats = NDArray[np.float32]
@@ -42,20 +43,28 @@ def side_by_side(draws: Sequence[Draw], axis: int) -> Draw:
     return Draw(uniform, normal, None if masks[0] is None else join(*masks))
 
 
+class Begun(NamedTuple):
+    """A dream's first latent, and what the model remembers there: `(latent,)` and `(memory,)`, or a row a dream."""
+
+    latent: Floats
+    memory: Floats
+
+
 class Noise:
     """The noise of one episode, step after step, and its beginning."""
 
     def __init__(self, seed: int, chance: Chance) -> None:
         self._random = np.random.Generator(np.random.PCG64(seed))
+        self._seed = seed
         self._chance = chance
         self._left = 0
 
-    def begin(self, initial: Floats) -> Floats:
-        """A first latent `(latent,)` from recorded ones `(N, 2, latent)`, mu and logvar; to be called first."""
-        mu, logvar = initial[self._random.integers(len(initial))]
+    def begin(self, beginnings: Beginnings) -> Begun:
+        """Where the dream begins; to be called first. Wherever that is, the noise of its steps is the same."""
+        first = int(self._random.integers(len(beginnings.initial)))
+        mu, logvar, memory = beginnings.choose(self._seed, first)
         normal = self._random.standard_normal(self._chance.latent, dtype=np.float32)
-        first: Floats = mu + np.exp(0.5 * logvar) * normal
-        return first
+        return Begun(mu + np.exp(0.5 * logvar) * normal, memory)
 
     def piece(self) -> Draw:
         """The noise of the next `PIECE` steps, a row each."""
@@ -79,11 +88,12 @@ class Noise:
 class SharedNoise:
     """The noise of rows that dream few episodes between them: drawn once an episode, given to each of its rows."""
 
-    def __init__(self, seeds: NDArray[np.int64], chance: Chance, initial: Floats) -> None:
+    def __init__(self, seeds: NDArray[np.int64], chance: Chance, beginnings: Beginnings) -> None:
         """`seeds` `(rows,)`: one a row."""
         unique, self._episode = np.unique(seeds, return_inverse=True)
         self._sources = [Noise(int(seed), chance) for seed in unique]
-        self.first = np.stack([source.begin(initial) for source in self._sources])[self._episode]
+        begun = zip(*(source.begin(beginnings) for source in self._sources), strict=True)
+        self.first = Begun(*(np.stack(parts)[self._episode] for parts in begun))
         self._left = 0
 
     def next(self, rows: NDArray[np.int64]) -> Draw:

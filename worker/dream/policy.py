@@ -25,6 +25,10 @@ class DreamPolicy:
         self._parameters = parameters.astype(np.float32).reshape(1, -1)
         self._state = self._step.zero_state(1)
 
+    def remember(self, memory: Floats) -> None:
+        """Begin with what the model remembers `(memory,)`, as the dream does: `reset` of its environment tells it."""
+        self._state[:, : self._step.memory_size] = memory
+
     def act(self, observation: Floats) -> Floats:
         """The action `(actions,)` for one latent."""
         latent = observation[None]

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import DREAM, INITIAL, Bundle
+from dreamfleet.common.bundle import DREAM, Bundle
 from dreamfleet.common.errors import BundleError, UsageError
-from dreamfleet.common.tensors import read_array
+from dreamfleet.worker.dream.beginnings import Beginnings
 from dreamfleet.worker.dream.noise import Draw
 from dreamfleet.worker.tasks.api import Assignment, DreamReward, World
 from dreamfleet.worker.tasks.registry import find_task
@@ -31,8 +31,10 @@ class Moment(NamedTuple):
 class DreamWorld:
     """The frozen MDN-RNN as a world, at one temperature (Ha & Schmidhuber 2018, section 4)."""
 
-    def __init__(self, bundle: Bundle, temperature: float, world: World | None = None) -> None:
-        """`world` is the bundle's own; found by its name if it is not given."""
+    def __init__(
+        self, bundle: Bundle, temperature: float, world: World | None = None, recorded: float = 0.0
+    ) -> None:  # fmt: skip
+        """`world` is the bundle's own; found by its name if it is not given. `recorded` is a share of `Beginnings`."""
         check_temperature(temperature)
         if DREAM not in bundle.manifest.parts:
             raise BundleError(f"{bundle.path.name} is from before dreams: build it again with `dreamfleet bundle`")
@@ -49,11 +51,18 @@ class DreamWorld:
         self._step = DreamStep(bundle)
         self._temperature = temperature
         self.chance = self._step.chance
-        self.initial = read_initial(bundle)
+        self.memory_size = self._step.memory_size
+        self.beginnings = Beginnings.of(bundle, recorded, self.memory_size)
 
-    def begin(self, rows: int) -> Floats:
-        """The recurrent state `(rows, state)` before a first step."""
-        return self._step.zero_state(rows)
+    def begin(self, rows: int, memory: Floats | None = None) -> Floats:
+        """The state `(rows, state)` before a first step: empty, or the model's part is `memory` `(rows, memory)`.
+
+        What a controller keeps of its own choices begins anew either way.
+        """
+        state = self._step.zero_state(rows)
+        if memory is not None:
+            state[:, : self.memory_size] = memory
+        return state
 
     def live(self, latent: Floats, parameters: Floats, state: Floats, draw: Draw) -> Moment:
         """Controllers `parameters` `(rows, size)` act on `latent` `(rows, latent)` and `state`; the dream goes on."""
@@ -89,8 +98,3 @@ def check_temperature(temperature: float) -> None:
     """`UsageError` unless it is a positive number."""
     if not (temperature > 0 and math.isfinite(temperature)):
         raise UsageError(f"a dream's temperature must be a positive number, not {temperature}")
-
-
-def read_initial(bundle: Bundle) -> Floats:
-    """First latents of recorded rollouts `(N, 2, latent)`, mu and logvar; an opened bundle has at least one."""
-    return read_array(bundle.read(INITIAL))

@@ -197,8 +197,8 @@ class DreamStep:
         self._idle: dict[str, Floats] = {}
         self.shape = bundle.controller_shape
         self.hidden_size = bundle.manifest.hidden
-        self._model_size: int = sizes["state"][1]
-        self.state_size = self._model_size + self._choices.columns
+        self.memory_size: int = sizes["state"][1]  # the world model's part of a state
+        self.state_size = self.memory_size + self._choices.columns
         self.latent_size: int = sizes["latent"][1]
         dropout = float(manifest.models["mdnrnn"]["dropout"]) if "mask" in sizes else 0.0
         self.chance = Chance(self.latent_size, self.hidden_size, dropout)
@@ -252,7 +252,7 @@ class DreamStep:
 
     def _models(self, state: Floats) -> Floats:
         """The world model's part of a state."""
-        return np.ascontiguousarray(state[:, : self._model_size]) if self._choices.columns else state
+        return np.ascontiguousarray(state[:, : self.memory_size]) if self._choices.columns else state
 
     def _after(self, models: Floats, state: Floats, chosen: Floats) -> Floats:
         """The world model's next state with what the controllers keep behind it."""

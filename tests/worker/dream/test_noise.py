@@ -1,14 +1,16 @@
 import numpy as np
 
+from dreamfleet.worker.dream.beginnings import Beginnings
 from dreamfleet.worker.dream.noise import PIECE, Noise, SharedNoise
 from dreamfleet.worker.worldmodel.inference import Chance
 
-INITIAL = np.random.default_rng(0).normal(size=(5, 2, 3)).astype(np.float32)
+FIRST = np.random.default_rng(0).normal(size=(5, 2, 3)).astype(np.float32)
+BEGINNINGS = Beginnings(FIRST, np.zeros((0, 6), np.float32))
 
 
 def drawn(seed, steps):
     noise, drawn = Noise(seed, Chance(3, 4, 0.0)), []
-    drawn.append(noise.begin(INITIAL))
+    drawn.append(noise.begin(BEGINNINGS).latent)
     for _ in range(steps):
         draw = noise.next()
         drawn += [draw.uniform[0], draw.normal[0]]
@@ -23,7 +25,7 @@ def test_it_is_a_function_of_the_seed():
 
 def test_the_choice_of_a_mixture_is_uniform_and_the_rest_normal():
     noise = Noise(3, Chance(1000, 1, 0.0))
-    noise.begin(np.zeros((1, 2, 1000), np.float32))
+    noise.begin(Beginnings(np.zeros((1, 2, 1000), np.float32), np.zeros((0, 2000), np.float32)))
     draw = noise.next()
     assert 0 <= draw.uniform.min() < 0.01 < 0.99 < draw.uniform.max() < 1
     assert abs(draw.normal.mean()) < 0.15
@@ -32,9 +34,9 @@ def test_the_choice_of_a_mixture_is_uniform_and_the_rest_normal():
 
 
 def test_rows_of_one_seed_share_their_noise_whichever_rows_still_dream():
-    shared = SharedNoise(np.array([7, 8, 7, 9]), Chance(3, 4, 0.0), INITIAL)
-    assert np.array_equal(shared.first[0], shared.first[2])
-    assert np.array_equal(shared.first[1], drawn(8, 0)[0])
+    shared = SharedNoise(np.array([7, 8, 7, 9]), Chance(3, 4, 0.0), BEGINNINGS)
+    assert np.array_equal(shared.first.latent[0], shared.first.latent[2])
+    assert np.array_equal(shared.first.latent[1], drawn(8, 0)[0])
     shared.next(np.arange(4))
     later = shared.next(np.array([1, 2]))
     assert np.array_equal(later.uniform[0], drawn(8, 2)[3])
@@ -43,8 +45,8 @@ def test_rows_of_one_seed_share_their_noise_whichever_rows_still_dream():
 
 def test_dropout_keeps_the_mean_and_is_shared_too():
     chance = Chance(3, 1000, 0.25)
-    shared, alone = SharedNoise(np.array([7, 8]), chance, INITIAL), Noise(8, chance)
-    alone.begin(INITIAL)
+    shared, alone = SharedNoise(np.array([7, 8]), chance, BEGINNINGS), Noise(8, chance)
+    alone.begin(BEGINNINGS)
     mask = shared.next(np.array([1])).mask
     assert np.array_equal(mask, alone.next().mask)
     assert set(np.unique(mask)) == {np.float32(0), np.float32(1) / np.float32(0.75)}

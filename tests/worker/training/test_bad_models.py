@@ -7,7 +7,7 @@ import numpy as np
 import onnx
 import pytest
 
-from dreamfleet.common.bundle import DREAM, INITIAL, POLICY, find_bundle, write_bundle
+from dreamfleet.common.bundle import DREAM, INITIAL, POLICY, RECORDED, find_bundle, write_bundle
 from dreamfleet.common.errors import BundleError, DatasetError
 from dreamfleet.common.tensors import weights_finite
 from dreamfleet.worker.training import train_mdnrnn, train_vae
@@ -68,6 +68,28 @@ def test_what_ships_and_what_is_no_model_have_no_wrong_weights():
 def test_a_dream_begins_at_real_latents(random_bundle, tmp_path, initial, said):
     with pytest.raises(BundleError, match=said):
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts_of(random_bundle), INITIAL: initial})
+
+
+@pytest.mark.parametrize(
+    ("recorded", "said"),
+    [
+        (npy(np.zeros((0, 576), np.float16)), "with N from 1 to 16384"),
+        (npy(np.zeros((16_385, 576), np.float16)), "with N from 1 to 16384"),
+        (npy(np.zeros((4, 575), np.float16)), "W at least 576, not"),
+        (npy(np.zeros((4, 2, 576), np.float16)), r"not \(4, 2, 576\)"),
+        (npy(np.full((4, 576), np.nan, np.float16)), "NaN or infinity"),
+        (npy(np.full((4, 576), np.inf, np.float16)), "NaN or infinity"),
+        (npy(np.array([object()])), "no array of states"),
+        (npy(np.zeros(576, np.int64)), "no array of states"),
+        (b"", "no array of states"),
+        (npy(np.zeros((4, 576), np.float16))[:-1], "no array of states"),
+    ],
+)
+def test_damaged_recorded_states_are_one_clear_line(random_bundle, tmp_path, recorded, said):
+    parts = {**parts_of(random_bundle), RECORDED: recorded}
+    with pytest.raises(BundleError, match=rf"b\.zip: recorded_states\.npy .*{said}.*; build the bundle again") as told:
+        write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)
+    assert "\n" not in str(told.value)
 
 
 def test_graphs_of_other_sizes_than_the_manifest_says_are_refused(random_bundle, tmp_path):

@@ -1,0 +1,78 @@
+"""Where dreams begin: at first pictures with an empty memory, or at recorded states, with what a drive remembered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.bundle import INITIAL, RECORDED, Bundle
+from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.tensors import read_array
+
+Floats = NDArray[np.float32]
+APART = (1,)  # the spawn key of what chooses a beginning: it takes nothing from a dream's other chance
+
+
+class Beginning(NamedTuple):
+    """One of them: `mu`, `logvar` `(latent,)`, and the model's recurrent state `memory` `(memory,)`."""
+
+    mu: Floats
+    logvar: Floats
+    memory: Floats
+
+
+@dataclass(frozen=True)
+class Beginnings:
+    """All that a bundle has, and the share of dreams that begins at recorded states.
+
+    `initial` `(N, 2, latent)` are the mu and logvar of first pictures, `recorded` `(M, 2 * latent + memory)` those of
+    recorded moments, with what the model remembered there.
+    """
+
+    initial: Floats
+    recorded: Floats
+    share: float = 0.0
+
+    @classmethod
+    def of(cls, bundle: Bundle, share: float, memory: int) -> Beginnings:
+        """A bundle's own, whose model remembers so many numbers; `UsageError` for a share that is none.
+
+        `BundleError` where recorded states are asked for and there are none, or they are of another model.
+        """
+        check_share(share)
+        initial, latent = read_array(bundle.read(INITIAL)), bundle.manifest.latent
+        if not share:
+            return cls(initial, np.zeros((0, 2 * latent + memory), dtype=np.float32))
+        recorded = bundle.read_recorded()
+        if recorded.shape[1] != 2 * latent + memory:
+            raise BundleError(
+                f"{bundle.path}: a state in {RECORDED} has {recorded.shape[1]} numbers, its model "
+                f"{2 * latent + memory}; build the bundle again"
+            )
+        return cls(initial, recorded, share)
+
+    def choose(self, seed: int, first: int) -> Beginning:
+        """Where the dream of this seed begins: at a recorded state, or else at the `first` of the first pictures.
+
+        A seed that begins at a recorded state does so at every larger share, at the same one.
+        """
+        if self.share:
+            random = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=APART)))
+            if random.random() < self.share:
+                return self._recorded(int(random.integers(len(self.recorded))))
+        mu, logvar = self.initial[first]
+        return Beginning(mu, logvar, np.zeros(self.recorded.shape[1] - 2 * len(mu), dtype=np.float32))
+
+    def _recorded(self, index: int) -> Beginning:
+        latent = self.initial.shape[2]
+        mu, logvar, memory = np.split(self.recorded[index], [latent, 2 * latent])
+        return Beginning(mu, logvar, memory)
+
+
+def check_share(share: float) -> None:
+    """`UsageError` unless it is from 0 to 1."""
+    if not 0 <= share <= 1:
+        raise UsageError(f"the share of dreams that begins at recorded states must be from 0 to 1, not {share}")
