@@ -138,6 +138,7 @@ def facts(bundle: Bundle) -> list[tuple[str, str]]:
         ("hidden units", str(manifest.hidden)),
         ("reward head", str(model.get("reward", "not told"))),
         ("attention window", str(model.get("window", 0) or "none")),
+        ("recorded states", str(bundle.recorded or "none")),
     ]
     rows += [
         (name, str(provenance[name])) for name in ("episodes", "frames", "held_out_episodes") if name in provenance

@@ -21,6 +21,7 @@ from dreamfleet.common.bundle import (
     LAYERED,
     LINEAR,
     POLICY,
+    RECORDED,
     WEIGHTS,
     Bundle,
     Manifest,
@@ -33,6 +34,7 @@ from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.dataset import episodes, load, split
 from dreamfleet.worker.training.encode import ENCODED, encoder_of
+from dreamfleet.worker.training.recorded import recorded_states
 from dreamfleet.worker.training.world import WORLD, find_world, preprocessing_to
 from dreamfleet.worker.worldmodel.export import (
     Weights,
@@ -57,8 +59,8 @@ def record_quality(folder: Path, figures: dict[str, float]) -> None:
         file.write(json.dumps({**known, **figures}, indent=1).encode())
 
 
-def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundle:
-    """Build the bundle of a data folder whose models are trained."""
+def assemble(folder: Path, out: Path, name: str, *, with_weights: bool, recorded: int = 0) -> Bundle:
+    """Build the bundle of a data folder whose models are trained, with `recorded` states of its drives at most."""
     vae = load_weights(folder / train_vae.CHECKPOINT)
     rnn = load_weights(folder / train_mdnrnn.CHECKPOINT)
     configs = (
@@ -81,6 +83,11 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundl
         "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
     }
     parts = graphs(vae, rnn, initial_latents(folder), *configs)
+    if recorded:
+        found = recorded_states(folder, recorded)
+        if states := len(found.states):
+            parts[RECORDED] = _npy(found.states)
+            provenance["recorded"] = {"states": states, "before_losses": found.before_losses}
     if with_weights:
         tensors = {f"vae.{key}": value for key, value in vae.items()} | {f"mdnrnn.{k}": v for k, v in rnn.items()}
         parts[WEIGHTS] = save(
@@ -116,8 +123,6 @@ def graphs(
     actions = find_world().world.actions
     if not isinstance(actions, Continuous) or actions.outputs_of:
         raise DatasetError(f"world models are built for continuous actions of an output each; those of {WORLD} are not")
-    buffer = io.BytesIO()
-    np.save(buffer, initial)
     return {
         ENCODER: export_encoder(vae, vae_config),
         DECODER: export_decoder(vae, vae_config),
@@ -125,8 +130,14 @@ def graphs(
         DREAM: export_dream(rnn, rnn_config),
         LINEAR: export_controller(actions, hidden=False),
         LAYERED: export_controller(actions, hidden=True),
-        INITIAL: buffer.getvalue(),
+        INITIAL: _npy(initial),
     }
+
+
+def _npy(array: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
 
 
 def initial_latents(folder: Path) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dreamfleet.worker.training.following import follow, remember
 from dreamfleet.worker.training.rollouts import Rollouts, load_rollouts
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction, reward_labels
 
@@ -30,11 +31,12 @@ def foresight(model: MDNRNN, held_out: Sequence[Path]) -> dict[str, float]:
     rollouts = load_rollouts(held_out[:MOST]).to(device)
     model.eval()
     with torch.no_grad():
-        told, hidden_states = _follow(model, rollouts)
+        hidden, states = follow(model, rollouts)
+        told = model.predict(hidden)
         labels = _labels(model, rollouts)
         mask = rollouts.mask > 0
         figures = {name: _judge(model, name, _head(told, name)[mask], labels[name][mask]) for name in labels}
-        for ahead, (seen, predicted, latents) in _dream(model, rollouts, hidden_states).items():
+        for ahead, (seen, predicted, latents) in _dream(model, rollouts, states).items():
             rows, steps = seen
             for name in labels:
                 figures[f"{name}_after_{ahead}"] = _judge(
@@ -55,21 +57,6 @@ def area_under_curve(scores: Floats, positive: NDArray[np.bool_]) -> float:
     return float((ranks[positive].sum() - positives * (positives + 1) / 2) / pairs) if pairs else float("nan")
 
 
-def _follow(model: MDNRNN, rollouts: Rollouts) -> tuple[Prediction, list[Tensor]]:
-    """Predictions along the recorded rollouts, and the state before each step."""
-    config = model.config
-    labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
-    state = rollouts.mu.new_zeros(len(rollouts.mu), config.state)
-    states, hidden = [], []
-    for step in range(rollouts.mu.shape[1]):
-        if config.previous_reward and step:
-            state = _remember(model, state, labels[:, step - 1])
-        states.append(state)
-        last, state = model.advance(torch.cat([rollouts.mu[:, step], rollouts.action[:, step]], dim=1), state)
-        hidden.append(last)
-    return model.predict(torch.stack(hidden, dim=1)), states
-
-
 def _dream(
     model: MDNRNN, rollouts: Rollouts, states: list[Tensor]
 ) -> dict[int, tuple[tuple[Tensor, Tensor], Prediction, Tensor]]:
@@ -86,7 +73,7 @@ def _dream(
             told = model.predict(hidden)
             latent = (told.log_weights.exp() * told.means).sum(dim=-1)
             if config.previous_reward:
-                state = _remember(model, state, told.reward if config.reward == "value" else (told.reward > 0).float())
+                state = remember(model, state, told.reward if config.reward == "value" else (told.reward > 0).float())
             if ahead in found:
                 rows = torch.nonzero(rollouts.mask[:, start + ahead])[:, 0]
                 last, _ = model.advance(torch.cat([latent, rollouts.action[:, start + ahead]], dim=1), state)
@@ -97,12 +84,6 @@ def _dream(
             rows, steps, hidden, latents = (torch.cat(each) for each in zip(*parts, strict=True))
             result[ahead] = ((rows, steps), model.predict(hidden), latents)
     return result
-
-
-def _remember(model: MDNRNN, state: Tensor, label: Tensor) -> Tensor:
-    state = state.clone()
-    state[:, 2 * model.config.hidden] = label
-    return state
 
 
 def _labels(model: MDNRNN, rollouts: Rollouts) -> dict[str, Tensor]:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dreamfleet.common.bundle import MOST_RECORDED
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
 
 SUMMARY = "freeze a trained world model into one file that workers fetch by its hash"
 EXTRAS = ("train",)
+RECORDED = 512  # states of the default layers are 0.6 MB
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -16,6 +19,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set and its trained models")
     parser.add_argument("--out", type=Path, required=True, help="the bundle to write, NAME.zip")
     parser.add_argument("--with-weights", action="store_true", help="keep the training weights in it")
+    parser.add_argument(
+        "--recorded", type=int, default=RECORDED, metavar="N",
+        help=f"moments of the drives at which dreams may begin, with the model's memory; 0: none (default {RECORDED})",
+    )  # fmt: skip
     add_json(parser)
 
 
@@ -23,10 +30,16 @@ def run(args: argparse.Namespace) -> int:
     """Build the bundle and print its identity."""
     from dreamfleet.worker.training.assemble import assemble
 
-    bundle = assemble(args.data, args.out, args.out.stem, with_weights=args.with_weights)
+    if not 0 <= args.recorded <= MOST_RECORDED:
+        raise UsageError(f"--recorded must be from 0 to {MOST_RECORDED}, not {args.recorded}")
+    bundle = assemble(args.data, args.out, args.out.stem, with_weights=args.with_weights, recorded=args.recorded)
     size = bundle.path.stat().st_size / 1e6
     parameters = bundle.controller_shape.size
-    text = f"{bundle.path}: {size:.1f} MB, sha256 {bundle.sha256}, controllers of {parameters} parameters"
+    states = bundle.recorded
+    text = (
+        f"{bundle.path}: {size:.1f} MB, sha256 {bundle.sha256}, controllers of {parameters} parameters, "
+        f"{states} recorded states"
+    )
     answer(args, text, bundle=bundle.path, bytes=bundle.path.stat().st_size, sha256=bundle.sha256,
-           controller_parameters=parameters)  # fmt: skip
+           controller_parameters=parameters, recorded=states)  # fmt: skip
     return 0

@@ -1,0 +1,31 @@
+"""The MDN-RNN along recorded drives: what it remembers before each of their steps."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dreamfleet.worker.training.rollouts import Rollouts
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, reward_labels
+
+
+def follow(model: MDNRNN, rollouts: Rollouts) -> tuple[Tensor, list[Tensor]]:
+    """What the LSTM gives at each step `(N, T, hidden)`, and the state `(N, state)` before each, from zero on."""
+    config = model.config
+    labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
+    state = rollouts.mu.new_zeros(len(rollouts.mu), config.state)
+    states, hidden = [], []
+    for step in range(rollouts.mu.shape[1]):
+        if config.previous_reward and step:
+            state = remember(model, state, labels[:, step - 1])
+        states.append(state)
+        last, state = model.advance(torch.cat([rollouts.mu[:, step], rollouts.action[:, step]], dim=1), state)
+        hidden.append(last)
+    return torch.stack(hidden, dim=1), states
+
+
+def remember(model: MDNRNN, state: Tensor, label: Tensor) -> Tensor:
+    """A state `(N, state)` with the reward head's label `(N,)` of the step before; of models that look at it."""
+    state = state.clone()
+    state[:, 2 * model.config.hidden] = label
+    return state

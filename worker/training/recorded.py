@@ -1,0 +1,64 @@
+"""Recorded states for a bundle: where a folder's drives were, and what its MDN-RNN remembered there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
+from dreamfleet.worker.training.dataset import episodes, load_steps
+from dreamfleet.worker.training.encode import ENCODED
+from dreamfleet.worker.training.following import follow
+from dreamfleet.worker.training.moments import Moment, draw_moments
+from dreamfleet.worker.training.rollouts import load_rollouts
+from dreamfleet.worker.training.train_mdnrnn import CHECKPOINT
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+
+DRIVES = 32  # that are followed at once: 1000 steps of the default layers' states are 65 MB
+SEED = 0
+
+
+@dataclass(frozen=True)
+class RecordedStates:
+    """States `(N, 2 * latent + state)` in half precision: mu, logvar and the recurrent state before the action.
+
+    So many of them lie shortly before a loss of the road.
+    """
+
+    states: NDArray[np.float16]
+    before_losses: int
+
+
+def recorded_states(folder: Path, count: int) -> RecordedStates:
+    """So many of a folder's encoded drives, by its MDN-RNN, or as many as there are; equal folders give equal ones."""
+    paths, model = episodes(folder, ENCODED), MDNRNN(load_config(folder / CHECKPOINT, MDNRNNConfig))
+    load_checkpoint(folder / CHECKPOINT, model, None)
+    drawn = draw_moments([load_steps(path)["reward"] for path in paths], count, np.random.default_rng(SEED))
+    rows = [row for part in _by_drives(drawn.all) for row in _states(paths, model, part)]
+    width = 2 * model.config.latent + model.config.state
+    return RecordedStates(np.array(rows, dtype=np.float16).reshape(-1, width), len(drawn.before_losses))
+
+
+def _by_drives(moments: Sequence[Moment]) -> Iterator[list[Moment]]:
+    """Sorted moments, those of few drives at a time."""
+    drives = [list(each) for _, each in groupby(moments, key=lambda moment: moment.drive)]
+    for start in range(0, len(drives), DRIVES):
+        yield [moment for drive in drives[start : start + DRIVES] for moment in drive]
+
+
+def _states(paths: Sequence[Path], model: MDNRNN, moments: Sequence[Moment]) -> Iterator[NDArray[np.float32]]:
+    """The state of each of these moments."""
+    drives = sorted({moment.drive for moment in moments})
+    rollouts = load_rollouts([paths[drive] for drive in drives])
+    with torch.no_grad():
+        _, remembered = follow(model, rollouts)
+    for drive, step in moments:
+        row = drives.index(drive)
+        yield torch.cat([rollouts.mu[row, step], rollouts.logvar[row, step], remembered[step][row]]).numpy()
