@@ -1,5 +1,6 @@
 """Evolving in the dream, with means that are driven in reality."""
 
+import json
 import os
 import signal
 from dataclasses import replace
@@ -11,17 +12,18 @@ from dreamfleet.common.bundle import DREAM, write_bundle
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.terms import terms_of
 from tests.support import tasks
+from tests.support.bundles import states, write_random_bundle
 
 pytestmark = pytest.mark.timeout(300)
 GENERATIONS, POPULATION, EPISODES = 4, 8, 3
 HEATED_GENERATIONS = 14
 
 
-def begin(processes, bundle, name):
+def begin(processes, bundle, name, *flags):
     return processes.coordinator(
         "--preset", "dream", "--bundle", bundle.path, "--population", POPULATION, "--episodes", EPISODES,
         "--horizon", 300, "--generations", GENERATIONS, "--evaluate-every", 2, "--evaluation-episodes", 2,
-        "--confirm-episodes", 2, name=name,
+        "--confirm-episodes", 2, *flags, name=name,
     )  # fmt: skip
 
 
@@ -51,6 +53,40 @@ def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bund
     assert out.count("same bits") == EPISODES
     code, out, err = processes.call("evaluate", "--controller", "alone", "--runs-dir", processes.runs, "--episodes", 1)
     assert code == 0, err
+
+
+def test_dreams_that_begin_at_recorded_states_are_the_same_whoever_dreams(processes, tmp_path):
+    bundle = write_random_bundle(tmp_path / "b.zip", recorded=states(20))
+    for name, workers, flags in (("alone", 1, ("--recorded", 0.5)), ("two", 2, ("--recorded", 0.5)), ("plain", 1, ())):
+        coordinator = begin(processes, bundle, name, *flags)
+        crew = [processes.worker("--run", name, "--name", f"w{number}") for number in range(workers)]
+        assert coordinator.finish(200)[0] == 0, "".join(coordinator.lines)
+        for each in crew:
+            each.end()
+    alone = outcome(processes, "alone")
+    assert alone == outcome(processes, "two")
+    assert alone[0] != outcome(processes, "plain")[0]
+    runs = ("--runs-dir", processes.runs)
+    code, out, err = processes.call("replay", "alone", *runs, "--candidate", "2/3")
+    assert (code, out.count("same bits")) == (0, EPISODES), err
+    code, out, err = processes.call("runs", "show", "alone", *runs, "--json")
+    assert json.loads(out)["settings"]["task"]["recorded"] == 0.5, err
+    code, out, err = processes.call("evaluate", "--controller", "alone", *runs, "--episodes", 1)
+    assert code == 0, err
+    code, out, err = processes.call("fork", "alone", *runs, "--task", "car-racing")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "--recorded is of task dream, not of car-racing: leave it out, or say 0" in err
+
+
+def test_recorded_states_that_a_bundle_lacks_are_refused_as_the_run_begins(processes, random_bundle):
+    code, _, err = processes.call(
+        "coordinator", "--preset", "dream", "--bundle", random_bundle.path, "--recorded", 0.5,
+        "--runs-dir", processes.runs,
+    )  # fmt: skip
+    assert code in (1, 2)
+    assert "random.zip holds no recorded states" in err
+    assert "Traceback" not in err
+    assert not (processes.runs / "run").exists()
 
 
 def begin_heated(processes, bundle, name):

@@ -28,12 +28,15 @@ from tests.support.processes import processes_in
 
 pytestmark = pytest.mark.timeout(600)
 SECONDS = 300  # that an iteration may take
+RUN = (
+    "--generations 2 --population 4 --episodes 1 --horizon 10 --evaluate-every 1 --evaluation-episodes 1"
+    " --confirm-episodes 0"
+)
 SMALL = (
     "--rounds", 2, "--drives", 3, "--drive-steps", 12, "--own-drives", 2, "--means", 2, "--jobs", 1, "--local", 1,
     "--vae-flags", "--updates 3 --batch 8 --latent 4 --channels 2 2 2 2 --validate-every 1", "--vae-updates", 2,
     "--mdnrnn-flags", "--updates 3 --batch 2 --latent 4 --hidden 4 --validate-every 1", "--mdnrnn-updates", 2,
-    "--run-flags", "--generations 2 --population 4 --episodes 1 --horizon 10 --evaluate-every 1 --evaluation-episodes 1"
-    " --confirm-episodes 0 --collect-every 2 --collect-episodes 1",
+    "--run-flags", f"{RUN} --collect-every 2 --collect-episodes 1",
     "--gate-drives", 2, "--gate-losses", 0,
 )  # fmt: skip
 FIRST = ("collect", "vae", "encode", "mdnrnn", "bundle", "evolve")
@@ -110,6 +113,16 @@ def test_each_round_makes_a_model_from_all_drives_and_evolves_in_its_dream(undis
             assert told["rounds"][number - 1]["score"]["mean"] == max(each.mean for each in run.evaluations())
     lines = [line for line in err.splitlines() if line.startswith("round ")]
     assert [tuple(line.split()[1:3]) for line in lines] == [(str(number), name) for number, name in PHASES]
+
+
+def test_a_rounds_dreams_may_begin_where_its_drives_were(processes):
+    layout = Layout(processes.folder / "data")
+    flags = ("--rounds", 1, "--drive-steps", 24, "--run-flags", f"{RUN} --recorded 0.5")
+    code, _, err = processes.call(*words(layout.root, *flags), timeout=SECONDS)
+    assert code == 0, err
+    assert Bundle.open(layout.bundle(1)).recorded == 3 * 4, "all that lies behind each drive's first steps"
+    with open_run(layout.runs, layout.run_name(1)) as run:
+        assert (run.spec.task, run.spec.recorded) == ("dream", 0.5)
 
 
 def test_the_encoder_stays_and_what_evolved_drives_for_the_next_model(undisturbed):

@@ -71,11 +71,14 @@ def test_a_controller_that_another_encoder_does_not_fit_dreams_no_losses():
 
 
 def test_a_round_evolves_in_the_model_that_counts_with_a_seed_of_its_own():
-    refused = commands(*ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), run_flags="--generations 3")
+    refused = commands(
+        *ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), run_flags="--generations 3 --recorded 0.5"
+    )
     words = said(refused.begin_run(2, ("tcp/127.0.0.1:7000",), ("--preset", "dream"), Path("start.npz")))
     assert words == (
-        "coordinator --preset dream --generations 3 --run round-02 --bundle data/rounds/01/round-1.zip --seed 2 "
-        "--init start.npz --runs-dir data/runs --json --listen tcp/127.0.0.1:7000"
+        "coordinator --preset dream --generations 3 --recorded 0.5 --run round-02 "
+        "--bundle data/rounds/01/round-1.zip --seed 2 --init start.npz "
+        "--runs-dir data/runs --json --listen tcp/127.0.0.1:7000"
     )
     assert said(refused.resume_run(2, ("tcp/127.0.0.1:7000",))) == (
         "coordinator --resume round-02 --runs-dir data/runs --json --listen tcp/127.0.0.1:7000"
