@@ -126,7 +126,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self._over = np.zeros(self.num_envs, dtype=bool)
         for index, each in enumerate(seeds):
             self._begin(index, each)
-        return self._latent.copy(), {"memory": self._memory.copy()}
+        return self._latent.copy(), self._told(np.ones(self.num_envs, dtype=bool))
 
     def step(
         self, actions: Floats
@@ -143,12 +143,15 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
             self._begin(int(index), None)
             reward[index], done[index], truncated[index] = 0.0, False, False
         self._over = done | truncated
-        info = {"memory": self._memory.copy(), "_memory": begun} if begun.any() else {}
-        return self._latent.copy(), reward, done, truncated, info
+        return self._latent.copy(), reward, done, truncated, self._told(begun) if begun.any() else {}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Each dream's picture `(side, side, 3)`."""
         return None if self._decoder is None else tuple(self._decoder.decode(self._latent))
+
+    def _told(self, begun: Flags) -> dict[str, Any]:
+        """What `info` says of dreams that have just begun, as gymnasium's vector environments say it."""
+        return {"memory": self._memory.copy(), "_memory": begun}
 
     def _begin(self, index: int, seed: int | None) -> None:
         dream = int(self.np_random.integers(2**31)) if seed is None else seed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -41,9 +42,21 @@ def recorded_states(folder: Path, count: int) -> RecordedStates:
     paths, model = episodes(folder, ENCODED), MDNRNN(load_config(folder / CHECKPOINT, MDNRNNConfig))
     load_checkpoint(folder / CHECKPOINT, model, None)
     drawn = draw_moments([load_steps(path)["reward"] for path in paths], count, np.random.default_rng(SEED))
-    rows = [row for part in _by_drives(drawn.all) for row in _states(paths, model, part)]
+    with _one_thread(), torch.no_grad():
+        rows = [row for part in _by_drives(drawn.all) for row in _states(paths, model, part)]
     width = 2 * model.config.latent + model.config.state
     return RecordedStates(np.array(rows, dtype=np.float16).reshape(-1, width), len(drawn.before_losses))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Then the bits do not depend on a host's cores; and steps as small as these take others several times as long."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _by_drives(moments: Sequence[Moment]) -> Iterator[list[Moment]]:
@@ -57,8 +70,7 @@ def _states(paths: Sequence[Path], model: MDNRNN, moments: Sequence[Moment]) -> 
     """The state of each of these moments."""
     drives = sorted({moment.drive for moment in moments})
     rollouts = load_rollouts([paths[drive] for drive in drives])
-    with torch.no_grad():
-        _, remembered = follow(model, rollouts)
+    _, remembered = follow(model, rollouts)
     for drive, step in moments:
         row = drives.index(drive)
         yield torch.cat([rollouts.mu[row, step], rollouts.logvar[row, step], remembered[step][row]]).numpy()

@@ -135,6 +135,7 @@ def test_many_dreams_begin_and_begin_again_as_the_single_ones(bundle):
     many = CarRacingDreams(6, bundle, horizon=3, recorded=0.5)
     single = [CarRacingDream(bundle, horizon=3, recorded=0.5) for _ in range(6)]
     latents, info = many.reset(seed=10)
+    assert info["_memory"].all()
     begun = [each.reset(seed=10 + index) for index, each in enumerate(single)]
     assert np.array_equal(latents, [latent for latent, _ in begun])
     assert np.array_equal(info["memory"], [told["memory"] for _, told in begun])

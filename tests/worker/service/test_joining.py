@@ -2,7 +2,7 @@
 
 import os
 import queue
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 
@@ -21,6 +21,13 @@ from tests.support.stage import wait_for
 
 pytestmark = pytest.mark.timeout(60)
 SLOW_BEATS = Intervals(beat=2 * DEADLINE, repeat=0.1)
+
+
+@dataclass(frozen=True)
+class OfTomorrow(TaskSpec):
+    """A specification with what a later version adds to it."""
+
+    later: float = 0.5
 
 
 def test_it_waits_for_a_coordinator_that_starts_later(stage, said, cached):
@@ -78,6 +85,15 @@ def test_a_refusal_ends_it_with_the_reason_and_the_remedy(stage):
     error = served.exception(DEADLINE)
     assert isinstance(error, RefusedError)
     assert "your moon is full; wait a week" in str(error)
+
+
+def test_a_run_that_is_told_in_a_later_versions_words_is_refused_rather_than_scored_otherwise(stage):
+    hand = stage.hand()
+    hand.spec = OfTomorrow(**vars(hand.spec))
+    _, served = stage.worker()
+    error = served.exception(DEADLINE)
+    assert isinstance(error, RefusedError)
+    assert "in words that this version does not know (wrong fields); install dreamfleet" in str(error)
 
 
 def test_of_any_run_one_that_refuses_is_left_to_others(stage, said, cached):
