@@ -69,7 +69,7 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         self._latent = begun.latent[None]
         self._state = self._world.begin(1, begun.memory)
         self._steps = 0
-        return self._latent[0], {"memory": begun.memory}
+        return self._latent[0], {"memory": begun.memory.copy()}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Dream one step under `action` `(3,)`."""

@@ -149,6 +149,14 @@ def test_many_dreams_begin_and_begin_again_as_the_single_ones(bundle):
     assert 0 < told["memory"].any(axis=1).sum() < 6
 
 
+def test_whoever_is_told_a_memory_may_do_with_it_what_he_likes(bundle):
+    environment = CarRacingDream(bundle, recorded=1.0)
+    first = environment.reset(seed=1)[1]["memory"]
+    kept = first.copy()
+    first[:] = 7
+    assert np.array_equal(environment.reset(seed=1)[1]["memory"], kept)
+
+
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_a_share_that_is_none_is_refused(bundle, share):
     with pytest.raises(UsageError, match="recorded states must be from 0 to 1"):
