@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from dreamfleet.common.bundle import (
     write_bundle,
 )
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.fields import written
 from dreamfleet.common.files import write_aside
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.worker.training import train_mdnrnn, train_vae
@@ -84,7 +84,7 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool) -> Bundl
     if with_weights:
         tensors = {f"vae.{key}": value for key, value in vae.items()} | {f"mdnrnn.{k}": v for k, v in rnn.items()}
         parts[WEIGHTS] = save(
-            tensors, {"vae": json.dumps(asdict(configs[0])), "mdnrnn": json.dumps(asdict(configs[1]))}
+            tensors, {"vae": json.dumps(written(configs[0])), "mdnrnn": json.dumps(written(configs[1]))}
         )
     return write_bundle(out, manifest(name, provenance, *configs), parts)
 
@@ -101,7 +101,7 @@ def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn:
         hidden=rnn.hidden,
         actions=rnn.actions,
         provenance=provenance,
-        models={"vae": asdict(vae), "mdnrnn": asdict(rnn)},
+        models={"vae": written(vae), "mdnrnn": written(rnn)},
     )
 
 

@@ -16,6 +16,7 @@ from safetensors.torch import save
 
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.fields import written
 from dreamfleet.common.files import write_aside
 
 T = TypeVar("T")
@@ -26,7 +27,7 @@ def save_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
     tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
-    about = {"progress": json.dumps(progress), "config": json.dumps(asdict(model.config))}  # type: ignore[call-overload]
+    about = {"progress": json.dumps(progress), "config": json.dumps(written(model.config))}
     data = save({name: tensor.contiguous() for name, tensor in tensors.items()}, about)
     with write_aside(path) as file:
         file.write(data)

@@ -32,7 +32,9 @@ def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> No
         for each in fields(config):
             if each.name not in FIXED:
                 flag = "--" + each.name.replace("_", "-")
-                group.add_argument(flag, default=argparse.SUPPRESS, **_options(hints[each.name]))
+                group.add_argument(
+                    flag, default=argparse.SUPPRESS, help=each.metadata.get("help"), **_options(hints[each.name])
+                )
 
 
 def changed(config: T, args: argparse.Namespace) -> T:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from dreamfleet.worker.training.train_vae import Report
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss, reward_labels, reward_loss
 from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
 
+N = TypeVar("N", float, Tensor)
 CHECKPOINT = "mdnrnn.safetensors"
 VALIDATION_ROLLOUTS = 20  # for the curve while training
 
@@ -65,7 +67,7 @@ def train_mdnrnn(
             append_curve(
                 folder / "mdnrnn.jsonl", update=update, **{f"held_out_{name}": part for name, part in parts.items()}
             )
-            schedule.validated(sum(parts.values()))
+            schedule.validated(sum(weighted(layers, parts).values()))
     return quality(model, held_out, device)
 
 
@@ -77,11 +79,11 @@ def vae_of(folder: Path) -> str:
 def backward(
     model: MDNRNN, rollouts: Rollouts, noise: torch.Generator, device: torch.device | None = None
 ) -> dict[str, float]:
-    """Gradients of a batch, few rollouts at a time, so that memory does not grow with it; returns the losses."""
+    """Gradients of a batch, few rollouts at a time, so that memory does not grow with it; returns the plain losses."""
     values: dict[str, float] = {}
     for chunk in rollouts.chunks():
         parts = shares(losses(model, chunk.to(device), noise), chunk, rollouts)
-        torch.stack(list(parts.values())).sum().backward()  # type: ignore[no-untyped-call]
+        torch.stack(list(weighted(model.config, parts).values())).sum().backward()  # type: ignore[no-untyped-call]
         values = {name: values.get(name, 0.0) + part.item() for name, part in parts.items()}
     return values
 
@@ -115,6 +117,11 @@ def losses(model: MDNRNN, rollouts: Rollouts, noise: torch.Generator) -> dict[st
     if config.done:
         parts["done"] = binary_loss(prediction.done, rollouts.done, rollouts.mask)
     return parts
+
+
+def weighted(config: MDNRNNConfig, parts: Mapping[str, N]) -> dict[str, N]:
+    """Losses as they count in what is learnt."""
+    return {name: config.factors[name] * part for name, part in parts.items()}
 
 
 def shares(parts: dict[str, Tensor], chunk: Rollouts, rollouts: Rollouts) -> dict[str, Tensor]:
