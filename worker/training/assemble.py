@@ -33,6 +33,7 @@ from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.dataset import episodes, load, split
 from dreamfleet.worker.training.encode import ENCODED, encoder_of
+from dreamfleet.worker.training.room import told_where_full
 from dreamfleet.worker.training.world import WORLD, find_world, preprocessing_to
 from dreamfleet.worker.worldmodel.export import (
     Weights,
@@ -53,7 +54,7 @@ def record_quality(folder: Path, figures: dict[str, float]) -> None:
     """Keep a model's figures beside the data, for the manifest."""
     path = folder / QUALITY
     known = json.loads(path.read_text()) if path.exists() else {}
-    with write_aside(path) as file:
+    with told_where_full(path), write_aside(path) as file:
         file.write(json.dumps({**known, **figures}, indent=1).encode())
 
 

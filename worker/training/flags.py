@@ -22,6 +22,10 @@ def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> No
     parser.add_argument("--preset", default="tiny", help=f"{preset_help('training')} (default tiny)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--continue-from", type=Path, metavar="FILE", help="begin from this checkpoint's weights")
+    parser.add_argument(
+        "--new", action="store_true",
+        help="begin anew where a checkpoint lies: it goes, and with it its curve and what --keep-every kept",
+    )  # fmt: skip
     parser.add_argument("--summary", action="store_true", help="print layers and parameters, and train nothing")
     add_json(parser)
     for title, config in (

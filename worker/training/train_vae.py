@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.progress import append_curve
 from dreamfleet.common.stopping import Stop, never
+from dreamfleet.worker.training.curve import append_curve
 from dreamfleet.worker.training.dataset import (
     POOL_EPISODES,
     check_pictures,
@@ -27,7 +27,7 @@ from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 
-CHECKPOINT = "vae.safetensors"
+CHECKPOINT, CURVE = "vae.safetensors", "vae.jsonl"
 VALIDATION_PICTURES = 2000
 CURVE_PICTURES = 500  # of them, for the curve while training
 ACTIVE_NATS = 0.1  # a picture, on average over the held-out ones, above which a latent carries something
@@ -47,7 +47,7 @@ class Losses(NamedTuple):
 def train_vae(
     folder: Path, config: TrainConfig, report: Report, layers: VAEConfig = PAPER,
     device: torch.device | None = None, continue_from: Path | None = None, decoder_only: bool = False,
-    stop: Stop = never,
+    stop: Stop = never, new: bool = False,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
 
@@ -59,12 +59,12 @@ def train_vae(
     check_pictures([*train, *held_out], layers.picture)
     torch.manual_seed(config.seed)
     model = VAE(layers).to(device)
-    if decoder_only and continue_from is None and not (folder / CHECKPOINT).exists():
+    if decoder_only and continue_from is None and (new or not (folder / CHECKPOINT).exists()):
         raise UsageError("--decoder-only needs an encoder that was trained: give --continue-from")
-    schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from)
+    schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from, new)
     progress = schedule.progress
     report(schedule.update, "")
-    validation = held_out_pictures(held_out, CURVE_PICTURES)
+    validation, curve = held_out_pictures(held_out, CURVE_PICTURES), folder / CURVE
     batches = picture_batches(train, config.batch, config.seed, progress.get("pool", 0), progress.get("taken", 0))
     epoch_pools = max(1, len(train) // POOL_EPISODES)
     while schedule.goes_on(stop):
@@ -76,15 +76,17 @@ def train_vae(
         schedule.progress |= {"pool": pool, "taken": taken}
         report(schedule.update, f"error {loss.error:.1f}  KL {loss.divergence:.1f}")
         if schedule.update % 20 == 0:
-            append_curve(folder / "vae.jsonl", update=schedule.update, error=loss.error, kl=loss.divergence)
-        if schedule.due:
-            held = validate(model, validation, device)
-            append_curve(
-                folder / "vae.jsonl", update=schedule.update,
-                held_out=held.plain, held_out_error=held.error, held_out_kl=held.divergence,
-            )  # fmt: skip
-            schedule.validated(held.weighted)
+            append_curve(curve, update=schedule.update, error=loss.error, kl=loss.divergence)
+        schedule.close_update(lambda: _look(model, validation, curve, schedule.update, device))
     return quality(model, held_out, device)
+
+
+def _look(model: VAE, pictures: NDArray[np.uint8], curve: Path, update: int, device: torch.device | None) -> float:
+    """The held-out loss that counts; a point of the curve."""
+    loss = validate(model, pictures, device)
+    parts = {"held_out": loss.plain, "held_out_error": loss.error, "held_out_kl": loss.divergence}
+    append_curve(curve, update=update, **parts)
+    return loss.weighted
 
 
 def backward(model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device: torch.device | None) -> Losses:
