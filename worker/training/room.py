@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from dreamfleet.common.errors import DatasetError
+
+FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 @contextmanager
@@ -16,6 +19,7 @@ def told_where_full(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise DatasetError(
-            f"cannot write {path}: {error.strerror}; what was saved before is kept: make room there, and the same "
-            "command goes on from it"
+            f"cannot write {path}: {error.strerror}; what was saved before is kept: "
+            f"{'make it writable' if error.errno in FORBIDDEN else 'make room there'}, and the same command (without "
+            "--new) goes on from it"
         ) from error

@@ -121,7 +121,10 @@ class Schedule:
 
     def _best_is_kept(self) -> bool:
         """Whether the best state lies there; without patience it was not kept, or it is another training's."""
-        return self._best_path.exists() and load_progress(self._best_path).get("best") == self.progress.get("best")
+        try:
+            return bool(load_progress(self._best_path).get("best") == self.progress.get("best"))
+        except DatasetError:  # it is not there, or damaged
+            return False
 
     def _replace(self, other: Path | None) -> None:
         """Write the first checkpoint where one may lie; only then remove what belongs to that, except `other`."""

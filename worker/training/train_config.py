@@ -21,7 +21,9 @@ class TrainConfig:
     validate_every: int = 200  # updates
     keep_every: int = field(
         default=0,
-        metadata={"help": "updates after which a checkpoint stays beside the last one, as vae.000400.safetensors"},
+        metadata={
+            "help": "updates after which a checkpoint stays beside the last one, as vae.000400.safetensors; 0: none"
+        },
     )
 
     def __post_init__(self) -> None:

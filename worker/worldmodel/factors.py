@@ -13,7 +13,7 @@ LEAST, MOST = 1e-6, 1e6  # beyond which float32 loses the lighter part beside th
 
 def factor(text: str) -> Any:
     """A field of a model's configuration that weighs a part of its loss; 1, which is not written: as it stands."""
-    return field(default=1.0, metadata={**OPTIONAL, "help": text})
+    return field(default=1.0, metadata={**OPTIONAL, "help": f"{text} (default 1)"})
 
 
 def check_factors(config: Any, *names: str) -> None:

@@ -199,6 +199,7 @@ def test_an_early_end_is_said_and_again_where_nothing_is_left_to_do(data, capsys
 def test_patience_that_comes_later_counts_from_then(data):
     still = replace(SHORT, rate=1e-12, updates=2, validate_every=1)
     train(data, still)
+    (data / "vae.best.safetensors").write_bytes(b"of another training, and damaged")
     train(data, replace(still, updates=20, patience=1))
     found = load_progress(data / train_vae.CHECKPOINT)
     assert (found["update"], found["given_up_at"]) == (3, 4)
