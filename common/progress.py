@@ -1,11 +1,9 @@
-"""Progress bars and loss curves."""
+"""Progress bars."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -32,9 +30,3 @@ def progress_bar(description: str, total: int, unit: str) -> Iterator[Bar]:
     )  # fmt: skip
     with Progress(*columns, console=Console(stderr=True)) as progress:
         yield Bar(progress, description, total)
-
-
-def append_curve(path: Path, **values: float) -> None:
-    """One point of a loss curve as a line of JSON."""
-    with path.open("a") as file:
-        file.write(json.dumps({name: round(value, 6) for name, value in values.items()}) + "\n")

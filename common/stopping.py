@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Stop = Callable[[], bool]
 """Whether to end at the next good place."""
 
@@ -30,9 +32,26 @@ def heeding_signals() -> Iterator[Stop]:
             raise KeyboardInterrupt
         told = True
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, handle) for number in SIGNALS}
     try:
         yield lambda: told
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Inside, Ctrl-C and SIGTERM wait: for what is short, and worth more whole than a moment earlier."""
+    if threading.current_thread() is not threading.main_thread():  # where no signal is handled
+        yield
+        return
+    waiting: list[int] = []
+    before = {number: signal.signal(number, lambda told, _frame: waiting.append(told)) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for told in waiting:
+        signal.raise_signal(told)

@@ -14,7 +14,7 @@ from dreamfleet.common.presets import check_preset, preset_help
 HARMLESS = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
 MOST_SEED = 2**31 - 1  # each round's training multiplies its own
 # Flags of a training that are iterate's to give.
-TAKEN = ("--data", "--preset", "--device", "--seed", "--continue-from", "--summary", "--json")
+TAKEN = ("--data", "--preset", "--device", "--seed", "--continue-from", "--new", "--summary", "--json")
 LEAST = {
     "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
     "mdnrnn_updates": 1, "gate_drives": 0, "gate_losses": 0, "seed": 0, "local": 0, "jobs": 1,

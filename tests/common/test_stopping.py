@@ -1,9 +1,10 @@
 import os
 import signal
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from dreamfleet.common.stopping import heeding_signals, never
+from dreamfleet.common.stopping import heeding_signals, never, undisturbed
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -21,3 +22,22 @@ def test_afterwards_signals_do_what_they_did_before():
         assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] != before
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
     assert not never()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_is_undisturbed_is_finished_before_a_signal_counts(number):
+    finished = []
+    with pytest.raises(KeyboardInterrupt), heeding_signals() as stop:  # noqa: PT012
+        with undisturbed():
+            signal.raise_signal(number)
+            finished.append(stop())
+        assert stop()
+        with undisturbed():
+            signal.raise_signal(number)
+            finished.append(True)
+    assert finished == [False, True]
+
+
+def test_a_thread_that_hears_no_signals_needs_no_peace():
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(lambda: [undisturbed().__enter__()]).result() == [None]

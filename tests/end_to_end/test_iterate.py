@@ -212,6 +212,10 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
         (("--run-flags", "--generations 1 --bundle tiny"), "--bundle in --run-flags: each round's run has its own"),
         (("--run-flags", "--generations 1 --sigma0 -1"), "--sigma0 must be a positive number"),
         (("--vae-flags", "--updates 0"), "--vae-flags: --updates must be at least 1"),
+        (
+            ("--vae-flags", "--error-factor 4", "--mdnrnn-flags", "--z-factor 0"),
+            "--mdnrnn-flags: --z-factor must be from",
+        ),
         (("--local", 0), "nobody would score"),
     ],
 )

@@ -6,7 +6,7 @@ import signal
 import av
 import pytest
 
-from dreamfleet.worker.training.checkpoint import load_progress
+from dreamfleet.worker.training.checkpoint import load_progress, load_weights
 from dreamfleet.worker.training.collect import present
 from tests.support import tasks
 from tests.support.drives import write_drives
@@ -39,6 +39,23 @@ def test_training_keeps_all_updates(processes, tmp_path, number):
     update = load_progress(tmp_path / "vae.safetensors")["update"]
     assert update >= 40
     assert f"after update {update} of 100000: {tmp_path}/vae.safetensors keeps them; the same command goes on" in said
+
+
+def test_a_training_that_was_killed_goes_on_to_the_same_bits(processes, tmp_path):
+    weights = []
+    for name, killed in ("whole", False), ("killed", True):
+        folder = tmp_path / name
+        write_drives(folder, episodes=4, steps=8)
+        flags = ("--updates", 60, "--batch", 8, "--channels", 2, 2, 4, 4, "--validate-every", 7, "--keep-every", 20)
+        if killed:
+            training = processes.start("train", "vae", "--data", folder, *flags)
+            while not (folder / "vae.000020.safetensors").exists():
+                assert training.popen.poll() is None, "".join(training.lines)
+            training.popen.kill()
+            assert training.finish()[0] == -signal.SIGKILL
+        assert processes.start("train", "vae", "--data", folder, *flags).finish()[0] == 0
+        weights.append(load_weights(folder / "vae.safetensors"))
+    assert all(weights[0][name].tobytes() == weights[1][name].tobytes() for name in weights[0])
 
 
 def test_a_recording_can_be_played(processes, tmp_path, number):

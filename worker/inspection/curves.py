@@ -1,67 +1,106 @@
-"""Curves on disk: the losses of training, the fitness of a run."""
+"""Curves: the losses of trainings, the fitness of a run."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from typing import Any
 
 import numpy as np
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
+from numpy.typing import NDArray
 
-from dreamfleet.common.errors import DatasetError
-from dreamfleet.common.files import read_text
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.stages import begun_stages, in_turn
 from dreamfleet.worker.inspection.charts import FONT, new_figure, png
 from dreamfleet.worker.inspection.section import Section
+from dreamfleet.worker.inspection.trainings import MODELS, UNITS, Curve, Training
 
-Points = list[dict[str, float]]
-MOST_BYTES, MOST = 100_000_000, 1e30  # of a file of points, and of a loss that can be drawn
-LOSSES = (("vae", "the VAE"), ("mdnrnn", "the MDN-RNN"))
-
-
-def losses(folder: Path) -> list[Section]:
-    """A section for each model whose losses lie in a data folder."""
-    if not folder.is_dir():
-        raise DatasetError(f"no folder {folder}: give --data a folder that was trained in, or leave it out")
-    named = [(f"{name}.jsonl", name, what) for name, what in LOSSES]
-    return [loss(read_points(folder / file), name, what) for file, name, what in named if (folder / file).exists()]
+COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+Style = dict[str, Any]
 
 
-def loss(points: Points, name: str, what: str) -> Section:
-    """Each part of a loss over the updates."""
-    names = [each for each in points[0] if each != "update"]
-    figure, axes = new_figure(2.8, 1, len(names))
-    updates = [point["update"] for point in points]
-    for panel, each in zip(axes[0], names, strict=True):
-        values = np.array([point[each] for point in points])
-        panel.plot(updates, values, color="tab:blue", alpha=0.35, linewidth=0.8)
-        width = max(1, len(values) // 50)
-        smooth = np.convolve(values, np.ones(width) / width, mode="valid")
-        panel.plot(updates[width - 1 :], smooth, color="tab:blue")
-        panel.set_title(each, fontsize=FONT + 1)
+@dataclass(frozen=True)
+class Look:
+    """How lines of batches and of held-out drives are drawn."""
+
+    trained: Style
+    held_out: Style
+
+    @classmethod
+    def of(cls, trained: str, held_out: str, marker: str = "o", alpha: float = 1.0) -> Look:
+        """In these colours."""
+        held = {"color": held_out, "linewidth": 1.6, "marker": marker, "markersize": 4}
+        return cls({"color": trained, "linewidth": 1.2, "alpha": alpha}, held)
+
+
+ALONE, ANY = Look.of("tab:blue", "tab:orange"), Look.of("tab:gray", "tab:gray", "", 0.5)
+
+
+def losses(found: Sequence[Training]) -> list[Section]:
+    """A section for each model that was trained."""
+    names = dict.fromkeys(each.name for each in found)
+    looks = {name: Look.of(colour, colour, marker, 0.5)
+             for name, colour, marker in zip(names, cycle(COLOURS), cycle(MARKERS), strict=False)}  # fmt: skip
+    models = [model for model in MODELS if any(each.model == model for each in found)]
+    return [_losses([each for each in found if each.model == model], model, looks) for model in models]
+
+
+def _losses(found: Sequence[Training], model: str, looks: Mapping[str, Look]) -> Section:
+    """A panel for each part of a loss: of each training what its batches and what held-out drives lost."""
+    parts = [part for part in UNITS if any(part in each.curves for each in found)]
+    figure, axes = new_figure(3.6 if len(found) == 1 else 4.0, 1, len(parts))
+    for panel, part in zip(axes[0], parts, strict=True):
+        curves = [(each.curves[part], looks[each.name]) for each in found if part in each.curves]
+        for curve, look in curves:
+            _draw(panel, curve, ALONE if len(found) == 1 else look)
+        _scale(panel, [line.values for curve, _ in curves for line in (curve.trained, curve.held_out)])
+        panel.set_title(UNITS[part][0], fontsize=FONT + 1)
         panel.set_xlabel("update", fontsize=FONT)
-        panel.set_yscale("log" if values.min() > 0 and values.max() > 10 * values.min() else "linear")
-        panel.yaxis.set_major_formatter(ScalarFormatter())
-        panel.yaxis.set_minor_formatter(ScalarFormatter())
-        panel.tick_params(which="both", labelsize=FONT)
+        panel.set_ylabel(UNITS[part][1], fontsize=FONT)
         panel.grid(alpha=0.3)
-    text = "Each batch's loss, and its running mean: where a curve still falls, more updates would help."
-    return Section(f"loss-{name}", f"How {what} learnt", text, png(figure))
+    handles = _keys([each.name for each in found], looks)
+    figure.legend(handles=handles, fontsize=FONT, loc="outside upper center", ncols=min(len(handles), 4))
+    text = (
+        "What batches lost, as a running mean, and what held-out drives did: where both still fall, more updates would "
+        "help; where only the batches' falls, more drives would. Factors of a loss are not in it."
+    )
+    return Section(f"loss-{model}", f"How {MODELS[model]} learnt", text, png(figure))
 
 
-def read_points(path: Path) -> Points:
-    """The points of a loss curve; `DatasetError` if the file is damaged or empty."""
-    try:
-        points: Points = [json.loads(line) for line in read_text(path, MOST_BYTES).splitlines() if line]
-        names = set(points[0])
-        if "update" not in names or any(set(point) != names for point in points):
-            raise ValueError("points differ in what they tell")
-        if not all(type(each) in (int, float) and abs(each) < MOST for point in points for each in point.values()):
-            raise ValueError("a point is no finite number")
-    except (OSError, ValueError, TypeError, IndexError, RecursionError) as error:
-        raise DatasetError(f"{path} holds no loss curve ({error}); delete it, training writes it again") from error
-    return points
+def _draw(panel: Any, curve: Curve, look: Look) -> None:
+    trained, held = curve.trained, curve.held_out
+    if look is ALONE:
+        panel.plot(trained.updates, trained.values, **{**look.trained, "alpha": 0.3, "linewidth": 0.8})
+    if len(trained):
+        mean = np.ones(width := max(1, len(trained) // 20)) / width
+        panel.plot(
+            *(np.convolve(each, mean, mode="valid") for each in (trained.updates, trained.values)), **look.trained
+        )
+    panel.plot(held.updates, held.values, **look.held_out)
+
+
+def _keys(names: Sequence[str], looks: Mapping[str, Look]) -> list[Line2D]:
+    """What the lines of one training are; of several, whose they are too."""
+    kinds, named = (ALONE, []) if len(names) == 1 else (ANY, [_key(name, looks[name].held_out) for name in names])
+    whose = f"{names[0]}: " if len(names) == 1 else ""
+    return [*named, _key(f"{whose}batches", kinds.trained), _key("held-out drives", kinds.held_out)]
+
+
+def _key(label: str, style: Style) -> Line2D:
+    return Line2D([], [], label=label, **style)
+
+
+def _scale(panel: Any, lines: Sequence[NDArray[np.float64]]) -> None:
+    values = np.concatenate(lines)
+    if values.min() > 0 and values.max() > 10 * values.min():
+        panel.set_yscale("log")
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panel.yaxis.set_minor_formatter(NullFormatter())
+    panel.yaxis.set_major_formatter(ScalarFormatter())
 
 
 def fitness(run: RunFolder) -> Section | None:

@@ -1,8 +1,8 @@
-"""The whole look: from a bundle or a run to a folder of pictures and a page."""
+"""The whole look: from a bundle, a run or trainings to a folder of pictures and a page."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ from dreamfleet.worker.inspection import curves, memory, vision
 from dreamfleet.worker.inspection.page import Page
 from dreamfleet.worker.inspection.rollout import DriveConfig, EncodedRollout, drive
 from dreamfleet.worker.inspection.section import Section
+from dreamfleet.worker.inspection.trainings import MODELS, Training, trainings
 from dreamfleet.worker.worldmodel.inference import Decoder
 
 PAGE = "index.html"
@@ -26,7 +27,10 @@ DRIVEN = ("episodes", "frames", "held_out_episodes")  # of a bundle's provenance
 
 @dataclass(frozen=True)
 class Subject:
-    """What is looked at: a bundle; of a run, its controller too. A run without a world model shows how it went."""
+    """What is looked at: a bundle; of a run, its controller too. A run without a world model shows how it went.
+
+    With neither, trainings alone are looked at.
+    """
 
     bundle: Bundle | None
     controller: Controller | None = None
@@ -57,30 +61,34 @@ def find_subject(name: str, runs_dir: Path) -> Iterator[Subject]:
 
 
 def inspect(
-    subject: Subject, out: Path, config: DriveConfig, data: Path | None = None,
+    subject: Subject, out: Path, config: DriveConfig, data: Sequence[Path] = (),
     on_section: Callable[[int, str], None] = lambda _done, _name: None,
 ) -> Path:  # fmt: skip
-    """Write a PNG a section and the page; returns the page's path."""
+    """Write a PNG a section and the page, with the trainings in the folders of `data`; returns the page's path."""
     sections: list[Section] = []
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for section in sections_of(subject, config, data):
+        trained = trainings(data)
+        for section in sections_of(subject, config, trained):
             sections.append(section)
             on_section(len(sections), section.name)
             if section.picture is not None:
                 (out / f"{section.name}.png").write_bytes(section.picture)
-        (out / PAGE).write_text(_page(subject, sections).html())
+        (out / PAGE).write_text(_page(subject, trained, sections).html())
     except OSError as error:
         raise DatasetError(f"cannot write in {out}: {error.strerror}; choose another --out") from error
     return out / PAGE
 
 
-def _page(subject: Subject, sections: list[Section]) -> Page:
+def _page(subject: Subject, trained: Sequence[Training], sections: list[Section]) -> Page:
+    told = [(f"{each.name}, {MODELS[each.model]}", each.told) for each in trained]
     if subject.bundle is not None:
         title = f"{subject.bundle.manifest.name}, a world model"
         about = f"{subject.bundle.path.name}, SHA-256 {subject.bundle.sha256}"
-        return Page(title, about, facts(subject.bundle), sections)
-    assert subject.run is not None
+        return Page(title, about, facts(subject.bundle) + told, sections)
+    if subject.run is None:
+        names = ", ".join(dict.fromkeys(each.name for each in trained))
+        return Page(f"How {names} learnt", f"trainings: {len(told)}", told, sections)
     settings, history = subject.run.settings, subject.run.history()
     stages = begun_stages(settings, history, subject.run.evaluations())
     rows = [
@@ -89,26 +97,24 @@ def _page(subject: Subject, sections: list[Section]) -> Page:
         ("population", in_turn(f"{each.stage.population} x {each.stage.episodes} episodes" for each in stages)),
         ("generations", str(len(history))),
     ]
-    return Page(f"{subject.run.name}, a run without a world model", f"run {subject.run.uid}", rows, sections)
+    return Page(f"{subject.run.name}, a run without a world model", f"run {subject.run.uid}", rows + told, sections)
 
 
-def sections_of(subject: Subject, config: DriveConfig, data: Path | None) -> Iterator[Section]:
+def sections_of(subject: Subject, config: DriveConfig, trained: Sequence[Training]) -> Iterator[Section]:
     """The sections of the page, each as it is drawn."""
-    if data is not None:
-        training = curves.losses(data)
-    if subject.bundle is None:
-        yield from _fitness(subject)
-        return
-    bundle, decoder = subject.bundle, Decoder(subject.bundle)
-    driven = drive(bundle, subject.controller, config)
+    if subject.bundle is not None:
+        yield from _looks(subject.bundle, subject.controller, config)
+    yield from _fitness(subject)
+    yield from curves.losses(trained)
+
+
+def _looks(bundle: Bundle, controller: Controller | None, config: DriveConfig) -> Iterator[Section]:
+    driven, decoder = drive(bundle, controller, config), Decoder(bundle)
     yield vision.reconstructions(driven, decoder)
     yield vision.traversals(driven, decoder)
     yield vision.moments(driven)
     yield vision.samples(bundle.manifest.latent, decoder)
     yield from _dreams(bundle, driven, decoder)
-    yield from _fitness(subject)
-    if data is not None:
-        yield from training
 
 
 def _fitness(subject: Subject) -> Iterator[Section]:

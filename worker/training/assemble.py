@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from dreamfleet.common.bundle import (
     write_bundle,
 )
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.fields import written
 from dreamfleet.common.files import write_aside
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.worker.training import train_mdnrnn, train_vae
@@ -35,6 +35,7 @@ from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.dataset import episodes, load, split
 from dreamfleet.worker.training.encode import ENCODED, encoder_of
 from dreamfleet.worker.training.recorded import recorded_states
+from dreamfleet.worker.training.room import told_where_full
 from dreamfleet.worker.training.world import WORLD, find_world, preprocessing_to
 from dreamfleet.worker.worldmodel.export import (
     Weights,
@@ -55,7 +56,7 @@ def record_quality(folder: Path, figures: dict[str, float]) -> None:
     """Keep a model's figures beside the data, for the manifest."""
     path = folder / QUALITY
     known = json.loads(path.read_text()) if path.exists() else {}
-    with write_aside(path) as file:
+    with told_where_full(path), write_aside(path) as file:
         file.write(json.dumps({**known, **figures}, indent=1).encode())
 
 
@@ -91,7 +92,7 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool, recorded
     if with_weights:
         tensors = {f"vae.{key}": value for key, value in vae.items()} | {f"mdnrnn.{k}": v for k, v in rnn.items()}
         parts[WEIGHTS] = save(
-            tensors, {"vae": json.dumps(asdict(configs[0])), "mdnrnn": json.dumps(asdict(configs[1]))}
+            tensors, {"vae": json.dumps(written(configs[0])), "mdnrnn": json.dumps(written(configs[1]))}
         )
     return write_bundle(out, manifest(name, provenance, *configs), parts)
 
@@ -108,7 +109,7 @@ def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn:
         hidden=rnn.hidden,
         actions=rnn.actions,
         provenance=provenance,
-        models={"vae": asdict(vae), "mdnrnn": asdict(rnn)},
+        models={"vae": written(vae), "mdnrnn": written(rnn)},
     )
 
 

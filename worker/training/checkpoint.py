@@ -16,20 +16,25 @@ from safetensors.torch import save
 
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.fields import written
 from dreamfleet.common.files import write_aside
+from dreamfleet.common.stopping import undisturbed
+from dreamfleet.worker.training.room import told_where_full
 
 T = TypeVar("T")
 
 
 def save_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam, progress: dict[str, Any]) -> None:
-    """Write a checkpoint whole or not at all; `progress` is anything that JSON holds, the model has a `config`."""
+    """Write a checkpoint whole or not at all; `progress` is anything that JSON holds, the model has a `config`.
+
+    A signal waits until it is written. `DatasetError` where there is no room: what was there stays.
+    """
     tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
-    about = {"progress": json.dumps(progress), "config": json.dumps(asdict(model.config))}  # type: ignore[call-overload]
-    data = save({name: tensor.contiguous() for name, tensor in tensors.items()}, about)
-    with write_aside(path) as file:
-        file.write(data)
+    about = {"progress": json.dumps(progress), "config": json.dumps(written(model.config))}
+    with undisturbed(), told_where_full(path), write_aside(path) as file:
+        file.write(save({name: tensor.contiguous() for name, tensor in tensors.items()}, about))
 
 
 def load_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam | None) -> dict[str, Any] | None:
@@ -47,7 +52,7 @@ def load_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
             _restore_adam(optimiser, {name: tensor for name, tensor in tensors.items() if name.startswith("adam.")})
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, RecursionError, SafetensorError) as error:
         raise DatasetError(
-            f"checkpoint {path} does not fit or is damaged ({error}); delete it to begin anew"
+            f"checkpoint {path} does not fit or is damaged ({error}); delete it or give --new to begin anew"
         ) from error
     return progress
 
@@ -86,8 +91,8 @@ def _check_config(path: Path, config: Any) -> None:
     differing = [f"{name} {stored[name]}, not {value}" for name, value in wanted.items() if stored[name] != value]
     if differing:
         raise DatasetError(
-            f"checkpoint {path} is of another model: {'; '.join(differing)}; give it the same flags, or delete it to "
-            "begin anew"
+            f"checkpoint {path} is of another model: {'; '.join(differing)}; give it the same flags, or --new to begin "
+            "anew"
         )
 
 

@@ -22,6 +22,10 @@ def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> No
     parser.add_argument("--preset", default="tiny", help=f"{preset_help('training')} (default tiny)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--continue-from", type=Path, metavar="FILE", help="begin from this checkpoint's weights")
+    parser.add_argument(
+        "--new", action="store_true",
+        help="begin anew where a checkpoint lies: it goes, and with it its curve and what --keep-every kept",
+    )  # fmt: skip
     parser.add_argument("--summary", action="store_true", help="print layers and parameters, and train nothing")
     add_json(parser)
     for title, config in (
@@ -32,7 +36,9 @@ def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> No
         for each in fields(config):
             if each.name not in FIXED:
                 flag = "--" + each.name.replace("_", "-")
-                group.add_argument(flag, default=argparse.SUPPRESS, **_options(hints[each.name]))
+                group.add_argument(
+                    flag, default=argparse.SUPPRESS, help=each.metadata.get("help"), **_options(hints[each.name])
+                )
 
 
 def changed(config: T, args: argparse.Namespace) -> T:

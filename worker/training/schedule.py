@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 
 from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.common.stopping import Stop
-from dreamfleet.worker.training.checkpoint import load_checkpoint, save_checkpoint
+from dreamfleet.worker.training.checkpoint import load_checkpoint, load_progress, save_checkpoint
 from dreamfleet.worker.training.train_config import TrainConfig
 
 
@@ -20,21 +20,29 @@ class Schedule:
     """A training's progress on disk: goes on where it stopped, and ends early when held-out rollouts gain nothing."""
 
     def __init__(
-        self, path: Path, model: torch.nn.Module, config: TrainConfig, episodes: int, other: Path | None = None
-    ) -> None:
-        """`episodes` to train on, in all; `other` is a checkpoint to begin from where `path` has none."""
-        self._path, self._model, self._config, self._episodes = path, model, config, episodes
+        self, path: Path, model: torch.nn.Module, config: TrainConfig, episodes: int, other: Path | None = None,
+        new: bool = False,
+    ) -> None:  # fmt: skip
+        """`episodes` to train on, in all; `other` is a checkpoint to begin from where `path` has none.
+
+        `new`: what `path` has is not gone on with, and replaced.
+        """
+        if new and other is not None and other.resolve() == path.resolve():
+            raise UsageError(f"--new replaces {path}, which --continue-from names: leave one of the two out")
+        self._path, self._model, self._config, self._episodes, self._new = path, model, config, episodes, new
         self._best_path = path.with_suffix(".best.safetensors")
         keep_triton_from_mesa()
         self.optimiser = torch.optim.Adam(model.parameters(), lr=config.rate)
         self.progress: dict[str, Any] = {"update": 0}
-        if (found := load_checkpoint(path, model, self.optimiser)) is not None:
+        if not new and (found := load_checkpoint(path, model, self.optimiser)) is not None:
             self.progress = found
         elif other is not None and load_checkpoint(other, model, self.optimiser) is None:
             raise UsageError(f"--continue-from: no checkpoint at {other}")
         # Ended early: only something new to learn from, or no patience at all, makes it go on.
         if self.progress.get("stopped") not in (None, episodes) or not config.patience:
             self.progress |= {"stopped": None, "idle": 0}
+        if new:
+            self._replace(other)
 
     @property
     def update(self) -> int:
@@ -56,8 +64,8 @@ class Schedule:
         if stop():
             self.save()
             raise StoppedError(
-                f"stopped after update {self.update} of {self._config.updates}: {self._path} keeps them; the same "
-                "command goes on from there"
+                f"stopped after update {self.update} of {self._config.updates}: {self._path} keeps them; "
+                f"{same_command(self._new)} goes on from there"
             )
         return True
 
@@ -79,31 +87,62 @@ class Schedule:
         self.optimiser.zero_grad()
         self.progress["update"] += 1
 
-    @property
-    def due(self) -> bool:
-        """Whether to look at the held-out rollouts."""
-        return self.update % self._config.validate_every == 0 or self.update == self._config.updates
-
-    def save(self) -> None:
+    def save(self, path: Path | None = None) -> None:
         """Keep the present state."""
-        save_checkpoint(self._path, self._model, self.optimiser, self.progress)
+        save_checkpoint(path or self._path, self._model, self.optimiser, self.progress)
 
-    def validated(self, loss: float) -> None:
-        """Take a held-out loss: keep the state, and end with the best one when patience is over."""
-        if loss < self.progress.get("best", float("inf")):
-            self.progress |= {"best": loss, "idle": 0}
-        else:
-            self.progress["idle"] = self.progress.get("idle", 0) + 1
-        self.save()
-        if not self._config.patience:
+    def close_update(self, look: Callable[[], float]) -> None:
+        """End an update: where it is due, `look` at held-out rollouts and save; the best, if patience is over.
+
+        The last checkpoint is written last and once: a kill before it leads to the same files again.
+        """
+        due = self.update % self._config.validate_every == 0 or self.update == self._config.updates
+        better = due and self._judge(look())
+        if self._config.keep_every and self.update % self._config.keep_every == 0:
+            self.save(kept_path(self._path, self.update))
+        if not due:
             return
-        if self.progress["idle"] == 0:
-            shutil.copyfile(self._path, self._best_path)
-        elif self.progress["idle"] >= self._config.patience and self._best_path.exists():
-            update = self.update
-            best = load_checkpoint(self._best_path, self._model, self.optimiser) or {}
-            self.progress = {**best, "stopped": self._episodes, "idle": 0, "given_up_at": update}
-            self.save()
+        if better and self._config.patience:
+            self.save(self._best_path)
+        if 0 < self._config.patience <= self.progress["idle"]:
+            self._give_up()
+        self.save()
+
+    def _judge(self, loss: float) -> bool:
+        """Take a held-out loss; whether it is the best so far, of those whose state is there to end with."""
+        better = loss < self.progress.get("best", math.inf) or (self._config.patience > 0 and not self._best_is_kept())
+        self.progress |= {"best": loss, "idle": 0} if better else {"idle": self.progress.get("idle", 0) + 1}
+        return better
+
+    def _give_up(self) -> None:
+        update = self.update
+        best = load_checkpoint(self._best_path, self._model, self.optimiser) or {}
+        self.progress = {**best, "stopped": self._episodes, "idle": 0, "given_up_at": update}
+
+    def _best_is_kept(self) -> bool:
+        """Whether the best state lies there; without patience it was not kept, or it is another training's."""
+        try:
+            return bool(load_progress(self._best_path).get("best") == self.progress.get("best"))
+        except DatasetError:  # it is not there, or damaged
+            return False
+
+    def _replace(self, other: Path | None) -> None:
+        """Write the first checkpoint where one may lie; only then remove what belongs to that, except `other`."""
+        self.save()
+        kept = self._path.parent.glob(f"{self._path.stem}.[0-9]*.safetensors")
+        for each in (self._best_path, self._path.with_suffix(".jsonl"), *kept):
+            if other is None or each.resolve() != other.resolve():
+                each.unlink(missing_ok=True)
+
+
+def kept_path(path: Path, update: int) -> Path:
+    """Where the checkpoint of an update is kept beside the last one, which lies at `path`."""
+    return path.with_name(f"{path.stem}.{update:06d}{path.suffix}")
+
+
+def same_command(new: bool) -> str:
+    """What goes on with a training."""
+    return "the same command without --new" if new else "the same command"
 
 
 def device_of(name: str) -> torch.device:

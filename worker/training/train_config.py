@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dreamfleet.common.errors import UsageError
 
@@ -19,10 +19,18 @@ class TrainConfig:
     decay: float = 1.0  # of the rate, an epoch: as many updates as show every recorded frame or drive once
     patience: int = 0  # validations without a better held-out loss before training ends; 0: never
     validate_every: int = 200  # updates
+    keep_every: int = field(
+        default=0,
+        metadata={
+            "help": "updates after which a checkpoint stays beside the last one, as vae.000400.safetensors; 0: none"
+        },
+    )
 
     def __post_init__(self) -> None:
         for name in ("updates", "batch", "validate_every"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        if self.keep_every < 0:
+            raise UsageError(f"--keep-every must be at least 1, or 0 for none, not {self.keep_every}")
         if not (self.rate > 0 and self.clip >= 0 and 0 < self.decay <= 1 and self.patience >= 0 and self.seed >= 0):
             raise UsageError("--rate must be positive, --decay in (0, 1], --clip, --patience and --seed not negative")

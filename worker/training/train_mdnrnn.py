@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.common.progress import append_curve
 from dreamfleet.common.stopping import Stop, never
 from dreamfleet.worker.training.checkpoint import load_progress
+from dreamfleet.worker.training.curve import append_curve
 from dreamfleet.worker.training.dataset import episodes, load, split
 from dreamfleet.worker.training.encode import ENCODED, encoder_of
 from dreamfleet.worker.training.foresight import foresight
@@ -23,13 +24,14 @@ from dreamfleet.worker.training.train_vae import Report
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss, reward_labels, reward_loss
 from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
 
-CHECKPOINT = "mdnrnn.safetensors"
+N = TypeVar("N", float, Tensor)
+CHECKPOINT, CURVE = "mdnrnn.safetensors", "mdnrnn.jsonl"
 VALIDATION_ROLLOUTS = 20  # for the curve while training
 
 
 def train_mdnrnn(
     folder: Path, config: TrainConfig, report: Report, layers: MDNRNNConfig = REWARDED,
-    device: torch.device | None = None, continue_from: Path | None = None, stop: Stop = never,
+    device: torch.device | None = None, continue_from: Path | None = None, stop: Stop = never, new: bool = False,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
 
@@ -42,9 +44,9 @@ def train_mdnrnn(
         raise DatasetError(f"the encoded rollouts have {latents} latents, this MDN-RNN {layers.latent}: give --latent")
     torch.manual_seed(config.seed)
     model = MDNRNN(layers).to(device)
-    schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from)
+    schedule, curve = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from, new), folder / CURVE
     if schedule.progress.setdefault("vae", vae) != vae:
-        raise DatasetError(f"{folder / CHECKPOINT} was trained on latents of another VAE; delete it to begin anew")
+        raise DatasetError(f"{folder / CHECKPOINT} was trained on latents of another VAE; --new begins anew")
     report(schedule.update, "")
     while schedule.goes_on(stop):
         update = schedule.update + 1
@@ -59,14 +61,16 @@ def train_mdnrnn(
         schedule.step(sum(values.values()))
         report(update, "  ".join(f"{name} {value:.3f}" for name, value in values.items()))
         if update % 10 == 0:
-            append_curve(folder / "mdnrnn.jsonl", update=update, **values)
-        if schedule.due:
-            parts = validate(model, held_out[:VALIDATION_ROLLOUTS], device)
-            append_curve(
-                folder / "mdnrnn.jsonl", update=update, **{f"held_out_{name}": part for name, part in parts.items()}
-            )
-            schedule.validated(sum(parts.values()))
+            append_curve(curve, update=update, **values)
+        schedule.close_update(lambda: _look(model, held_out[:VALIDATION_ROLLOUTS], curve, schedule.update, device))
     return quality(model, held_out, device)
+
+
+def _look(model: MDNRNN, paths: Sequence[Path], curve: Path, update: int, device: torch.device | None) -> float:
+    """The held-out loss that counts; a point of the curve."""
+    parts = validate(model, paths, device)
+    append_curve(curve, update=update, **{f"held_out_{name}": part for name, part in parts.items()})
+    return sum(weighted(model.config, parts).values())
 
 
 def vae_of(folder: Path) -> str:
@@ -77,11 +81,11 @@ def vae_of(folder: Path) -> str:
 def backward(
     model: MDNRNN, rollouts: Rollouts, noise: torch.Generator, device: torch.device | None = None
 ) -> dict[str, float]:
-    """Gradients of a batch, few rollouts at a time, so that memory does not grow with it; returns the losses."""
+    """Gradients of a batch, few rollouts at a time, so that memory does not grow with it; returns the plain losses."""
     values: dict[str, float] = {}
     for chunk in rollouts.chunks():
         parts = shares(losses(model, chunk.to(device), noise), chunk, rollouts)
-        torch.stack(list(parts.values())).sum().backward()  # type: ignore[no-untyped-call]
+        torch.stack(list(weighted(model.config, parts).values())).sum().backward()  # type: ignore[no-untyped-call]
         values = {name: values.get(name, 0.0) + part.item() for name, part in parts.items()}
     return values
 
@@ -115,6 +119,11 @@ def losses(model: MDNRNN, rollouts: Rollouts, noise: torch.Generator) -> dict[st
     if config.done:
         parts["done"] = binary_loss(prediction.done, rollouts.done, rollouts.mask)
     return parts
+
+
+def weighted(config: MDNRNNConfig, parts: Mapping[str, N]) -> dict[str, N]:
+    """Losses as they count in what is learnt."""
+    return {name: config.factors[name] * part for name, part in parts.items()}
 
 
 def shares(parts: dict[str, Tensor], chunk: Rollouts, rollouts: Rollouts) -> dict[str, Tensor]:

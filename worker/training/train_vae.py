@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.progress import append_curve
 from dreamfleet.common.stopping import Stop, never
+from dreamfleet.worker.training.curve import append_curve
 from dreamfleet.worker.training.dataset import (
     POOL_EPISODES,
     check_pictures,
@@ -26,7 +27,7 @@ from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 
-CHECKPOINT = "vae.safetensors"
+CHECKPOINT, CURVE = "vae.safetensors", "vae.jsonl"
 VALIDATION_PICTURES = 2000
 CURVE_PICTURES = 500  # of them, for the curve while training
 ACTIVE_NATS = 0.1  # a picture, on average over the held-out ones, above which a latent carries something
@@ -34,10 +35,19 @@ ACTIVE_NATS = 0.1  # a picture, on average over the held-out ones, above which a
 Report = Callable[[int, str], None]
 
 
+class Losses(NamedTuple):
+    """Of a VAE, as `Loss` has them."""
+
+    weighted: float
+    plain: float
+    error: float
+    divergence: float
+
+
 def train_vae(
     folder: Path, config: TrainConfig, report: Report, layers: VAEConfig = PAPER,
     device: torch.device | None = None, continue_from: Path | None = None, decoder_only: bool = False,
-    stop: Stop = never,
+    stop: Stop = never, new: bool = False,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
 
@@ -49,57 +59,56 @@ def train_vae(
     check_pictures([*train, *held_out], layers.picture)
     torch.manual_seed(config.seed)
     model = VAE(layers).to(device)
-    if decoder_only and continue_from is None and not (folder / CHECKPOINT).exists():
+    if decoder_only and continue_from is None and (new or not (folder / CHECKPOINT).exists()):
         raise UsageError("--decoder-only needs an encoder that was trained: give --continue-from")
-    schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from)
+    schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from, new)
     progress = schedule.progress
     report(schedule.update, "")
-    validation = held_out_pictures(held_out, CURVE_PICTURES)
+    validation, curve = held_out_pictures(held_out, CURVE_PICTURES), folder / CURVE
     batches = picture_batches(train, config.batch, config.seed, progress.get("pool", 0), progress.get("taken", 0))
     epoch_pools = max(1, len(train) // POOL_EPISODES)
     while schedule.goes_on(stop):
         pool, taken, batch = next(batches)
         schedule.set_rate(pool // epoch_pools)
         torch.manual_seed(config.seed * 1_000_003 + schedule.update)
-        loss, error, divergence = backward(model, batch, decoder_only, device)
-        schedule.step(loss)
+        loss = backward(model, batch, decoder_only, device)
+        schedule.step(loss.weighted)
         schedule.progress |= {"pool": pool, "taken": taken}
-        report(schedule.update, f"error {error:.1f}  KL {divergence:.1f}")
+        report(schedule.update, f"error {loss.error:.1f}  KL {loss.divergence:.1f}")
         if schedule.update % 20 == 0:
-            append_curve(folder / "vae.jsonl", update=schedule.update, error=error, kl=divergence)
-        if schedule.due:
-            held_out_loss, held_out_error = validate(model, validation, device)
-            append_curve(
-                folder / "vae.jsonl", update=schedule.update, held_out=held_out_loss, held_out_error=held_out_error
-            )
-            schedule.validated(held_out_loss)
+            append_curve(curve, update=schedule.update, error=loss.error, kl=loss.divergence)
+        schedule.close_update(lambda: _look(model, validation, curve, schedule.update, device))
     return quality(model, held_out, device)
 
 
-def backward(
-    model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device: torch.device | None
-) -> tuple[float, float, float]:
-    """Gradients of a batch; returns its loss, its squared error a picture and its divergence."""
+def _look(model: VAE, pictures: NDArray[np.uint8], curve: Path, update: int, device: torch.device | None) -> float:
+    """The held-out loss that counts; a point of the curve."""
+    loss = validate(model, pictures, device)
+    parts = {"held_out": loss.plain, "held_out_error": loss.error, "held_out_kl": loss.divergence}
+    append_curve(curve, update=update, **parts)
+    return loss.weighted
+
+
+def backward(model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device: torch.device | None) -> Losses:
+    """Gradients of a batch; returns its losses."""
     model.train()
     if decoder_only:
         model.freeze_encoder()
     noise = torch.randn(len(pictures), model.config.latent).to(device)
-    parts = model.loss(as_tensor(pictures, device), noise)
-    parts[0].backward()  # type: ignore[no-untyped-call]
-    loss, error, divergence = (part.item() for part in parts)
-    return loss, error, divergence
+    loss = model.loss(as_tensor(pictures, device), noise)
+    loss.weighted.backward()  # type: ignore[no-untyped-call]
+    return Losses(*(part.item() for part in loss))
 
 
-def validate(model: VAE, pictures: NDArray[np.uint8], device: torch.device | None) -> tuple[float, float]:
-    """Loss and summed squared error a held-out picture, at the latents' means."""
+def validate(model: VAE, pictures: NDArray[np.uint8], device: torch.device | None) -> Losses:
+    """Losses on held-out pictures, at the latents' means."""
     model.eval()
     with torch.no_grad():
         parts = [
-            torch.stack(model.loss(batch, torch.zeros(len(batch), model.config.latent, device=device))[:2]) * len(batch)
+            torch.stack(model.loss(batch, torch.zeros(len(batch), model.config.latent, device=device))) * len(batch)
             for batch in (as_tensor(pictures[start : start + 100], device) for start in range(0, len(pictures), 100))
         ]
-    loss, error = (torch.stack(parts).sum(dim=0) / len(pictures)).tolist()
-    return loss, error
+    return Losses(*(torch.stack(parts).sum(dim=0) / len(pictures)).tolist())
 
 
 def held_out_pictures(held_out: Sequence[Path], most: int) -> NDArray[np.uint8]:

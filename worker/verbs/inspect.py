@@ -1,4 +1,4 @@
-"""`dreamfleet inspect`: a page about a world model, or figures of what it knows and how it dreams."""
+"""`dreamfleet inspect`: a page about a world model or trainings, or figures of what a model knows and how it dreams."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from dreamfleet.worker.inspection.measuring import Driving
     from dreamfleet.worker.inspection.witness import WitnessConfig
 
-SUMMARY = "look into a world model: what it sees, keeps and dreams, as pictures and one page, or as figures"
+SUMMARY = "look into a world model: what it sees, keeps and dreams, and how it learnt, as one page, or as figures"
 EXTRAS = ("worker", "views")
 SECTIONS = 10  # at most
 DRIVES, LOSSES = 20, 30
@@ -35,7 +35,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="a bundle's file, one that ships, or a run; for figures it may be left out: the --controller's",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("inspection"), help="folder to write (default inspection)")
-    parser.add_argument("--data", type=Path, help="the data folder that it was trained in, for the loss curves")
+    parser.add_argument(
+        "--data", type=Path, nargs="+", default=[], metavar="FOLDER",
+        help="data folders, whose loss curves are drawn on one axis: the one that it was trained in, or trainings to "
+        "compare, with or without a bundle before them",
+    )  # fmt: skip
     first = VALIDATION.start
     parser.add_argument("--seed", type=int, default=first, help=f"the (first) track that is driven (default {first})")
     parser.add_argument("--steps", type=int, default=300, help="steps of the page's drive (default 300)")
@@ -58,8 +62,8 @@ def run(args: argparse.Namespace) -> int:
         return _measure(args)
     if args.controller or args.driver:
         raise UsageError("--controller and --driver drive for figures: give --probe or --losses too")
-    if not args.subject:
-        raise UsageError("give a bundle or a run to look into")
+    if not args.subject and not args.data:
+        raise UsageError("give a bundle or a run to look into, or --data folders whose trainings to draw")
     return _draw(args)
 
 
@@ -67,10 +71,12 @@ def _draw(args: argparse.Namespace) -> int:
     if args.steps < 2 or args.seed < 0:
         raise UsageError("--steps must be at least 2 and --seed at least 0")
     from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.inspection.inspection import find_subject, inspect
+    from dreamfleet.worker.inspection.inspection import inspect
     from dreamfleet.worker.inspection.rollout import DriveConfig
 
-    with find_subject(args.subject, args.runs_dir) as subject, progress_bar("inspect", SECTIONS, "sections") as bar:
+    with ExitStack() as held:
+        subject = _found(args, held)
+        bar = held.enter_context(progress_bar("inspect", SECTIONS, "sections"))
         page = inspect(subject, args.out, DriveConfig(args.seed, args.steps), args.data, bar.move)
         bar.move(SECTIONS)
     answer(args, str(page), page=page)
@@ -142,14 +148,16 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _subject(args: argparse.Namespace, held: ExitStack) -> Subject:
-    from dreamfleet.worker.inspection.inspection import Subject, find_subject
-
-    if not args.subject:
-        return Subject(None)
-    subject = held.enter_context(find_subject(args.subject, args.runs_dir))
-    if subject.bundle is None:
+    subject = _found(args, held)
+    if args.subject and subject.bundle is None:
         raise UsageError(f"run {args.subject} has no world model to measure: name a bundle, or a run with one")
     return subject
+
+
+def _found(args: argparse.Namespace, held: ExitStack) -> Subject:
+    from dreamfleet.worker.inspection.inspection import Subject, find_subject
+
+    return held.enter_context(find_subject(args.subject, args.runs_dir)) if args.subject else Subject(None)
 
 
 def _temperature(args: argparse.Namespace, subject: Subject) -> float:

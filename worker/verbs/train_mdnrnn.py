@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from dreamfleet.common.listing import answer
+if TYPE_CHECKING:
+    from dreamfleet.common.stopping import Stop
+    from dreamfleet.worker.training.train_vae import Report
 
 SUMMARY = "train the MDN-RNN on a data set, or go on with it"
 EXTRAS = ("train",)
@@ -20,13 +23,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.common.stopping import heeding_signals
-    from dreamfleet.worker.training.assemble import record_quality
     from dreamfleet.worker.training.flags import changed
     from dreamfleet.worker.training.presets import find_preset
     from dreamfleet.worker.training.schedule import device_of, summary
-    from dreamfleet.worker.training.train_mdnrnn import train_mdnrnn
+    from dreamfleet.worker.training.telling import show
+    from dreamfleet.worker.training.train_mdnrnn import CHECKPOINT, train_mdnrnn
     from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 
     preset = find_preset(args.preset)
@@ -34,9 +35,9 @@ def run(args: argparse.Namespace) -> int:
     if args.summary:
         print(summary(MDNRNN(layers)))
         return 0
-    with progress_bar("MDN-RNN", config.updates, "updates") as bar, heeding_signals() as stop:
+
+    def train(report: Report, stop: Stop) -> dict[str, float]:
         device, other = device_of(args.device), args.continue_from
-        figures = train_mdnrnn(args.data, config, bar.move, layers, device, other, stop)
-    record_quality(args.data, figures)
-    answer(args, "  ".join(f"{name} {value}" for name, value in figures.items()), **figures)
-    return 0
+        return train_mdnrnn(args.data, config, report, layers, device, other, stop, args.new)
+
+    return show(args, "MDN-RNN", config.updates, args.data / CHECKPOINT, train)

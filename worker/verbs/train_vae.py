@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from dreamfleet.common.listing import answer
+if TYPE_CHECKING:
+    from dreamfleet.common.stopping import Stop
+    from dreamfleet.worker.training.train_vae import Report
 
 SUMMARY = "train the VAE on a data set, or go on with it"
 EXTRAS = ("train",)
@@ -23,13 +26,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.common.stopping import heeding_signals
-    from dreamfleet.worker.training.assemble import record_quality
     from dreamfleet.worker.training.flags import changed
     from dreamfleet.worker.training.presets import find_preset
     from dreamfleet.worker.training.schedule import device_of, summary
-    from dreamfleet.worker.training.train_vae import train_vae
+    from dreamfleet.worker.training.telling import show
+    from dreamfleet.worker.training.train_vae import CHECKPOINT, train_vae
     from dreamfleet.worker.worldmodel.vae import VAE
 
     preset = find_preset(args.preset)
@@ -37,9 +38,9 @@ def run(args: argparse.Namespace) -> int:
     if args.summary:
         print(summary(VAE(layers)))
         return 0
-    with progress_bar("VAE", config.updates, "updates") as bar, heeding_signals() as stop:
+
+    def train(report: Report, stop: Stop) -> dict[str, float]:
         device, other = device_of(args.device), args.continue_from
-        figures = train_vae(args.data, config, bar.move, layers, device, other, args.decoder_only, stop)
-    record_quality(args.data, figures)
-    answer(args, "  ".join(f"{name} {value}" for name, value in figures.items()), **figures)
-    return 0
+        return train_vae(args.data, config, report, layers, device, other, args.decoder_only, stop, args.new)
+
+    return show(args, "VAE", config.updates, args.data / CHECKPOINT, train)

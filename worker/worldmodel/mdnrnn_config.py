@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.worldmodel.factors import check_factors, factor
 
 Reward = Literal["none", "positive", "notebook", "value"]
 
@@ -28,6 +29,8 @@ class MDNRNNConfig:
     dropout: float = 0.0  # of the LSTM's output before the heads
     window: int = 0  # inputs that attention looks at, the current one among them; 0: none
     attention_units: int = 64
+    z_factor: float = factor("weighs the likelihood of the next latents")
+    reward_factor: float = factor("weighs the reward head's loss")
 
     def __post_init__(self) -> None:
         if min(self.latent, self.actions, self.hidden, self.mixtures, self.attention_units) < 1 or self.window < 0:
@@ -36,6 +39,9 @@ class MDNRNNConfig:
             raise UsageError(f"--dropout must be from 0 to below 1, not {self.dropout}")
         if self.previous_reward and self.reward == "none":
             raise UsageError("the previous reward as an input needs a reward head: in the dream nothing else tells it")
+        check_factors(self, "z_factor", "reward_factor")
+        if self.reward_factor != 1 and self.reward == "none":
+            raise UsageError("--reward-factor weighs the loss of a reward head: give --reward another kind than none")
 
     @property
     def inputs(self) -> int:
@@ -51,6 +57,11 @@ class MDNRNNConfig:
     def rewarded(self) -> bool:
         """Whether there is a reward head."""
         return self.reward != "none"
+
+    @property
+    def factors(self) -> dict[str, float]:
+        """Weights of the parts of the loss, by name."""
+        return {"latent": self.z_factor, "reward": self.reward_factor, "done": 1.0}
 
     @property
     def outputs(self) -> int:

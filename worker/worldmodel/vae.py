@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from dreamfleet.worker.worldmodel.vae_config import KERNEL, LEAK, VAEConfig
+
+
+class Loss(NamedTuple):
+    """What is learnt from, the same at an error factor of 1, and of each picture: squared error, KL in nats."""
+
+    weighted: Tensor
+    plain: Tensor
+    error: Tensor
+    divergence: Tensor
 
 
 class VAE(nn.Module):
@@ -46,20 +56,21 @@ class VAE(nn.Module):
         pictures: Tensor = self.decoder(self.dense(latents).reshape(-1, *self._start))
         return pictures
 
-    def loss(self, pictures: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The configured loss, and summed squared error and KL in nats beside it; `noise` `(N, latent)` normal.
+    def loss(self, pictures: Tensor, noise: Tensor) -> Loss:
+        """The configured loss and its parts; `noise` `(N, latent)` normal.
 
-        The paper's: error + max(KL, tolerance). The notebook's: 1000 x mean square + KL.
+        The paper's: F error + max(KL, tolerance). The notebook's: F 1000 x mean square + KL. F is the error factor.
         """
         mu, logvar = self.encode(pictures)
         decoded = self.decode(mu + noise * torch.exp(0.5 * logvar))
         error = functional.mse_loss(decoded, pictures, reduction="none").sum(dim=(1, 2, 3)).mean()
         divergence = -0.5 * (1 + logvar - mu.square() - logvar.exp()).sum(dim=1)
         if self.config.loss == "notebook":
-            pixels = 3 * self.config.picture**2
-            return 1000 / pixels * error + divergence.mean(), error, divergence.mean()
-        floor = self.config.kl_tolerance * self.config.latent
-        return error + divergence.clamp(min=floor).mean(), error, divergence.mean()
+            cost, floored = 1000 / (3 * self.config.picture**2) * error, divergence
+        else:
+            cost, floored = error, divergence.clamp(min=self.config.kl_tolerance * self.config.latent)
+        weighted = self.config.error_factor * cost + floored.mean()
+        return Loss(weighted, cost + floored.mean(), error, divergence.mean())
 
 
 def _after(config: VAEConfig, channels: int) -> list[nn.Module]:

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Literal
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.worldmodel.factors import check_factors, factor
 
 LEAK = 0.2  # slope of the leaky activation below zero
 KERNEL = 4
@@ -27,6 +28,7 @@ class VAEConfig:
     loss: Literal["paper", "notebook"] = "paper"
     kl_tolerance: float = 0.5  # of the paper's loss: nats a latent below which the divergence costs nothing
     dense: int = 0  # inputs of the paper's decoder; 0: as many as the encoder's outputs
+    error_factor: float = factor("weighs the reconstruction error against the divergence; above 1 latents keep more")
 
     def __post_init__(self) -> None:
         if self.picture not in (64, 96):
@@ -35,6 +37,7 @@ class VAEConfig:
             raise UsageError(f"a VAE has 4 layers of channels and a latent, not {self.channels}, {self.latent}")
         if not 0 <= self.dropout < 1 or self.kl_tolerance < 0 or self.dense < 0:
             raise UsageError("--dropout must be from 0 to below 1; a tolerance and a width must not be negative")
+        check_factors(self, "error_factor")
 
     @property
     def sides(self) -> tuple[int, ...]:

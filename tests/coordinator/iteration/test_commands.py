@@ -85,7 +85,7 @@ def test_a_round_evolves_in_the_model_that_counts_with_a_seed_of_its_own():
     )
 
 
-@pytest.mark.parametrize("flags", ["--data elsewhere", "--updates 3 --seed=9", "--continue other.safetensors"])
+@pytest.mark.parametrize("flags", ["--data elsewhere", "--updates 3 --seed=9", "--continue other.safetensors", "--new"])
 def test_what_a_training_is_told_by_the_iteration_is_no_flag_of_it(flags):
     with pytest.raises(UsageError, match="of each training is iterate's own to give"):
         IterateConfig(vae_flags=flags)

@@ -8,7 +8,7 @@ import torch
 
 from dreamfleet.common.bundle import DREAM, write_bundle
 from dreamfleet.common.errors import BundleError, DatasetError
-from dreamfleet.worker.inspection import curves, memory
+from dreamfleet.worker.inspection import memory
 from dreamfleet.worker.inspection.inspection import Subject, facts, find_subject, inspect
 from dreamfleet.worker.inspection.page import Page
 from dreamfleet.worker.inspection.rollout import DriveConfig, drive
@@ -55,7 +55,9 @@ def attentive(tmp_path):
 def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
     write_curves(tmp_path)
     told = []
-    page = inspect(Subject(attentive), tmp_path / "out", SHORT, tmp_path, lambda done, name: told.append((done, name)))
+    page = inspect(
+        Subject(attentive), tmp_path / "out", SHORT, [tmp_path], lambda done, name: told.append((done, name))
+    )
     found = Links(page.read_text())
     names = [*LOOKS, "dream", "rewards", "attention", "loss-vae", "loss-mdnrnn"]
     assert found.sections == names
@@ -133,18 +135,11 @@ def test_a_drive_is_seen_as_its_bundle_sees(tmp_path):
     assert Links(page.read_text()).sections == [*LOOKS, "dream", "rewards"]
 
 
-@pytest.mark.parametrize("text", ["", "{", '{"error": 1}', '{"update": 1, "a": 2}\n{"update": 2, "b": 2}', "[]"])
-def test_a_damaged_curve_is_told(tmp_path, text):
-    (tmp_path / "vae.jsonl").write_text(text)
-    with pytest.raises(DatasetError, match="holds no loss curve"):
-        curves.losses(tmp_path)
-
-
 def test_what_is_nowhere_is_told_before_anything_is_driven(tmp_path, attentive):
     with pytest.raises(BundleError, match=r"no bundle 'nosuch'.*no run 'nosuch'"), find_subject("nosuch", tmp_path):
         pass
     with pytest.raises(DatasetError, match="no folder"):
-        inspect(Subject(attentive), tmp_path / "out", SHORT, tmp_path / "nowhere")
+        inspect(Subject(attentive), tmp_path / "out", SHORT, [tmp_path / "nowhere"])
     (tmp_path / "file").write_text("")
     with pytest.raises(DatasetError, match="choose another --out"):
         inspect(Subject(attentive), tmp_path / "file" / "out", SHORT)

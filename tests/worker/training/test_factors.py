@@ -1,0 +1,131 @@
+"""Factors weigh the parts of a loss; at 1 nothing is written of them, and what is reported is never weighed."""
+
+import argparse
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.coordinator.iteration.config import IterateConfig
+from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training.assemble import assemble, manifest
+from dreamfleet.worker.training.checkpoint import load_config, load_weights
+from dreamfleet.worker.training.encode import encode
+from dreamfleet.worker.training.rollouts import load_rollouts
+from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.verbs import train_vae as verb
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae import VAE
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.coordinator.iteration.test_commands import commands
+from tests.support.drives import write_drives
+
+LAYERS, RNN = VAEConfig(latent=4, channels=(4, 4, 8, 8)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
+SHORT = TrainConfig(updates=2, batch=8, rate=1e-3, validate_every=1)
+
+
+def ignore(_done, _note):
+    pass
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    write_drives(folder, episodes=4, steps=8)
+    train_vae.train_vae(folder, SHORT, ignore, LAYERS)
+    assert len(list(encode(folder))) == 4
+    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, RNN)
+    return folder
+
+
+def linked(trained, folder, *names):
+    for name in names:
+        (folder / name).symlink_to(trained / name)
+    return folder
+
+
+def points(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+@pytest.mark.parametrize(("loss", "scale"), [("paper", 1), ("notebook", 1000 / (3 * 64**2))])
+def test_the_error_is_weighed_against_the_divergence(loss, scale):
+    torch.manual_seed(0)
+    model = VAE(replace(LAYERS, loss=loss, error_factor=4.0, kl_tolerance=0.0))
+    found = model.loss(torch.rand(2, 3, 64, 64), torch.randn(2, 4))
+    torch.testing.assert_close(found.weighted, 4 * scale * found.error + found.divergence)
+    torch.testing.assert_close(found.plain, scale * found.error + found.divergence)
+
+
+def test_a_factor_changes_what_is_learnt_and_held_out_losses_stay_comparable(trained, tmp_path):
+    layers, told, learnt = replace(LAYERS, loss="notebook"), [], []
+    for factor in (1.0, 4.0):
+        folder = tmp_path / f"{factor}"
+        folder.mkdir()
+        linked(trained, folder, "episodes")
+        still = replace(SHORT, updates=1, rate=1e-12)
+        train_vae.train_vae(folder, still, ignore, replace(layers, error_factor=factor))
+        told.append(points(folder / "vae.jsonl")[-1])
+        train_vae.train_vae(folder, SHORT, ignore, replace(layers, error_factor=factor))
+        learnt.append(load_weights(folder / train_vae.CHECKPOINT))
+    assert told[0] == pytest.approx(told[1])
+    assert list(told[0]) == ["update", "held_out", "held_out_error", "held_out_kl"]
+    assert not np.array_equal(learnt[0]["mu.weight"], learnt[1]["mu.weight"])
+
+
+def test_latents_and_rewards_are_weighed_in_the_gradients_and_not_in_what_is_told(trained):
+    rollouts = load_rollouts(sorted((trained / "encoded").glob("*.npz")))
+    gradients, told = [], []
+    for z, reward in ((1.0, 1.0), (1.0, 3.0), (2.0, 1.0), (2.0, 3.0)):
+        torch.manual_seed(0)
+        model = MDNRNN(replace(RNN, z_factor=z, reward_factor=reward))
+        told.append(train_mdnrnn.backward(model, rollouts, torch.Generator().manual_seed(0)))
+        gradients.append(model.heads.weight.grad)
+    assert all(each == told[0] for each in told)
+    plain, rewards, latents, both = gradients
+    torch.testing.assert_close(both, rewards + latents - plain)
+    torch.testing.assert_close(rewards[-1], 3 * plain[-1])  # the reward head's row
+    torch.testing.assert_close(latents[:-1], 2 * plain[:-1])
+
+
+def test_at_one_nothing_is_written_and_files_from_before_factors_open(trained, tmp_path):
+    bundle = assemble(trained, tmp_path / "b.zip", "b", with_weights=False)
+    assert not any("factor" in name for model in bundle.manifest.models.values() for name in model)
+    assert load_config(trained / train_vae.CHECKPOINT, VAEConfig).error_factor == 1.0
+    weighed = manifest("b", {}, replace(LAYERS, error_factor=4.0), replace(RNN, reward_factor=2.0))
+    assert weighed.models["vae"]["error_factor"] == 4.0
+    assert weighed.models["mdnrnn"]["reward_factor"] == 2.0
+
+
+def test_a_training_goes_on_under_its_own_factors_only(trained):
+    with pytest.raises(DatasetError, match=r"of another model: error_factor 1\.0, not 4\.0; .*same flags"):
+        train_vae.train_vae(trained, SHORT, ignore, replace(LAYERS, error_factor=4.0))
+    with pytest.raises(DatasetError, match=r"z_factor 1\.0, not 2\.0"):
+        train_mdnrnn.train_mdnrnn(trained, SHORT, ignore, replace(RNN, z_factor=2.0))
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 1e7, float("nan"), float("inf")])
+def test_a_factor_that_weighs_nothing_or_all_is_refused(value):
+    for change in (
+        lambda: VAEConfig(error_factor=value), lambda: MDNRNNConfig(z_factor=value),
+        lambda: MDNRNNConfig(reward_factor=value),
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=r"-factor must be from 1e-06 to 1e\+06, not"):
+            change()
+    with pytest.raises(UsageError, match="a reward head"):
+        MDNRNNConfig(reward="none", reward_factor=2.0)
+
+
+def test_flags_pass_through_an_iteration_to_the_training(trained, tmp_path):
+    linked(trained, tmp_path, "episodes")
+    assert IterateConfig(vae_flags="--error-factor 4").vae_flags
+    words = commands(vae_flags="--error-factor 4").train(1, "vae")
+    parser = argparse.ArgumentParser()
+    verb.configure(parser)
+    given = [str(tmp_path) if word == "data/rounds/01" else word for word in words[2:]]
+    assert verb.run(parser.parse_args([*given, "--updates", "1", "--channels", "2", "2", "4", "4"])) == 0
+    assert load_config(tmp_path / train_vae.CHECKPOINT, VAEConfig).error_factor == 4.0
