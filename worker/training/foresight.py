@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dreamfleet.worker.training.following import follow, remember
-from dreamfleet.worker.training.rollouts import Rollouts, load_rollouts
+from dreamfleet.worker.training.rollouts import Rollouts, ends, load_rollouts
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction, reward_labels
 
 AHEAD = (1, 10, 50)  # steps of dreaming
@@ -91,7 +91,7 @@ def _labels(model: MDNRNN, rollouts: Rollouts) -> dict[str, Tensor]:
     if config.rewarded:
         labels["reward"] = reward_labels(config.reward, rollouts.reward, rollouts.done)
     if config.done:
-        labels["done"] = rollouts.done
+        labels["done"] = ends(config, rollouts)
     return labels
 
 

@@ -59,6 +59,25 @@ def load_rollouts(paths: Sequence[Path], mirrored: NDArray[np.bool_] | None = No
     return Rollouts(**{name: torch.from_numpy(pad(arrays)) for name, arrays in columns.items()})
 
 
+def ends(config: MDNRNNConfig, rollouts: Rollouts) -> Tensor:
+    """What the done head shall tell `(N, T)`: 1 where an episode ended, and where `lost` steps without reward follow.
+
+    A drive that was given up without a reward for so long is lost from its last reward to its end.
+    """
+    if not config.lost:
+        return rollouts.done
+    paid = (rollouts.reward > 0) & (rollouts.mask > 0)
+    count = paid.shape[1]
+    steps = torch.arange(count, device=paid.device)
+    never = torch.full_like(steps[:1], count).expand(len(paid), 1)
+    following = torch.where(paid, steps, count).flip(1).cummin(dim=1).values.flip(1)
+    next_paid = torch.cat([following[:, 1:], never], dim=1)
+    last_paid = torch.where(paid, steps, -1).amax(dim=1, keepdim=True)
+    given_up = rollouts.mask.sum(dim=1, keepdim=True) - 1 - last_paid > config.lost
+    lost = torch.where(next_paid == count, given_up, next_paid - steps > config.lost)
+    return torch.maximum(rollouts.done, lost * rollouts.mask)
+
+
 def inputs_of(config: MDNRNNConfig, latents: Tensor, rollouts: Rollouts) -> Tensor:
     """`(N, T, inputs)`: latents, actions, and where the model takes it the reward head's label of the step before."""
     parts = [latents, rollouts.action]

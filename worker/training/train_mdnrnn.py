@@ -17,7 +17,7 @@ from dreamfleet.worker.training.curve import append_curve
 from dreamfleet.worker.training.dataset import episodes, load, split
 from dreamfleet.worker.training.encode import ENCODED, encoder_of
 from dreamfleet.worker.training.foresight import foresight
-from dreamfleet.worker.training.rollouts import Rollouts, inputs_of, load_rollouts
+from dreamfleet.worker.training.rollouts import Rollouts, ends, inputs_of, load_rollouts
 from dreamfleet.worker.training.schedule import Schedule
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.training.train_vae import Report
@@ -117,7 +117,7 @@ def losses(model: MDNRNN, rollouts: Rollouts, noise: torch.Generator) -> dict[st
         labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
         parts["reward"] = reward_loss(config.reward, prediction.reward, labels, rollouts.mask)
     if config.done:
-        parts["done"] = binary_loss(prediction.done, rollouts.done, rollouts.mask)
+        parts["done"] = binary_loss(prediction.done, ends(config, rollouts), rollouts.mask)
     return parts
 
 

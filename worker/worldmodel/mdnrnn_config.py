@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.fields import OPTIONAL
 from dreamfleet.worker.worldmodel.factors import check_factors, factor
 
 Reward = Literal["none", "positive", "notebook", "value"]
@@ -16,7 +17,8 @@ class MDNRNNConfig:
     """Inputs, an LSTM of `hidden` units, `mixtures` Gaussians a latent dimension, heads.
 
     The reward head: the logit of a positive reward; the `notebook`'s, of a reward that is not positive while the
-    episode goes on; or the reward's value.
+    episode goes on; or the reward's value. The done head: the logit of a step that ends the episode, or, with `lost`,
+    behind which no reward follows for so many steps either: a dream of such a model ends where the road is lost.
     """
 
     latent: int = 32
@@ -29,6 +31,9 @@ class MDNRNNConfig:
     dropout: float = 0.0  # of the LSTM's output before the heads
     window: int = 0  # inputs that attention looks at, the current one among them; 0: none
     attention_units: int = 64
+    lost: int = field(
+        default=0, metadata={**OPTIONAL, "help": "steps without reward that the done head foretells as an end; 0: none"}
+    )
     z_factor: float = factor("weighs the likelihood of the next latents")
     reward_factor: float = factor("weighs the reward head's loss")
 
@@ -39,6 +44,8 @@ class MDNRNNConfig:
             raise UsageError(f"--dropout must be from 0 to below 1, not {self.dropout}")
         if self.previous_reward and self.reward == "none":
             raise UsageError("the previous reward as an input needs a reward head: in the dream nothing else tells it")
+        if self.lost < 0 or (self.lost and not self.done):
+            raise UsageError("--lost is a number of steps that a done head foretells: give --done, and 0 or more")
         check_factors(self, "z_factor", "reward_factor")
         if self.reward_factor != 1 and self.reward == "none":
             raise UsageError("--reward-factor weighs the loss of a reward head: give --reward another kind than none")
