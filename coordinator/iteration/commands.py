@@ -96,7 +96,7 @@ class Commands:
         layout = self.layout
         begun = () if start is None else ("--init", start)
         return (
-            *_spelt("coordinator", *more, *words("run_flags", self.config.run_flags)),
+            *_spelt("coordinator", *more, *self.config.flags_of_run(number)),
             *_spelt("--run", layout.run_name(number), "--bundle", layout.bundle(self.ledger.kept(number)),
                     "--seed", self.seed(Phase(number, EVOLVE)), *begun, *self._reached(listen)),
         )  # fmt: skip

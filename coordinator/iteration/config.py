@@ -14,6 +14,7 @@ from dreamfleet.common.presets import check_preset, preset_help
 HARMLESS = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
 MOST_SEED = 2**31 - 1  # each round's training multiplies its own
 # Flags of a training that are iterate's to give.
+RUN_FLAGS = ("run_flags", "later_run_flags")
 TAKEN = ("--data", "--preset", "--device", "--seed", "--continue-from", "--new", "--summary", "--json")
 LEAST = {
     "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
@@ -30,7 +31,9 @@ class IterateConfig:
     drives: int | None = option(None, "random drives that the first world model learns from (default the preset's)")
     more_drives: int = option(0, "random drives that each later round adds")
     own_drives: int = option(80, "drives of the last round's own means that each later round adds")
-    means: int = option(4, "means that drive these: the one that the run reports, then its best evaluated ones")
+    means: int = option(
+        4, "means that drive these: the reported one, the last one, then the best evaluated ones"
+    )
     noise: float = option(0.3, "on the actions of these drives, in halves of an action's range")
     drive_steps: int | None = option(None, "steps of a drive at most (default the preset's)")
     vae: Literal["decoder", "whole", "keep"] = option(
@@ -43,6 +46,7 @@ class IterateConfig:
     run_flags: str = option(
         "--generations 32", "flags of each round's `coordinator`, whose preset is dream unless another is named"
     )
+    later_run_flags: str = option("", "flags that follow these in each round but the first: --temperature 1")
     go_on: bool = option(False, "begin each evolution at the last round's optimum instead of at zero")
     gate_drives: int = option(20, "drives of `inspect --probe` that a new world model is held to the old by; 0: none")
     gate_losses: int = option(30, "losses of `inspect --losses` that it is held to it by; 0: none")
@@ -65,14 +69,19 @@ class IterateConfig:
             raise UsageError("--go-on begins with a controller, and another encoder fits none: leave --vae whole out")
         if self.seed > MOST_SEED:
             raise UsageError(f"--seed must be at most {MOST_SEED}, not {self.seed}")
-        for name in ("vae_flags", "mdnrnn_flags", "run_flags"):
+        for name in ("vae_flags", "mdnrnn_flags", *RUN_FLAGS):
             _check_words(name, words(name, getattr(self, name)))
+
+    def flags_of_run(self, number: int) -> tuple[str, ...]:
+        """The flags of a round's `coordinator`; of one that is said twice the latter counts."""
+        names = RUN_FLAGS if number > 1 else RUN_FLAGS[:1]
+        return tuple(word for name in names for word in words(name, getattr(self, name)))
 
 
 def _check_words(name: str, given: tuple[str, ...]) -> None:
     said = {word.partition("=")[0] for word in given if word.startswith("--")}
     taken = [flag for flag in TAKEN if any(flag.startswith(word) for word in said)]  # flags may be shortened
-    if taken and name != "run_flags":
+    if taken and name not in RUN_FLAGS:
         raise UsageError(f"--{name.replace('_', '-')}: {', '.join(taken)} of each training is iterate's own to give")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -181,7 +181,7 @@ class Phases:
             (folder / RUN_BUNDLE).symlink_to(Path("..", "..", "..", *run.bundle_path.parts[-3:]))
         reported = Controller.load(run.controller_path)
         told = reported.provenance.get("generation")
-        others = best_others(run.evaluations(), told, self._config.means - 1)
+        others = other_means(run.evaluations(), told, self._config.means - 1)
         vectors = [reported.parameters, *(run.evaluated(each) for each in others)]
         paths = [folder / f"{row}.npz" for row in range(len(vectors))]
         for path, vector in zip(paths, vectors, strict=True):
@@ -189,10 +189,15 @@ class Phases:
         return paths, [int(told or 0), *others]
 
 
-def best_others(evaluations: Iterable[StoredEvaluation], reported: int | None, count: int) -> list[int]:
-    """The generations of the best evaluated means beside the reported one's, best first; of equals the first."""
+def other_means(evaluations: Sequence[StoredEvaluation], reported: int | None, count: int) -> list[int]:
+    """The generations of evaluated means beside the reported one's: the last, then the best; of equals the first.
+
+    The last one is the dream's own optimum, whatever reality made of it: no drives teach the next model more.
+    """
+    last = max((each.generation for each in evaluations), default=None)
     others = [each for each in evaluations if each.generation != reported]
-    return [each.generation for each in sorted(others, key=lambda each: (-each.mean, each.generation))[:count]]
+    others.sort(key=lambda each: (each.generation != last, -each.mean, each.generation))
+    return [each.generation for each in others[:count]]
 
 
 def _told(run: RunFolder) -> dict[str, Any]:

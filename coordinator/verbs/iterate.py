@@ -13,7 +13,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer, print_rows
 from dreamfleet.common.site import offer
 from dreamfleet.coordinator.config import DEFAULT_BUNDLE, LimitsConfig, RunConfig
-from dreamfleet.coordinator.iteration.config import IterateConfig, words
+from dreamfleet.coordinator.iteration.config import IterateConfig
 
 if TYPE_CHECKING:
     from dreamfleet.common.stopping import Stop
@@ -69,7 +69,7 @@ def _open(args: argparse.Namespace, layout: Layout, stop: Stop) -> Iteration:
     begun = Ledger.load(layout.ledger)
     config = load(IterateConfig, "iterate", base=begun.settings if begun else None, **args.sources)
     more = _flags_before(args)
-    settings = _run_settings(args, [*more, *words("run_flags", config.run_flags)], new=begun is None)
+    settings, _ = (_run_settings(args, [*more, *config.flags_of_run(number)], new=begun is None) for number in (1, 2))
     ledger = begun.take(config, settings, layout.root) if begun else Ledger.begin(config, settings)
     if config.local == 0 and not args.listen:
         raise UsageError("nobody would score: give --local slots here, or --listen for workers of other hosts")

@@ -85,6 +85,13 @@ def test_a_round_evolves_in_the_model_that_counts_with_a_seed_of_its_own():
     )
 
 
+def test_later_rounds_may_evolve_otherwise_than_the_first():
+    told = commands(*ROUND_2, run_flags="--generations 32", later_run_flags="--generations 6 --temperature 1")
+    first, later = (said(told.begin_run(number, (), (), None)) for number in (1, 2))
+    assert first.startswith("coordinator --generations 32 --run round-01")
+    assert later.startswith("coordinator --generations 32 --generations 6 --temperature 1 --run round-02")
+
+
 @pytest.mark.parametrize("flags", ["--data elsewhere", "--updates 3 --seed=9", "--continue other.safetensors", "--new"])
 def test_what_a_training_is_told_by_the_iteration_is_no_flag_of_it(flags):
     with pytest.raises(UsageError, match="of each training is iterate's own to give"):

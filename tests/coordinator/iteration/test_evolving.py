@@ -4,7 +4,7 @@ import pytest
 
 from dreamfleet.common.stored import StoredEvaluation
 from dreamfleet.coordinator.iteration.evolving import Crew
-from dreamfleet.coordinator.iteration.phases import best_others
+from dreamfleet.coordinator.iteration.phases import other_means
 
 
 def test_without_an_address_this_host_scores_alone_with_a_slot_a_core():
@@ -24,10 +24,11 @@ def test_where_workers_come_from_anywhere_this_host_scores_only_if_asked(listen,
     assert (crew.listen, crew.near, crew.slots) == ((listen,), near, 2)
 
 
-def test_the_best_evaluated_means_drive_beside_the_reported_one():
+def test_the_last_mean_and_the_best_evaluated_ones_drive_beside_the_reported_one():
     seen = [
-        StoredEvaluation(generation, 4, mean, 1.0) for generation, mean in ((4, 1.0), (9, 5.0), (14, 3.0), (19, 5.0))
+        StoredEvaluation(generation, 4, mean, 1.0) for generation, mean in ((4, 4.0), (9, 5.0), (14, 3.0), (19, 1.0))
     ]
-    assert best_others(seen, 19, 2) == [9, 14]
-    assert best_others(seen, None, 9) == [9, 19, 14, 4]
-    assert best_others(seen, 4, 0) == []
+    assert other_means(seen, 9, 2) == [19, 4]
+    assert other_means(seen, 19, 2) == [9, 4]
+    assert other_means(seen, None, 9) == [19, 9, 4, 14]
+    assert other_means(seen, 4, 0) == other_means([], None, 3) == []
