@@ -31,9 +31,7 @@ class IterateConfig:
     drives: int | None = option(None, "random drives that the first world model learns from (default the preset's)")
     more_drives: int = option(0, "random drives that each later round adds")
     own_drives: int = option(80, "drives of the last round's own means that each later round adds")
-    means: int = option(
-        4, "means that drive these: the reported one, the last one, then the best evaluated ones"
-    )
+    means: int = option(4, "means that drive these: the reported one, the last one, then the best evaluated ones")
     noise: float = option(0.3, "on the actions of these drives, in halves of an action's range")
     drive_steps: int | None = option(None, "steps of a drive at most (default the preset's)")
     vae: Literal["decoder", "whole", "keep"] = option(
