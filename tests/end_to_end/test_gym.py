@@ -1,6 +1,7 @@
 """gymnasium's own environments on a fleet, without a bundle: they are learnt, and to the same bits by any fleet."""
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -74,7 +75,9 @@ def test_a_worker_that_lacks_the_environment_says_so_and_the_run_waits(processes
     assert "'tests.support.tasks:Toy'" in err
     assert "install the package" in err
     coordinator.wait_for("refused worker")
-    status = processes.status()
+    deadline = time.monotonic() + 20
+    while "refused" not in (status := processes.status()):  # a status is from up to a moment before
+        assert time.monotonic() < deadline
     assert status["state"] == "waiting for workers"
     assert any("does not know" in why for why in status["refused"].values())
 
