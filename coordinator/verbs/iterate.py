@@ -69,7 +69,8 @@ def _open(args: argparse.Namespace, layout: Layout, stop: Stop) -> Iteration:
     begun = Ledger.load(layout.ledger)
     config = load(IterateConfig, "iterate", base=begun.settings if begun else None, **args.sources)
     more = _flags_before(args)
-    settings, _ = (_run_settings(args, [*more, *config.flags_of_run(number)], new=begun is None) for number in (1, 2))
+    settings = _run_settings(args, [*more, *config.flags_of_run(1)], new=begun is None)
+    _run_settings(args, [*more, *config.flags_of_run(2)], new=begun is None)  # what is wrong with them is said now
     ledger = begun.take(config, settings, layout.root) if begun else Ledger.begin(config, settings)
     if config.local == 0 and not args.listen:
         raise UsageError("nobody would score: give --local slots here, or --listen for workers of other hosts")

@@ -53,8 +53,7 @@ class CarRacing(Task):
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """The environment with the native picture, where that is exact; it observes the bundle's pictures."""
-        made = self.make_recorded(self.preprocessing(assignment.world_model).name)
-        return OffRoad(made) if assignment.world_model.variant.offroad_cost else made
+        return _telling(self.make_recorded(self.preprocessing(assignment.world_model).name), assignment)
 
     def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
         """The same, observing the pictures of a preprocessing by name."""
@@ -63,8 +62,8 @@ class CarRacing(Task):
     def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The unmodified environment of gymnasium, preprocessed here."""
         preprocessing = self.preprocessing(assignment.world_model)
-        made = PictureObservation(gymnasium.make(ENVIRONMENT, render_mode=render_mode), preprocessing)
-        return OffRoad(made) if assignment.world_model.variant.offroad_cost else made
+        made = gymnasium.make(ENVIRONMENT, render_mode=render_mode)
+        return _telling(PictureObservation(made, preprocessing), assignment)
 
     def make_policy(self, assignment: Assignment) -> CarRacingPolicy:
         """Encoder, controller and MDN-RNN of a bundle that was trained on this task's pictures."""
@@ -119,13 +118,14 @@ class OffRoad(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """The environment's step, and that beside it."""
         *given, info = self.env.step(action)
-        info["off_road"] = not all(wheel.tiles for wheel in self._car.wheels)
+        inner: Any = self.env.unwrapped
+        info[WORLD.stray] = not all(wheel.tiles for wheel in inner.car.wheels)
         return (*given, info)
 
-    @property
-    def _car(self) -> Any:
-        inner: Any = self.env.unwrapped
-        return inner.car
+
+def _telling(environment: gymnasium.Env[Any, Any], assignment: Assignment) -> gymnasium.Env[Any, Any]:
+    """The environment, saying which steps are off the road where candidates pay for them."""
+    return OffRoad(environment) if assignment.world_model.variant.offroad_cost else environment
 
 
 class CarRacingPolicy:

@@ -99,7 +99,7 @@ class World:
     horizon: int = ENVIRONMENTS_OWN  # steps of a judged episode at most
     version: int = 1  # to be raised whenever the same parameters and seeds give another fitness
     time_cost: float = 0.0  # what a candidate pays for each step until `finish`, or its horizon; nobody who is judged
-    stray_cost: float = 0.0  # what it pays for each step of which the environment's `info` says `stray`, of so many
+    stray_cost: float = 0.0  # what it pays for each step whose `info` says `stray`; of 100 an episode at most
     frames_per_second: int = 30  # of a video
     action_names: tuple[str, ...] = ()  # of continuous actions, for people
     dream_reward: DreamReward | None = None  # of worlds that world models are trained on
