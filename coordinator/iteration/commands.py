@@ -73,11 +73,17 @@ class Commands:
         """A round's models as one file."""
         return _spelt("bundle", "--data", self.layout.round(number), "--out", self.layout.bundle(number), "--json")
 
+    def refit(self, number: int, path: Path) -> Words:
+        """The last round's optimum fitted to this round's new world model."""
+        layout = self.layout
+        optimum = layout.run(number - 1) / CONTROLLER
+        return _spelt("refit", optimum, "--to", layout.bundle(number), "--data", layout.root, "--out", path, "--json")
+
     def gate(self, number: int) -> dict[str, dict[str, Words]]:
         """What is measured of the `old` and the `new` world model: `probe`, `losses`, or both.
 
         Both are watched on the same drives of the last round's optimum. In dreams of losses it has to drive by the
-        model that dreams, so there the new one has the same parameters to itself.
+        model that dreams, so there the new one has it fitted to itself.
         """
         config, layout = self.config, self.layout
         optimum = layout.run(number - 1) / CONTROLLER
@@ -87,7 +93,7 @@ class Commands:
         for side, (bundle, driver) in sides.items():
             if config.gate_drives:
                 found[side]["probe"] = _measure(bundle, "--probe", optimum, config.gate_drives)
-            if config.gate_losses and config.vae != "whole":
+            if config.gate_losses:
                 found[side]["losses"] = _measure(bundle, "--losses", driver, config.gate_losses)
         return found
 

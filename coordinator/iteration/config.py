@@ -34,9 +34,7 @@ class IterateConfig:
     means: int = option(4, "means that drive these: the reported one, the last one, then the best evaluated ones")
     noise: float = option(0.3, "on the actions of these drives, in halves of an action's range")
     drive_steps: int | None = option(None, "steps of a drive at most (default the preset's)")
-    vae: Literal["decoder", "whole", "keep"] = option(
-        "decoder", "what of the VAE learns on in later rounds; after `whole` no earlier controller fits"
-    )
+    vae: Literal["decoder", "whole", "keep"] = option("decoder", "what of the VAE learns on in later rounds")
     vae_updates: int = option(1800, "updates of the VAE in each later round")
     mdnrnn_updates: int = option(600, "updates of the MDN-RNN in each later round")
     vae_flags: str = option("", 'flags of `train vae` in every round, as one text: "--updates 900 --batch 50"')
@@ -45,7 +43,9 @@ class IterateConfig:
         "--generations 32", "flags of each round's `coordinator`, whose preset is dream unless another is named"
     )
     later_run_flags: str = option("", "flags that follow these in each round but the first: --temperature 1")
-    go_on: bool = option(False, "begin each evolution at the last round's optimum instead of at zero")
+    go_on: bool = option(
+        False, "begin each evolution at the last round's optimum, fitted to the new model, instead of at zero"
+    )
     gate_drives: int = option(20, "drives of `inspect --probe` that a new world model is held to the old by; 0: none")
     gate_losses: int = option(30, "losses of `inspect --losses` that it is held to it by; 0: none")
     seed: int = option(0, "makes the iteration: drives, training, populations and tracks follow from it")
@@ -63,8 +63,6 @@ class IterateConfig:
             raise UsageError(f"--noise must be from 0 to 10, not {self.noise}")
         if self.gate_drives == 1 or 0 < self.gate_losses < 4:
             raise UsageError("--gate-drives must be 0 or at least 2, --gate-losses 0 or at least 4")
-        if self.go_on and self.vae == "whole":
-            raise UsageError("--go-on begins with a controller, and another encoder fits none: leave --vae whole out")
         if self.seed > MOST_SEED:
             raise UsageError(f"--seed must be at most {MOST_SEED}, not {self.seed}")
         for name in ("vae_flags", "mdnrnn_flags", *RUN_FLAGS):

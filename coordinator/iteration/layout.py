@@ -65,7 +65,7 @@ class Layout:
         return self.round(number) / "gate.json"
 
     def moved(self, number: int) -> Path:
-        """The last round's optimum, as a controller of this round's new world model."""
+        """The last round's optimum, fitted to this round's new world model."""
         return self.round(number) / "moved.npz"
 
     def start(self, number: int) -> Path:

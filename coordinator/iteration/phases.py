@@ -121,7 +121,8 @@ class Phases:
 
     def _gate(self, number: int) -> Outcome:
         moved, measured = self._layout.moved(number), self._layout.measured(number)
-        self._move(number - 1, number, moved)
+        fitting = self._commands.refit(number, moved)
+        self._call(number, "gate-refit", fitting)
         commands = self._commands.gate(number)
         told = {side: {what: self._measure(number, f"{side}-{what}", words) for what, words in each.items()}
                 for side, each in commands.items()}  # fmt: skip
@@ -129,7 +130,7 @@ class Phases:
         figures = {side: gate.figures(each) for side, each in told.items()}
         verdict = gate.judge(figures["old"], figures["new"])
         plain = {side: {name: each and asdict(each) for name, each in found.items()} for side, found in figures.items()}
-        words = tuple(words for each in commands.values() for words in each.values())
+        words = (fitting, *(words for each in commands.values() for words in each.values()))
         return Outcome(words, {**plain, **asdict(verdict)}, (moved, measured))
 
     def _measure(self, number: int, name: str, words: Words) -> dict[str, Any]:
@@ -165,14 +166,18 @@ class Phases:
         start = None
         if self._config.go_on and number > 1:
             start = self._layout.start(number)
-            self._move(number - 1, self._ledger.kept(number), start)
+            self._carry(number, start)
         return self._commands.begin_run(number, crew.listen, crew.coordinator, start)
 
-    def _move(self, run: int, model: int, path: Path) -> None:
-        """Write the optimum of a round's run as a controller of another round's world model, of the same encoder."""
-        optimum = Controller.load(self._layout.run(run) / CONTROLLER)
-        bundle = Bundle.open(self._layout.bundle(model))
-        replace(optimum, bundle=bundle.sha256, provenance={"moved_from": optimum.bundle}).save(path)
+    def _carry(self, number: int, path: Path) -> None:
+        """Write the last round's optimum as a controller of the world model that counts now."""
+        layout = self._layout
+        if self._ledger.kept(number) == self._ledger.kept(number - 1):
+            shutil.copyfile(layout.run(number - 1) / CONTROLLER, path)
+        elif is_there(layout.moved(number)):
+            shutil.copyfile(layout.moved(number), path)
+        else:
+            self._call(number, "refit", self._commands.refit(number, path))
 
     def _pilots(self, run: RunFolder, folder: Path) -> tuple[list[Path], list[int]]:
         """The means that drive for the next round, as files beside a link to their world model; their generations."""

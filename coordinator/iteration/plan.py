@@ -47,7 +47,7 @@ class Plan:
             COLLECT: not (first or config.more_drives),
             TAKE: first or not self.collects,
             DRIVE: first or not config.own_drives,
-            GATE: first or not (config.gate_drives or (config.gate_losses and config.vae != "whole")),
+            GATE: first or not (config.gate_drives or config.gate_losses),
         }
         return tuple(Phase(number, name) for name in ALL if not left_out.get(name))
 

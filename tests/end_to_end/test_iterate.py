@@ -24,6 +24,7 @@ from dreamfleet.coordinator.iteration.process import ask
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
+from tests.support.drives import write_drives
 from tests.support.processes import processes_in
 
 pytestmark = pytest.mark.timeout(600)
@@ -153,7 +154,7 @@ def test_a_gate_that_can_measure_nothing_refuses_nothing_and_says_so(undisturbed
     assert told["new"]["probe"]["failed"].startswith("a probe needs two drives on the road at least")
     moved = Controller.load(layout.moved(2))
     assert moved.bundle == Bundle.open(layout.bundle(2)).sha256
-    assert moved.provenance == {"moved_from": Bundle.open(layout.bundle(1)).sha256}
+    assert moved.provenance["of_world_model"] == Bundle.open(layout.bundle(1)).sha256
 
 
 def gate(layout, new, **changes):
@@ -163,6 +164,7 @@ def gate(layout, new, **changes):
     for place, source in {**places, layout.run(1) / "controller.npz": tiny.with_suffix(".npz")}.items():
         place.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, place)
+    write_drives(layout.root)
     config = IterateConfig(**changes)
     ledger = Ledger.begin(config, {}).add(Entry(1, "bundle", 0, 0.0, "")).add(Entry(2, "bundle", 0, 0.0, ""))
     phases = Phases(Commands(config, layout, ledger), None, lambda words, log: ask(words, log, never), never)

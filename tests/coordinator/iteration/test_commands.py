@@ -65,9 +65,11 @@ def test_both_models_are_measured_on_the_same_drives_and_tracks():
     assert "--controller data/runs/round-01/controller.npz" in said(gate["old"]["losses"])
 
 
-def test_a_controller_that_another_encoder_does_not_fit_dreams_no_losses():
-    gate = commands(*ROUND_2, entry(2, "bundle"), vae="whole").gate(2)
-    assert [list(each) for each in gate.values()] == [["probe"], ["probe"]]
+def test_the_optimum_is_fitted_to_the_new_model_by_all_drives():
+    words = said(commands(*ROUND_2, entry(2, "bundle")).refit(2, Path("moved.npz")))
+    assert words == (
+        "refit data/runs/round-01/controller.npz --to data/rounds/02/round-2.zip --data data --out moved.npz --json"
+    )
 
 
 def test_a_round_evolves_in_the_model_that_counts_with_a_seed_of_its_own():

@@ -28,7 +28,6 @@ def test_later_rounds_drive_what_evolved_before_and_pass_a_gate():
     [
         ({"own_drives": 0}, "drive"),
         ({"gate_drives": 0, "gate_losses": 0}, "gate"),
-        ({"gate_drives": 0, "vae": "whole"}, "gate"),  # nobody could drive in the new model's dreams of losses
     ],
 )
 def test_a_phase_that_would_do_nothing_is_left_out(changes, phase):
@@ -69,7 +68,6 @@ def test_what_is_no_phase_is_refused_with_those_that_there_are(text):
         ({"gate_drives": 1}, "--gate-drives must be 0 or at least 2"),
         ({"gate_losses": 3}, "--gate-losses 0 or at least 4"),
         ({"preset": "dream"}, "'dream' is a preset of run"),
-        ({"go_on": True, "vae": "whole"}, "another encoder fits none"),
         ({"run_flags": "--schedule 'a.toml"}, "--run-flags"),
     ],
 )

@@ -1,0 +1,148 @@
+"""A controller fitted to another world model."""
+
+import argparse
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
+from dreamfleet.common.variants import PLAIN, Variant
+from dreamfleet.worker.training.refit import Drive, Onlooker, Sums, on_the_way, refit
+from dreamfleet.worker.verbs import refit as verb
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import write_random_bundle
+from tests.support.drives import write_drive, write_drives
+
+EYES = VAEConfig(latent=4, channels=(2, 2, 2, 2))
+MEMORY = MDNRNNConfig(latent=4, hidden=6)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("refit")
+
+
+@pytest.fixture(scope="module")
+def bundles(folder):
+    """Two world models that were trained by nobody, each with eyes and a memory of its own."""
+    return [write_random_bundle(folder / f"{seed}.zip", seed, EYES, MEMORY) for seed in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def drives(folder):
+    return write_drives(folder / "data", episodes=20, steps=60)
+
+
+def controller(bundle, features="zh", hidden=0, variant=PLAIN):
+    shape = bundle.shape_of(features, hidden, variant)
+    parameters = np.random.default_rng(3).normal(size=shape.size).astype(np.float32)
+    return Controller(shape, parameters, "car-racing", bundle.sha256, options=variant.options)
+
+
+def ignore(_):
+    pass
+
+
+def first_values(chosen, bundle, paths):
+    """What its first layer gives on drives `(N, T, outputs)`."""
+    with_pictures = []
+    for path in paths:
+        with np.load(path) as drive:
+            with_pictures.append(Drive(drive["picture"], drive["action"], drive["reward"]))
+    looking = Onlooker(bundle.fitting(chosen))
+    (weights, biases), *_ = chosen.shape.unpack(chosen.parameters)
+    return np.clip(looking.features(with_pictures, looking.see(with_pictures)) @ weights.T + biases, -2.5, 2.5)
+
+
+@pytest.mark.parametrize("features", ["z", "zh"])
+@pytest.mark.parametrize("hidden", [0, 5])
+def test_it_chooses_by_other_eyes_much_as_it_chose(bundles, drives, features, hidden):
+    old, new = bundles
+    before = controller(old, features, hidden)
+    told = []
+    found = refit(before, old, new, drives[:16], told.append)
+    after = found.controller
+    assert (after.bundle, after.shape, after.task) == (new.sha256, before.shape, before.task)
+    assert after.provenance == {"refitted_from": before.sha256, "of_world_model": old.sha256}
+    assert found.drives == 16
+    assert 16 * 55 < found.steps < 16 * 60  # nothing is known behind a drive's last reward
+    assert told == [16]
+    for (above, offsets), (same, unchanged) in zip(
+        before.shape.unpack(before.parameters)[1:], after.shape.unpack(after.parameters)[1:], strict=True
+    ):
+        assert (above == same).all()
+        assert (offsets == unchanged).all()
+    wanted = first_values(before, old, drives[16:])
+    fitted, moved = (first_values(each, new, drives[16:]) for each in (after, replace(before, bundle=new.sha256)))
+    assert np.square(fitted - wanted).mean() < 0.2 * np.square(moved - wanted).mean()
+
+
+def test_the_model_that_it_has_leaves_it_as_it_is(bundles, drives):
+    before = controller(bundles[0])
+    assert refit(before, bundles[0], bundles[0], drives, ignore).controller is before
+
+
+def test_least_squares_find_a_map_and_tell_how_much_it_explains():
+    random = np.random.default_rng(0)
+    inputs = random.normal(size=(200, 3)).astype(np.float32)
+    weights, noise = random.normal(size=(4, 2)), random.normal(size=(200, 2)) * [0, 1]
+    targets = inputs @ weights[:3] + weights[3] + noise
+    parts = Sums.of(inputs[:90], targets[:90]) + Sums.of(inputs[90:], targets[90:])
+    solved = parts.solve(0)
+    assert np.allclose(solved[:, 0], weights[:, 0])
+    left = targets[:, 1] - inputs @ solved[:3, 1] - solved[3, 1]
+    assert np.allclose(parts.r_squared(solved), [1, 1 - left.var() / targets[:, 1].var()])
+    assert np.abs(parts.solve(1)[:3]).sum() < np.abs(solved[:3]).sum()
+    assert np.isnan(Sums.of(inputs, np.ones((200, 1))).r_squared(np.zeros((4, 1)))).all()
+
+
+def test_steps_behind_a_loss_of_the_road_are_left_out():
+    reward = np.full(100, -0.1, np.float32)
+    reward[[3, 30, 90]] = 3
+    assert np.flatnonzero(~on_the_way(reward)).tolist() == [*range(31, 51), *range(91, 100)]
+    assert not on_the_way(np.full(5, -0.1, np.float32)).any()
+
+
+def test_what_cannot_be_fitted_is_refused(bundles, drives, folder, tmp_path):
+    old, new = bundles
+    with pytest.raises(ControllerError, match="looks at its own last choices"):
+        refit(controller(old, variant=Variant(feedback="last")), old, new, drives, ignore)
+    wide = write_random_bundle(tmp_path / "wide.zip", 1, VAEConfig(latent=4, picture=96, channels=(2, 2, 2, 2)), MEMORY)
+    with pytest.raises(ControllerError, match="no drive shows both"):
+        refit(controller(old), old, wide, drives, ignore)
+    other = write_drive(tmp_path, 0, picture=96)
+    with pytest.raises(DatasetError, match="holds pictures"):
+        refit(controller(old), old, new, [other], ignore)
+    lost = write_drive(tmp_path, 1)
+    with np.load(lost) as drive:
+        arrays = dict(drive)
+    np.savez(lost, **{**arrays, "reward": np.full_like(arrays["reward"], -0.1)})
+    with pytest.raises(UsageError, match="none of the 1 drives keeps to its road"):
+        refit(controller(old), old, new, [lost], ignore)
+    np.savez(lost, **{**arrays, "picture": arrays["picture"][1:]})
+    with pytest.raises(DatasetError, match="another number of actions"):
+        refit(controller(old), old, new, [lost], ignore)
+
+
+def call(*arguments):
+    parser = argparse.ArgumentParser()
+    verb.configure(parser)
+    return verb.run(parser.parse_args([str(each) for each in arguments]))
+
+
+def test_the_verb_writes_a_controller_of_the_other_model(bundles, drives, folder, tmp_path, capsys):
+    old, new = bundles
+    controller(old).save(tmp_path / "before.npz")
+    flags = ("--bundle", old.path, "--data", folder / "data", "--out", tmp_path / "after.npz", "--runs-dir", tmp_path)
+    assert call(tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 10, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    after = Controller.load(tmp_path / "after.npz")
+    assert (told["sha256"], told["bundle"], told["drives"]) == (after.sha256, Bundle.open(new.path).sha256, 10)
+    assert len(told["r_squared"]) == 3
+    with pytest.raises(UsageError, match="--episodes must be at least 2"):
+        call(tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 1)

@@ -1,0 +1,201 @@
+"""A controller for another world model: what it chooses on recorded drives, imitated there by least squares.
+
+Weights on [z, h] mean nothing to another encoder's z, and little to an MDN-RNN's h once that has learnt on. So both
+models follow the same drives, and the controller's first layer is fitted on what the new one sees and remembers to what
+it gives on what its own does, before it is squashed: ridge regression, in closed form. Layers above stay as they are.
+It is behavioural cloning (Pomerleau 1991) of a controller by itself, on states that others may have driven to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.bundle import ENCODER, Bundle
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
+from dreamfleet.worker.training.dataset import check_whole, episodes, load_pictures, load_steps, pad, preprocessing_of
+from dreamfleet.worker.training.moments import LASTING
+from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, RewardLabel
+
+RIDGE = 0.01  # against the mean square of a feature, which is below 1 for h and about 1 for what z tells
+BOUND = 2.5  # tanh has 0.987 there: how much further a value lies makes no action
+HELD_OUT = 5  # every fifth drive tells how well it went
+TOGETHER = 16  # drives that are followed at once
+PICTURES = 100  # that are encoded at once
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """T recorded steps: `pictures` (T, side, side, 3), `action` (T, actions), `reward` (T,)."""
+
+    pictures: NDArray[np.uint8]
+    action: Floats
+    reward: Floats
+
+
+@dataclass(frozen=True)
+class Refit:
+    """The fitted controller; on how many drives and steps, and R² of each of the first layer's values on others."""
+
+    controller: Controller
+    drives: int
+    steps: int
+    r_squared: tuple[float, ...]
+
+
+class Onlooker:
+    """What a controller of one world model would see while others drive."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._encoder, self._memory, self._label = Encoder(bundle), DreamStep(bundle), RewardLabel(bundle)
+        hidden = bundle.controller_shape.features > bundle.manifest.latent
+        self._hidden = bundle.manifest.hidden if hidden else 0
+
+    def see(self, drives: Sequence[Drive]) -> Floats:
+        """The latents of their pictures `(N, T, latent)`, zero behind a drive's end."""
+        return pad([self._encode(drive.pictures) for drive in drives])
+
+    def features(self, drives: Sequence[Drive], latent: Floats) -> Floats:
+        """[z, h], or z alone, before each step `(N, T, features)`; behind a drive's end they mean nothing."""
+        action, reward = pad([drive.action for drive in drives]), pad([drive.reward for drive in drives])
+        state, seen = self._memory.zero_state(len(drives)), []
+        for step in range(latent.shape[1]):
+            seen.append(np.concatenate([latent[:, step], state[:, : self._hidden]], axis=1))
+            state = self._memory.advance(latent[:, step], action[:, step], state)
+            self._label.write(state, reward[:, step].astype(np.float64))
+        return np.stack(seen, axis=1)
+
+    def _encode(self, pictures: NDArray[np.uint8]) -> Floats:
+        starts = range(0, len(pictures), PICTURES)
+        return np.concatenate([self._encoder.encode(pictures[start : start + PICTURES])[0] for start in starts])
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Everything that least squares ask of inputs X `(steps, inputs)` and targets Y `(steps, outputs)`."""
+
+    steps: int
+    inputs: Doubles  # X'X
+    cross: Doubles  # X'Y
+    targets: Doubles  # the sums of Y, and of its squares `(2, outputs)`
+
+    @classmethod
+    def of(cls, inputs: Floats, targets: Doubles) -> Sums:
+        """Those of some steps; inputs have a last column of ones added."""
+        wide = np.concatenate([inputs, np.ones((len(inputs), 1), np.float32)], axis=1).astype(np.float64)
+        return cls(len(wide), wide.T @ wide, wide.T @ targets, np.stack([targets.sum(0), (targets**2).sum(0)]))
+
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(
+            self.steps + other.steps, self.inputs + other.inputs, self.cross + other.cross, self.targets + other.targets
+        )
+
+    def solve(self, ridge: float) -> Doubles:
+        """The map `(inputs + 1, outputs)`; the offsets, its last row, are not held small."""
+        held = np.full(len(self.inputs), ridge * self.steps)
+        held[-1] = 0
+        return np.asarray(np.linalg.solve(self.inputs + np.diag(held), self.cross), dtype=np.float64)
+
+    def r_squared(self, solved: Doubles) -> Doubles:
+        """How much of each target's variance a map tells `(outputs,)`; NaN of one that does not vary."""
+        missed = self.targets[1] - 2 * (solved * self.cross).sum(0) + (solved * (self.inputs @ solved)).sum(0)
+        varies = self.targets[1] - self.targets[0] ** 2 / self.steps
+        found: Doubles = np.full_like(varies, np.nan)
+        np.divide(varies - missed, varies, out=found, where=varies > 1e-9 * self.steps)
+        return found
+
+
+def refit(
+    controller: Controller, own: Bundle, bundle: Bundle, paths: Sequence[Path], told: Callable[[int], None]
+) -> Refit:
+    """The controller of the world model `own` for `bundle`, by these drives; `told` hears how many are followed.
+
+    It is left as it is if it is of that world model already.
+
+    `ControllerError` if the two worlds or their pictures differ, or if it looks at its own last choices;
+    `DatasetError` if the drives have other pictures or are damaged; `UsageError` if none of them keeps to its road.
+    """
+    if controller.bundle == bundle.sha256:
+        return Refit(controller, 0, 0, ())
+    _check(controller, own, bundle, paths)
+    fitted = bundle.under(bundle.shape_of(_sees(controller, own), controller.shape.hidden, controller.variant),
+                          controller.variant)  # fmt: skip
+    old, new = Onlooker(own.fitting(controller)), Onlooker(fitted)
+    same_eyes = own.read(ENCODER) == bundle.read(ENCODER)
+    (weights, biases), *above = controller.shape.unpack(controller.parameters)
+    kept: list[Sums | None] = [None, None]  # of the drives that it is fitted to, and of the others
+    for first, drives in _followed(paths):
+        latent = old.see(drives)
+        before, after = old.features(drives, latent), new.features(drives, latent if same_eyes else new.see(drives))
+        for row, drive in enumerate(drives):
+            on = on_the_way(drive.reward)
+            wanted = before[row, : len(on)][on].astype(np.float64) @ weights.T.astype(np.float64) + biases
+            sums = Sums.of(after[row, : len(on)][on], np.clip(wanted, -BOUND, BOUND))
+            side = int((first + row) % HELD_OUT == HELD_OUT - 1)
+            so_far = kept[side]
+            kept[side] = sums if so_far is None else so_far + sums
+        told(first + len(drives))
+    used, others = kept
+    if used is None or not used.steps:
+        raise UsageError(f"none of the {len(paths)} drives keeps to its road: there is nothing to fit a controller to")
+    r_squared = others.r_squared(used.solve(RIDGE)) if others and others.steps else np.full(len(biases), np.nan)
+    whole = used + others if others else used
+    solved = whole.solve(RIDGE)
+    parts = [solved[:-1].T, solved[-1], *(part for layer in above for part in layer)]
+    parameters = np.concatenate([part.ravel() for part in parts]).astype(np.float32)
+    moved = replace(controller, shape=fitted.controller_shape, parameters=parameters, bundle=bundle.sha256,
+                    provenance={"refitted_from": controller.sha256, "of_world_model": controller.bundle})  # fmt: skip
+    return Refit(moved, len(paths), whole.steps, tuple(float(each) for each in r_squared))
+
+
+def last_drives(folder: Path, count: int) -> list[Path]:
+    """A folder's last drives, so many at most; those of controllers lie behind random ones."""
+    return episodes(folder)[-count:]
+
+
+def on_the_way(reward: Floats) -> NDArray[np.bool_]:
+    """The steps of a drive `(T,)` that another reward follows before the road counts as lost."""
+    steps = np.arange(len(reward))
+    paid = np.where(reward > 0, steps, 2 * len(reward) + LASTING)
+    following = np.minimum.accumulate(paid[::-1])[::-1]
+    return np.asarray(following - steps < LASTING)
+
+
+def _sees(controller: Controller, own: Bundle) -> str:
+    return "zh" if controller.shape.features > own.manifest.latent else "z"
+
+
+def _check(controller: Controller, own: Bundle, bundle: Bundle, paths: Sequence[Path]) -> None:
+    sees = [(each.manifest.task, each.manifest.preprocessing) for each in (own, bundle)]
+    if sees[0] != sees[1]:
+        raise ControllerError(
+            f"the controller sees {sees[0][1]!r} of {sees[0][0]}, and {bundle.manifest.name} {sees[1][1]!r} of "
+            f"{sees[1][0]}: no drive shows both"
+        )
+    if controller.variant.seen:
+        raise ControllerError("it looks at its own last choices, which no recorded drive holds: it cannot be refitted")
+    check_whole(paths, "picture", "preprocessing", "action", "reward", "ended")
+    for path in paths:
+        if (found := preprocessing_of(path)) != sees[0][1]:
+            raise DatasetError(f"{path} holds pictures {found!r}, and the controller sees {sees[0][1]!r}")
+
+
+def _followed(paths: Sequence[Path]) -> Iterator[tuple[int, list[Drive]]]:
+    """The drives, few at a time, with the number of the first of them."""
+    for first in range(0, len(paths), TOGETHER):
+        yield first, [_load(path) for path in paths[first : first + TOGETHER]]
+
+
+def _load(path: Path) -> Drive:
+    steps, pictures = load_steps(path), load_pictures(path)
+    if len(pictures) != len(steps["reward"]):
+        raise DatasetError(f"{path} holds {len(pictures)} pictures and another number of actions; delete it")
+    return Drive(pictures, steps["action"], steps["reward"])
