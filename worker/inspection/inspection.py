@@ -18,6 +18,7 @@ from dreamfleet.worker.inspection import curves, memory, vision
 from dreamfleet.worker.inspection.page import Page
 from dreamfleet.worker.inspection.rollout import DriveConfig, EncodedRollout, drive
 from dreamfleet.worker.inspection.section import Section
+from dreamfleet.worker.inspection.tables import measured_rows
 from dreamfleet.worker.inspection.trainings import MODELS, Training, trainings
 from dreamfleet.worker.worldmodel.inference import Decoder
 
@@ -150,4 +151,6 @@ def facts(bundle: Bundle) -> list[tuple[str, str]]:
         (name, str(provenance[name])) for name in ("episodes", "frames", "held_out_episodes") if name in provenance
     ]
     rows += [(f"quality: {name}", str(value)) for name, value in quality.items()] if isinstance(quality, dict) else []
+    measured = provenance.get("measured", [])
+    rows += [row for told in measured for row in measured_rows(told)] if isinstance(measured, list) else []
     return [(name.replace("_", " "), value) for name, value in rows]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from typing import Any
 
 from dreamfleet.worker.inspection.knowledge import Knowledge
 from dreamfleet.worker.inspection.losses import Compared
@@ -42,6 +44,22 @@ def loss_text(drives: int, dreams: int, lasting: int) -> str:
         f"means ± standard errors over n beginnings in {drives} drives, {dreams} dreams of each; the road is lost "
         f"after {lasting} steps in a row off it, and the end is as long"
     )
+
+
+def measured_rows(told: Any) -> Iterator[tuple[str, str]]:
+    """What a manifest keeps of these figures: linear maps from [z, h], and dreams that lose the road.
+
+    Whatever else a manifest holds there tells nothing.
+    """
+    with suppress(KeyError, TypeError, ValueError, AttributeError):
+        for each in told.get("probe", {}).get("known", ()):
+            yield f"R² of {each['quantity']}, linear on [z, h]", _estimate(each["found"]["zh_linear"])
+        for each in told.get("losses", {}).get("begun", ()):
+            yield f"road lost in dreams begun {each['begun']}", _estimate(each["figures"]["lost"]["dream"])
+
+
+def _estimate(told: dict[str, float]) -> str:
+    return f"{told['value']:.2f} ± {told['error']:.2f}"
 
 
 def _column(name: str) -> str:

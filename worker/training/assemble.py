@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from dreamfleet.common.bundle import (
 )
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.fields import written
-from dreamfleet.common.files import write_aside
+from dreamfleet.common.files import read_regular, write_aside
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
@@ -49,6 +50,8 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 
 QUALITY = "quality.json"
+MEASURED, CIRCUMSTANCES = ("probe", "losses"), ("driver", "noise", "first_seed")  # of what `inspect --json` tells
+MOST_FIGURES = 1 << 18  # bytes: a manifest has a million at most
 INITIAL_LATENTS = 256
 
 
@@ -60,8 +63,13 @@ def record_quality(folder: Path, figures: dict[str, float]) -> None:
         file.write(json.dumps({**known, **figures}, indent=1).encode())
 
 
-def assemble(folder: Path, out: Path, name: str, *, with_weights: bool, recorded: int = 0) -> Bundle:
-    """Build the bundle of a data folder whose models are trained, with `recorded` states of its drives at most."""
+def assemble(
+    folder: Path, out: Path, name: str, *, with_weights: bool, recorded: int = 0, measured: Sequence[Path] = ()
+) -> Bundle:
+    """Build the bundle of a data folder whose models are trained, with `recorded` states of its drives at most.
+
+    `measured` are figures that `inspect --json` told of the same bundle without them; `DatasetError` if of another.
+    """
     vae = load_weights(folder / train_vae.CHECKPOINT)
     rnn = load_weights(folder / train_mdnrnn.CHECKPOINT)
     configs = (
@@ -94,7 +102,27 @@ def assemble(folder: Path, out: Path, name: str, *, with_weights: bool, recorded
         parts[WEIGHTS] = save(
             tensors, {"vae": json.dumps(written(configs[0])), "mdnrnn": json.dumps(written(configs[1]))}
         )
+    bundle = write_bundle(out, manifest(name, provenance, *configs), parts)
+    if not measured:
+        return bundle
+    provenance["measured"] = [_figures(path, bundle) for path in measured]
     return write_bundle(out, manifest(name, provenance, *configs), parts)
+
+
+def _figures(path: Path, bundle: Bundle) -> dict[str, Any]:
+    """What `inspect --json` told of this bundle."""
+    try:
+        told = json.loads(read_regular(path, MOST_FIGURES))
+        figures = {name: told[name] for name in MEASURED if name in told}
+        measured, circumstances = told["bundle"], {name: told[name] for name in CIRCUMSTANCES}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise DatasetError(f"{path} holds no figures of `inspect BUNDLE --probe --json` ({error})") from error
+    if measured != bundle.sha256:
+        raise DatasetError(
+            f"{path} was measured of the world model {str(measured)[:12]}..., and this folder makes "
+            f"{bundle.sha256[:12]}..., which {bundle.path} now holds: measure that"
+        )
+    return circumstances | figures
 
 
 def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED) -> Manifest:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import ENCODER, Bundle
+from dreamfleet.common.bundle import DREAM, ENCODER, Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
 from dreamfleet.worker.training.dataset import check_whole, episodes, load_pictures, load_steps, pad, preprocessing_of
@@ -118,13 +118,13 @@ def refit(
 ) -> Refit:
     """The controller of the world model `own` for `bundle`, by these drives; `told` hears how many are followed.
 
-    It is left as it is if it is of that world model already.
+    It is left as it is where that one sees and remembers as its own does, to the bit.
 
     `ControllerError` if the two worlds or their pictures differ, or if it looks at its own last choices;
     `DatasetError` if the drives have other pictures or are damaged; `UsageError` if none of them keeps to its road.
     """
-    if controller.bundle == bundle.sha256:
-        return Refit(controller, 0, 0, ())
+    if all(own.read(part) == bundle.read(part) for part in (ENCODER, DREAM)):
+        return Refit(replace(controller, bundle=bundle.sha256), 0, 0, ())
     _check(controller, own, bundle, paths)
     fitted = bundle.under(bundle.shape_of(_sees(controller, own), controller.shape.hidden, controller.variant),
                           controller.variant)  # fmt: skip

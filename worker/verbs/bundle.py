@@ -23,6 +23,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--recorded", type=int, default=RECORDED, metavar="N",
         help=f"moments of the drives at which dreams may begin, with the model's memory; 0: none (default {RECORDED})",
     )  # fmt: skip
+    parser.add_argument(
+        "--measured", type=Path, nargs="+", default=[], metavar="FILE",
+        help="figures to keep in its manifest, told by `inspect --probe --losses --json` of the bundle without them",
+    )  # fmt: skip
     add_json(parser)
 
 
@@ -32,7 +36,10 @@ def run(args: argparse.Namespace) -> int:
 
     if not 0 <= args.recorded <= MOST_RECORDED:
         raise UsageError(f"--recorded must be from 0 to {MOST_RECORDED}, not {args.recorded}")
-    bundle = assemble(args.data, args.out, args.out.stem, with_weights=args.with_weights, recorded=args.recorded)
+    bundle = assemble(
+        args.data, args.out, args.out.stem, with_weights=args.with_weights, recorded=args.recorded,
+        measured=args.measured,
+    )  # fmt: skip
     size = bundle.path.stat().st_size / 1e6
     parameters = bundle.controller_shape.size
     states = bundle.recorded

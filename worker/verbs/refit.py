@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     spoken = ", ".join("-" if each is None else f"{each:.2f}" for each in r_squared)
     text = f"{args.out}: fitted on {fitted.steps} steps of {fitted.drives} drives; R² on held-out ones {spoken}"
     if not fitted.drives:
-        text = f"{args.out}: the same controller, which is of this world model already"
+        text = f"{args.out}: the same parameters, since both models see and remember alike"
     answer(args, text, controller=args.out, sha256=fitted.controller.sha256, bundle=fitted.controller.bundle,
            drives=fitted.drives, steps=fitted.steps, r_squared=r_squared)  # fmt: skip
     return 0

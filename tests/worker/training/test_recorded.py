@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.bundle import RECORDED, Bundle
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.dream.environment import CarRacingDream
 from dreamfleet.worker.inspection.inspection import facts
 from dreamfleet.worker.training import train_mdnrnn, train_vae
@@ -18,6 +18,7 @@ from dreamfleet.worker.verbs import bundle as verb
 from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import write_random_bundle
 from tests.support.drives import write_drive
 
 SHORT = TrainConfig(updates=1, batch=4, rate=1e-3)
@@ -148,3 +149,38 @@ def test_the_verb_and_the_page_tell_how_many_there_are(trained, capsys):
     for wrong in ("-1", "16385"):
         with pytest.raises(UsageError, match="--recorded must be from 0 to 16384"):
             call(capsys, folder, "--recorded", wrong)
+
+
+FIGURES = {
+    "noise": 0.3, "first_seed": 20000, "driver": "f00",
+    "probe": {"drives": 2, "known": [{"quantity": "speed", "found": {"zh_linear": {"value": 0.86, "error": 0.01}}}]},
+    "losses": {
+        "begun": [{"begun": "40 steps before", "figures": {"lost": {"dream": {"value": 0.6, "error": 0.07}}}}],
+    },
+}  # fmt: skip
+
+
+def test_figures_that_were_measured_stay_with_the_bundle(trained, tmp_path, capsys):
+    folder, told = trained(MODELS["plain"]), tmp_path / "told.json"
+    bare = json.loads(call(capsys, folder, "--json"))["sha256"]
+    told.write_text(json.dumps({"bundle": bare, **FIGURES}))
+    assert json.loads(call(capsys, folder, "--measured", str(told), "--json"))["sha256"] != bare
+    bundle = Bundle.open(folder / "b.zip")
+    assert bundle.manifest.provenance["measured"] == [FIGURES]
+    rows = dict(facts(bundle))
+    assert rows["R² of speed, linear on [z, h]"] == "0.86 ± 0.01"
+    assert rows["road lost in dreams begun 40 steps before"] == "0.60 ± 0.07"
+    for content, said in (
+        (json.dumps({"bundle": "0" * 64, **FIGURES}), "was measured of the world model 000000000000"),
+        ("{}", "holds no figures"), ("[" * 100_000, "holds no figures"), ("", "holds no figures"),
+    ):  # fmt: skip
+        told.write_text(content)
+        with pytest.raises(DatasetError, match=said):
+            call(capsys, folder, "--measured", str(told))
+
+
+@pytest.mark.parametrize("told", [7, [7], [{"probe": 7}], [{"probe": {"known": [{"quantity": 1}]}}]])
+def test_a_manifest_that_holds_anything_there_tells_nothing(tmp_path, told):
+    bundle = write_random_bundle(tmp_path / "b.zip")
+    bundle.manifest.provenance["measured"] = told
+    assert not [name for name, _ in facts(bundle) if "R²" in name]

@@ -84,7 +84,7 @@ def test_it_chooses_by_other_eyes_much_as_it_chose(bundles, drives, features, hi
 
 def test_the_model_that_it_has_leaves_it_as_it_is(bundles, drives):
     before = controller(bundles[0])
-    assert refit(before, bundles[0], bundles[0], drives, ignore).controller is before
+    assert refit(before, bundles[0], bundles[0], drives, ignore).controller == before
 
 
 def test_least_squares_find_a_map_and_tell_how_much_it_explains():
