@@ -44,8 +44,10 @@ class Commands:
 
     def drive(self, pilots: Sequence[Path]) -> Words:
         """Drives of the last round's means, which lie in these files."""
-        wanted = self.ledger.episodes + self.config.own_drives
-        return self._collect(wanted, "--noise", self.config.noise, "--controller", *pilots)
+        config = self.config
+        wanted = self.ledger.episodes + config.own_drives
+        tried = ("--spells", config.spells) if config.spells else ()
+        return self._collect(wanted, "--noise", config.noise, *tried, "--controller", *pilots)
 
     def train(self, number: int, model: str) -> Words:
         """The training of `vae` or `mdnrnn`: from nothing, or on from the world model that counts."""

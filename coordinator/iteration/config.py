@@ -33,6 +33,7 @@ class IterateConfig:
     own_drives: int = option(80, "drives of the last round's own means that each later round adds")
     means: int = option(4, "means that drive these: the reported one, the last one, then the best evaluated ones")
     noise: float = option(0.3, "on the actions of these drives, in halves of an action's range")
+    spells: float = option(0.0, "chance of each of their steps that an action which rests, as a brake, is tried")
     drive_steps: int | None = option(None, "steps of a drive at most (default the preset's)")
     vae: Literal["decoder", "whole", "keep"] = option("decoder", "what of the VAE learns on in later rounds")
     vae_updates: int = option(1800, "updates of the VAE in each later round")
@@ -61,6 +62,8 @@ class IterateConfig:
         check_preset("training", self.preset)
         if not 0 <= self.noise <= 10:
             raise UsageError(f"--noise must be from 0 to 10, not {self.noise}")
+        if not 0 <= self.spells <= 1:
+            raise UsageError(f"--spells must be from 0 to 1, not {self.spells}")
         if self.gate_drives == 1 or 0 < self.gate_losses < 4:
             raise UsageError("--gate-drives must be 0 or at least 2, --gate-losses 0 or at least 4")
         if self.seed > MOST_SEED:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dreamfleet.worker.scoring.disturbance import Disturbance
 from dreamfleet.worker.scoring.hand import Hand
 from dreamfleet.worker.scoring.mind import Mind
+from dreamfleet.worker.scoring.spells import Spells
 
 Floats = NDArray[np.float32]
 
@@ -17,9 +18,11 @@ Floats = NDArray[np.float32]
 class Disturbed:
     """A policy: the hand chooses, the disturbance changes it, and all minds are told what was done in truth."""
 
-    def __init__(self, hand: Hand, disturbance: Disturbance, watching: Mind | None = None) -> None:
+    def __init__(
+        self, hand: Hand, disturbance: Disturbance, watching: Mind | None = None, spells: Spells | None = None
+    ) -> None:
         """`watching` is another mind than the hand's that looks on, if one does."""
-        self._hand, self._disturbance = hand, disturbance
+        self._hand, self._disturbance, self._spells = hand, disturbance, spells
         minds = [watching, None if hand.mind is watching else hand.mind]
         self._minds = [each for each in minds if each is not None]
 
@@ -34,6 +37,7 @@ class Disturbed:
             each.see(observation)
         push, chosen = self._disturbance.next(), self._hand.choose()
         action = self._disturbance.apply(chosen, push)
+        action = self._spells.apply(chosen, action) if self._spells else action
         self.note(action, push)
         for each in self._minds:
             each.remember(action, chosen)

@@ -42,6 +42,7 @@ class CollectConfig:
     patience: int = 120  # steps after the last new tile before an episode ends
     picture: int = 64  # height and width of what is recorded: 64, or 96 for the whole observation
     noise: float = 0.3  # on a controller's actions, in halves of their range; random drivers have none
+    spells: float = 0.0  # a step's chance that a controller's resting action is tried; see `scoring.spells`
 
     def __post_init__(self) -> None:
         for name in ("episodes", "steps", "patience"):
@@ -51,6 +52,8 @@ class CollectConfig:
             raise UsageError(f"--seed must not be negative, not {self.seed}")
         if not 0 <= self.noise <= LOUDEST:
             raise UsageError(f"--noise must be from 0 to {LOUDEST:g}, not {self.noise}")
+        if not 0 <= self.spells <= 1:
+            raise UsageError(f"--spells must be from 0 to 1, not {self.spells}")
         preprocessing_to(self.picture)
 
 
@@ -138,7 +141,7 @@ def _driver(
     """Who drives this episode, by name and as a policy that has begun."""
     if pilots:
         pilot = pilots[number % len(pilots)]
-        return DRIVER, pilot.policy(config.noise, int(random.integers(2**63)))
+        return DRIVER, pilot.policy(config.noise, config.spells, int(random.integers(2**63)))
     drivers = find_world().drivers
     name = list(drivers)[number % len(drivers)]
     return name, Driven(drivers[name](random))

@@ -12,6 +12,7 @@ from dreamfleet.worker.scoring.disturbance import Disturbance
 from dreamfleet.worker.scoring.disturbed import Disturbed
 from dreamfleet.worker.scoring.hand import ControllersHand
 from dreamfleet.worker.scoring.mind import Mind
+from dreamfleet.worker.scoring.spells import Spells
 from dreamfleet.worker.training.world import WORLD, find_world
 
 
@@ -35,10 +36,11 @@ class Pilot:
                 f"{preprocessing!r} of {WORLD}: choose another --picture, or another --controller"
             )
 
-    def policy(self, noise: float, seed: int) -> Disturbed:
-        """It at the wheel of one drive, under a noise that follows from the seed."""
+    def policy(self, noise: float, spells: float, seed: int) -> Disturbed:
+        """It at the wheel of one drive, under a noise and spells that follow from the seed."""
         actions = find_world().world.actions
         if not isinstance(actions, Continuous):
             raise ControllerError(f"{WORLD} has no continuous actions: its drives cannot be disturbed")
         hand = ControllersHand(self.controller, self.bundle, Mind(self.bundle.fitting(self.controller)))
-        return Disturbed(hand, Disturbance(seed, actions, noise))
+        tried = Spells(seed, actions, spells) if spells else None
+        return Disturbed(hand, Disturbance(seed, actions, noise), spells=tried)

@@ -35,6 +35,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="who drives the episodes that are missing, in turn, instead of random drivers: files, runs, or what ships",
     )  # fmt: skip
     parser.add_argument("--noise", type=float, help="on a controller's actions, of half their range (default 0.3)")
+    parser.add_argument(
+        "--spells", type=float, metavar="CHANCE",
+        help="of each step, that an action which a controller leaves at its bound, as a brake, is tried (default 0)",
+    )  # fmt: skip
     parser.add_argument("--from-run", metavar="RUN", help="drive nothing: take in what this run collected, each once")
     offer(parser, "runs_dir")
     add_json(parser)
@@ -44,15 +48,16 @@ def run(args: argparse.Namespace) -> int:
     """Collect what is missing."""
     if args.from_run is not None:
         return _take_in(args)
-    if args.noise is not None and not args.controller:
-        raise UsageError("--noise is on a controller's actions: give --controller too")
+    for flag in ("noise", "spells"):
+        if getattr(args, flag) is not None and not args.controller:
+            raise UsageError(f"--{flag} is on a controller's actions: give --controller too")
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.common.stopping import heeding_signals
     from dreamfleet.worker.training.collect import collect, missing, present
     from dreamfleet.worker.training.presets import find_preset
 
     config = find_preset(args.preset).collect
-    names = ("episodes", "steps", "seed", "picture", "noise")
+    names = ("episodes", "steps", "seed", "picture", "noise", "spells")
     changes = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     config = replace(config, **changes)
     pilots = _pilots(args)

@@ -43,6 +43,8 @@ def test_later_rounds_add_drives_to_those_that_there_are():
     assert "--episodes 1200 --steps 300 --jobs 2" in said(later.collect(2))
     drive = said(commands(*ROUND_2, own_drives=80, noise=0.2).drive([Path("0.npz"), Path("1.npz")]))
     assert drive.endswith("--episodes 700 --noise 0.2 --controller 0.npz 1.npz --json")
+    tried = said(commands(*ROUND_2, spells=0.01).drive([Path("0.npz")]))
+    assert "--noise 0.3 --spells 0.01 --controller 0.npz" in tried
     assert said(later.take(2)) == "collect --data data --from-run round-01 --runs-dir data/runs --json"
 
 

@@ -65,6 +65,7 @@ def test_what_is_no_phase_is_refused_with_those_that_there_are(text):
         ({"rounds": 0}, "--rounds must be at least 1"),
         ({"drives": 1}, "--drives must be at least 2"),
         ({"noise": -0.1}, "--noise must be from 0 to 10"),
+        ({"spells": -0.1}, "--spells must be from 0 to 1"),
         ({"gate_drives": 1}, "--gate-drives must be 0 or at least 2"),
         ({"gate_losses": 3}, "--gate-losses 0 or at least 4"),
         ({"preset": "dream"}, "'dream' is a preset of run"),

@@ -10,6 +10,7 @@ from dreamfleet.worker.scoring.disturbance import Disturbance, pushed
 from dreamfleet.worker.scoring.disturbed import Disturbed
 from dreamfleet.worker.scoring.hand import ControllersHand
 from dreamfleet.worker.scoring.mind import Mind
+from dreamfleet.worker.scoring.spells import Spells
 
 
 def test_noise_is_as_large_as_is_said_and_touches_no_action_at_its_bound():
@@ -19,6 +20,28 @@ def test_noise_is_as_large_as_is_said_and_touches_no_action_at_its_bound():
     chosen = np.array([[0.9, 0.0, 1.0], [0.0, 0.5, 0.2]], np.float32)
     done = pushed(STEERING_GAS_BRAKE, chosen, np.array([[0.3, 0.3, -0.3]], np.float32))
     np.testing.assert_allclose(done, [[1.0, 0.0, 1.0], [0.3, 0.8, 0.0]], atol=1e-6)
+
+
+def test_what_rests_is_tried_for_a_spell_and_then_rests_again():
+    chosen = np.array([[0.2, 1.0, 0.0]], np.float32)  # steers, full gas, no brake
+
+    def drive(seed):
+        spells = Spells(seed, STEERING_GAS_BRAKE, 0.02)
+        return np.concatenate([spells.apply(chosen, chosen) for _ in range(5000)])
+
+    done = drive(4)
+    assert (done[:, 0] == chosen[0, 0]).all()
+    for action, resting in ((1, 1.0), (2, 0.0)):
+        tried = done[:, action] != resting
+        assert 0.1 < tried.mean() < 0.2  # 9 steps of every 50 + 9
+        changes = np.flatnonzero(np.diff(done[:, action])) + 1
+        lengths = np.diff(changes)[tried[changes[:-1]]]
+        assert lengths.min() >= 3
+        assert np.median(lengths) <= 12
+        assert done[tried, action].std() > 0.2
+    assert np.array_equal(done, drive(4))
+    assert not np.array_equal(done, drive(5))
+    assert (Spells(0, STEERING_GAS_BRAKE, 0.0).apply(chosen, chosen) == chosen).all()
 
 
 class Recorder(Disturbed):

@@ -58,7 +58,9 @@ def test_collecting_again_writes_only_what_is_missing_and_the_same(tmp_path):
     assert len(load_pictures(episode_path(tmp_path, 2))) == 4
 
 
-@pytest.mark.parametrize("changes", [{"episodes": 0}, {"steps": 0}, {"patience": 0}, {"seed": -1}, {"noise": -1}])
+@pytest.mark.parametrize(
+    "changes", [{"episodes": 0}, {"steps": 0}, {"patience": 0}, {"seed": -1}, {"noise": -1}, {"spells": 1.1}]
+)
 def test_impossible_settings_are_refused(changes):
     with pytest.raises(UsageError, match=f"--{next(iter(changes))}"):
         CollectConfig(**changes)
@@ -95,6 +97,9 @@ def test_controllers_drive_in_turn_under_noise_as_a_function_of_seed_and_number(
     assert str(first["driver"]) == "controller"
     quiet = drive(replace(TINY, noise=0.0), 1, (still,))
     assert np.ptp(quiet["action"], axis=0).max() == 0 < np.ptp(first["action"], axis=0).max()
+    tried = drive(replace(TINY, noise=0.0, spells=1.0), 1, (still,))
+    assert np.array_equal(tried["action"][:, 0], quiet["action"][:, 0])
+    assert (tried["action"][:, 2] > 0).all()
     assert list(collect(tmp_path, TINY, 1, (pilot, still))) == [4, 4, 4]
     with np.load(episode_path(tmp_path, 1)) as written:
         assert equal(dict(written), first)

@@ -67,6 +67,7 @@ def test_a_set_goes_on_with_drives_of_controllers(tmp_path, capsys):
     ("flags", "said"),
     [
         (("--noise", "0.1"), "give --controller"),
+        (("--spells", "0.1"), "give --controller"),
         (("--from-run", "r", "--controller", "tiny"), "leave --controller out"),
     ],
 )
