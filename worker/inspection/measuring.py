@@ -10,6 +10,8 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.inspection.knowledge import Knowledge, measure
+from dreamfleet.worker.inspection.likeness import Alike
+from dreamfleet.worker.inspection.likeness import compare as alike
 from dreamfleet.worker.inspection.losses import Compared, LossConfig, compare, gather
 from dreamfleet.worker.inspection.witness import WitnessConfig, WitnessedDrive, witness
 from dreamfleet.worker.scoring.hand import Hand, controllers_hand, drivers_hands
@@ -51,6 +53,18 @@ def probe(bundle: Bundle, driving: Driving, config: WitnessConfig, episodes: int
     return measure(drives, config.opening)
 
 
+def likeness(
+    bundle: Bundle, driving: Driving, config: WitnessConfig, dreams: LossConfig, episodes: int, on_drive: Told
+) -> list[Alike]:
+    """How often dreams come to what is rare on so many drives; `UsageError` as of `dream_losses`."""
+    controller = _dreamer(bundle, driving)
+    drives = []
+    for drive in islice(_drives(bundle, driving, config), episodes):
+        drives.append(drive)
+        on_drive(len(drives))
+    return alike(drives, bundle, controller, config.opening, dreams.dreams, dreams.temperature)
+
+
 def dream_losses(
     bundle: Bundle, driving: Driving, config: WitnessConfig, losses: LossConfig, on_loss: Told
 ) -> tuple[list[Compared], int]:
@@ -58,11 +72,17 @@ def dream_losses(
 
     `UsageError` unless a controller drives that was evolved with this world model: it has to drive on in the dream.
     """
-    controller = driving.controller
-    if controller is None or controller.bundle != bundle.sha256:
-        raise UsageError("dreams of losses need a --controller that was evolved with this world model: it drives them")
+    controller = _dreamer(bundle, driving)
     drives = gather(_drives(bundle, driving, config), losses, config, on_loss)
     return compare(drives, bundle, controller, losses, config), len(drives)
+
+
+def _dreamer(bundle: Bundle, driving: Driving) -> Controller:
+    """Who drives in dreams too."""
+    controller = driving.controller
+    if controller is None or controller.bundle != bundle.sha256:
+        raise UsageError("these dreams need a --controller that was evolved with this world model: it drives them")
+    return controller
 
 
 def _drives(bundle: Bundle, driving: Driving, config: WitnessConfig) -> Iterator[WitnessedDrive]:

@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 from dreamfleet.worker.inspection.knowledge import Knowledge
+from dreamfleet.worker.inspection.likeness import Alike
 from dreamfleet.worker.inspection.losses import Compared
 
 HELD = {"z": "z", "zh": "[z, h]"}
@@ -38,6 +39,21 @@ def loss_rows(compared: Sequence[Compared]) -> list[dict[str, object]]:
     ]
 
 
+def likeness_rows(compared: Sequence[Alike]) -> list[dict[str, str]]:
+    """A row a quantity: what is rare in reality, and how often it is exceeded there and in dreams."""
+    return [
+        {"quantity": each.quantity, "rare": f"above {each.rare:.3g}"}
+        | {WHERE[where]: str(share) for where, share in each.found.items()}
+        for each in compared
+    ]
+
+
+LIKENESS = (
+    "shares of steps ± standard errors over drives at which a quantity is larger than at nine of ten real steps, by "
+    "the truth, and by a linear probe on [z, h]; dreams begin behind each drive's opening and last as long"
+)
+
+
 def loss_text(drives: int, dreams: int, lasting: int) -> str:
     """What the rows are of."""
     return (
@@ -47,7 +63,7 @@ def loss_text(drives: int, dreams: int, lasting: int) -> str:
 
 
 def measured_rows(told: Any) -> Iterator[tuple[str, str]]:
-    """What a manifest keeps of these figures: linear maps from [z, h], and dreams that lose the road.
+    """What a manifest keeps of these figures: linear maps from [z, h], and how dreams are and what they lose.
 
     Whatever else a manifest holds there tells nothing.
     """
@@ -56,6 +72,8 @@ def measured_rows(told: Any) -> Iterator[tuple[str, str]]:
             yield f"R² of {each['quantity']}, linear on [z, h]", _estimate(each["found"]["zh_linear"])
         for each in told.get("losses", {}).get("begun", ()):
             yield f"road lost in dreams begun {each['begun']}", _estimate(each["figures"]["lost"]["dream"])
+        for each in told.get("likeness", {}).get("quantities", ()):
+            yield f"dreamt share of {each['quantity']} above {each['rare']:.3g}", _estimate(each["found"]["dream"])
 
 
 def _estimate(told: dict[str, float]) -> str:

@@ -50,7 +50,10 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 
 QUALITY = "quality.json"
-MEASURED, CIRCUMSTANCES = ("probe", "losses"), ("driver", "noise", "first_seed")  # of what `inspect --json` tells
+MEASURED, CIRCUMSTANCES = (
+    ("probe", "losses", "likeness"),
+    ("driver", "noise", "first_seed"),
+)  # of what `inspect --json` tells
 MOST_FIGURES = 1 << 18  # bytes: a manifest has a million at most
 INITIAL_LATENTS = 256
 

@@ -25,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--measured", type=Path, nargs="+", default=[], metavar="FILE",
-        help="figures to keep in its manifest, told by `inspect --probe --losses --json` of the bundle without them",
+        help="figures to keep in its manifest, told by `inspect --json` (--probe, --losses, ...) of it without them",
     )  # fmt: skip
     add_json(parser)
 

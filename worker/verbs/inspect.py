@@ -46,6 +46,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     figures = parser.add_argument_group("figures, printed instead of the page")
     figures.add_argument("--probe", action="store_true", help="how much of the simulator's truth [z, h] holds")
     figures.add_argument("--losses", action="store_true", help="whether dreams lose the road where reality lost it")
+    figures.add_argument("--likeness", action="store_true", help="whether dreams hold what is rare on drives as often")
     figures.add_argument("--controller", help="who drives: a file, a run, or one that ships (default the run's own)")
     figures.add_argument("--driver", help="who drives for --probe: a random driver by name, from anywhere")
     figures.add_argument("--episodes", type=int, help=f"drives of --probe ({DRIVES}), losses of --losses ({LOSSES})")
@@ -58,10 +59,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Draw and print where the page lies, or measure and print figures."""
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    if args.probe or args.losses:
+    if args.probe or args.losses or args.likeness:
         return _measure(args)
     if args.controller or args.driver:
-        raise UsageError("--controller and --driver drive for figures: give --probe or --losses too")
+        raise UsageError("--controller and --driver drive for figures: give --probe, --losses or --likeness too")
     if not args.subject and not args.data:
         raise UsageError("give a bundle or a run to look into, or --data folders whose trainings to draw")
     return _draw(args)
@@ -96,6 +97,8 @@ def _measure(args: argparse.Namespace) -> int:
         found["driver"] = driving.driver or (driving.controller and driving.controller.sha256)
         if args.probe:
             found["probe"] = _probe(args, bundle, driving, config)
+        if args.likeness:
+            found["likeness"] = _liken(args, bundle, driving, config, _temperature(args, subject))
         if args.losses:
             found["losses"] = _lose(args, bundle, driving, config, _temperature(args, subject))
     if args.json:
@@ -116,6 +119,25 @@ def _probe(args: argparse.Namespace, bundle: Bundle, driving: Driving, config: W
         print_rows(rows, right=tuple(rows[0])[1:])
         print(knowledge_text(known))
     return asdict(known)
+
+
+def _liken(
+    args: argparse.Namespace, bundle: Bundle, driving: Driving, config: WitnessConfig, temperature: float
+) -> dict[str, Any]:
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.inspection.losses import LossConfig
+    from dreamfleet.worker.inspection.measuring import likeness
+    from dreamfleet.worker.inspection.tables import LIKENESS, likeness_rows
+
+    drives, wanted = DRIVES if args.episodes is None else args.episodes, LossConfig(temperature=temperature)
+    with progress_bar("likeness", drives, "drives") as bar:
+        compared = likeness(bundle, driving, config, wanted, drives, bar.move)
+    if not args.json:
+        rows = likeness_rows(compared)
+        print_rows(rows, right=tuple(rows[0])[1:])
+        print(LIKENESS)
+    facts = {"drives": drives, "dreams": wanted.dreams, "temperature": wanted.temperature}
+    return {**facts, "quantities": [asdict(each) for each in compared]}
 
 
 def _lose(

@@ -50,6 +50,15 @@ def test_a_driver_drives_without_a_controller(call):
     assert found["probe"]["steps"] > 50
 
 
+def test_likeness_prints_how_often_dreams_come_to_what_is_rare(call):
+    lines = call("tiny", "--likeness", "--controller", "tiny", "--episodes", "3", "--noise", "0.1").splitlines()
+    assert lines[0].split("\t") == ["quantity", "rare", "reality", "reality, foreseen", "dream"]
+    rows = {line.split("\t")[0]: line.split("\t")[2:] for line in lines[1:-1]}
+    assert "off_road" not in rows
+    assert rows["curvature_20m"][0].startswith("0.1")
+    assert lines[-1].startswith("shares of steps ± standard errors over drives")
+
+
 def test_as_json_both_tell_counts_values_and_errors(call):
     found = json.loads(call("--controller", "tiny", "--probe", "--losses", "--episodes", "4", "--json"))
     assert found["bundle"] == find_bundle("tiny").sha256
@@ -69,11 +78,12 @@ def test_as_json_both_tell_counts_values_and_errors(call):
     [
         ((), "give a bundle or a run to look into"),
         (("--losses",), "give a bundle or a run to measure"),
-        (("tiny", "--controller", "tiny"), "give --probe or --losses too"),
+        (("tiny", "--controller", "tiny"), "give --probe, --losses or --likeness too"),
         (("tiny", "--probe"), "nobody drives"),
         (("tiny", "--probe", "--controller", "tiny", "--driver", "held"), "one drives"),
         (("tiny", "--probe", "--driver", "ghost"), "no driver 'ghost'"),
         (("tiny", "--losses", "--driver", "held"), "need a --controller that was evolved with this world model"),
+        (("tiny", "--likeness", "--driver", "held"), "need a --controller that was evolved with this world model"),
         (("tiny", "--losses", "--controller", "tiny", "--episodes", "3"), "at least 2 to probe, 4 losses to dream"),
         (("tiny", "--probe", "--controller", "tiny", "--noise", "nan"), "--noise from 0 to 10"),
         (("tiny", "--losses", "--controller", "tiny", "--temperature", "0"), "temperature must be a positive number"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.inspection import probe
+from dreamfleet.worker.inspection import likeness, probe
 from dreamfleet.worker.inspection.imagination import Beginning, Imagination
 from dreamfleet.worker.inspection.judge import Course, Judge
 from dreamfleet.worker.inspection.knowledge import measure
@@ -120,6 +120,18 @@ def test_a_world_model_knows_yaw_from_what_it_remembers_not_from_a_picture(drive
     assert known["yaw_rate"]["zh_linear"].value > 0.8 > known["yaw_rate"]["z_linear"].value + 0.2
     assert known["lateral_offset"]["z_linear"].value > 0.5
     assert [row["quantity"] for row in knowledge_rows(knowledge)] == list(known)
+
+
+def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
+    told = {each.quantity: each for each in likeness.compare(drives, tiny, controller, DRIVEN.opening, 2, 1.0)}
+    assert OFF not in told
+    for each in told.values():
+        assert each.found["reality"].value == pytest.approx(0.1, abs=0.05)  # over drives of unequal lengths
+        assert 0 <= each.found["dream"].value <= 1
+    assert told["yaw_rate"].found["foreseen"].value == pytest.approx(0.1, abs=0.05)
+    assert told["speed"].rare > 20
+    with pytest.raises(UsageError, match="two drives at least that keep to the road for 100 steps"):
+        likeness.compare(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
 
 
 def test_one_drive_is_too_few_to_fit_and_judge(drives):

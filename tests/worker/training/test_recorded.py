@@ -152,6 +152,7 @@ def test_the_verb_and_the_page_tell_how_many_there_are(trained, capsys):
 
 
 FIGURES = {
+    "likeness": {"quantities": [{"quantity": "yaw", "rare": 3.0, "found": {"dream": {"value": 0.2, "error": 0.01}}}]},
     "noise": 0.3, "first_seed": 20000, "driver": "f00",
     "probe": {"drives": 2, "known": [{"quantity": "speed", "found": {"zh_linear": {"value": 0.86, "error": 0.01}}}]},
     "losses": {
@@ -169,6 +170,7 @@ def test_figures_that_were_measured_stay_with_the_bundle(trained, tmp_path, caps
     assert bundle.manifest.provenance["measured"] == [FIGURES]
     rows = dict(facts(bundle))
     assert rows["R² of speed, linear on [z, h]"] == "0.86 ± 0.01"
+    assert rows["dreamt share of yaw above 3"] == "0.20 ± 0.01"
     assert rows["road lost in dreams begun 40 steps before"] == "0.60 ± 0.07"
     for content, said in (
         (json.dumps({"bundle": "0" * 64, **FIGURES}), "was measured of the world model 000000000000"),
