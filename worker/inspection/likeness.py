@@ -60,7 +60,7 @@ def compare(
         rest = others(fold, len(begun))
         probe = LinearProbe.fit(*(np.concatenate([each[row] for row in rest]) for each in (foreseen, truths)))
         for row in fold:
-            dreamt = np.concatenate(imagination.dream(begun[row], own=True)[0])
+            dreamt = _going(imagination.dream(begun[row], own=True)[0])
             told = {"reality": truths[row], "foreseen": probe.predict(foreseen[row]), "dream": probe.predict(dreamt)}
             shares.append({where: (np.abs(values) > rare).mean(axis=0) for where, values in told.items()})
     found = {where: np.stack([each[where] for each in shares], axis=1) for where in shares[0]}
@@ -68,6 +68,15 @@ def compare(
         Alike(name, float(rare[row]), {where: Estimate.of(list(each[row])) for where, each in found.items()})
         for row, name in enumerate(names)
     ]
+
+
+def _going(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The steps `(steps, features)` of dreams `(dreams, steps, features)`, without those behind their ends.
+
+    A dream that has ended stays as it was.
+    """
+    still = (np.diff(features, axis=1) == 0).all(axis=2)
+    return features[:, 1:][~still]
 
 
 def _beginning(drive: WitnessedDrive, opening: int) -> Beginning | None:

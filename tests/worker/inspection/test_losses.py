@@ -134,6 +134,12 @@ def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
         likeness.compare(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
 
 
+def test_steps_behind_a_dreams_end_do_not_count():
+    features = np.arange(24.0).reshape(2, 4, 3)
+    features[1, 2:] = features[1, 1]
+    assert likeness._going(features).tolist() == [*features[0, 1:].tolist(), features[1, 1].tolist()]
+
+
 def test_one_drive_is_too_few_to_fit_and_judge(drives):
     with pytest.raises(UsageError, match="two drives on the road"):
         measure(drives[:1], DRIVEN.opening)
