@@ -76,7 +76,8 @@ def _going(features: NDArray[np.float32]) -> NDArray[np.float32]:
     A dream that has ended stays as it was.
     """
     still = (np.diff(features, axis=1) == 0).all(axis=2)
-    return features[:, 1:][~still]
+    going: NDArray[np.float32] = features[:, 1:][~still]
+    return going
 
 
 def _beginning(drive: WitnessedDrive, opening: int) -> Beginning | None:
