@@ -198,6 +198,8 @@ def write_bundle(path: Path, manifest: Manifest, parts: Mapping[str, bytes]) -> 
     """Write a bundle whole or not at all, and open it."""
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(parts.items())}
     text = json.dumps({**written(manifest), "parts": hashes}, indent=1, sort_keys=True)
+    if len(text) > _MAX_MANIFEST:
+        raise BundleError(f"the manifest of {path} would have {len(text)} bytes, and {_MAX_MANIFEST} are read")
     with write_aside(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in [(MANIFEST, text.encode()), *sorted(parts.items())]:
             archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)

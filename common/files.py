@@ -7,7 +7,7 @@ import os
 import stat
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO
@@ -17,8 +17,10 @@ from typing import BinaryIO
 def write_aside(path: Path) -> Iterator[BinaryIO]:
     """Open a neighbour of `path` for writing; on success it is synced and takes the name, on failure it vanishes.
 
-    The folder is synced too: a name that a power cut takes back would be no file at all.
+    The folder is synced too: a name that a power cut takes back would be no file at all. `OSError` where there is
+    something that is no file: a device would become one.
     """
+    check_replaceable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -71,6 +73,12 @@ def check_regular(path: Path) -> None:
         _check(path.stat(), sys.maxsize)
     except ValueError as error:  # a NUL, or half a surrogate pair
         raise OSError(errno.EINVAL, "no file can have this name") from error
+
+
+def check_replaceable(path: Path) -> None:
+    """`OSError` where there is something that is no file."""
+    with suppress(FileNotFoundError):
+        check_regular(path)
 
 
 def read_regular(path: Path, most: int) -> bytes:

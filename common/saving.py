@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from dreamfleet.common.errors import DreamfleetError, UsageError
-from dreamfleet.common.files import is_folder, write_aside
+from dreamfleet.common.files import check_replaceable, is_folder, write_aside
 
 
 def check_out(path: Path) -> None:
@@ -22,13 +22,23 @@ def check_out(path: Path) -> None:
         raise UsageError(f"--out {path}: its folder cannot be made ({error}): choose another") from error
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"--out {path}: its folder cannot be written in: choose another")
+    try:
+        check_replaceable(path)
+    except OSError as error:
+        raise UsageError(f"--out {path}: {error.strerror}: name another") from error
 
 
 @contextmanager
 def saving(path: Path) -> Iterator[BinaryIO]:
     """Open what `--out` names for writing; it is whole or not there."""
+    with told(path), write_aside(path) as file:
+        yield file
+
+
+@contextmanager
+def told(path: Path) -> Iterator[None]:
+    """What cannot be written at `path` is a `DreamfleetError`."""
     try:
-        with write_aside(path) as file:
-            yield file
+        yield
     except OSError as error:
         raise DreamfleetError(f"cannot write {path}: {error.strerror}; make room or choose another --out") from error

@@ -121,17 +121,30 @@ class Phases:
 
     def _gate(self, number: int) -> Outcome:
         moved, measured = self._layout.moved(number), self._layout.measured(number)
-        fitting = self._commands.refit(number, moved)
-        self._call(number, "gate-refit", fitting)
         commands = self._commands.gate(number)
+        fitting = self._commands.refit(number, moved) if self._config.gate_losses else ()
+        unfitted = self._refit(number, fitting) if fitting else {}
+        if unfitted:
+            del commands["new"]["losses"]
         told = {side: {what: self._measure(number, f"{side}-{what}", words) for what, words in each.items()}
                 for side, each in commands.items()}  # fmt: skip
+        if unfitted:
+            told["new"]["losses"] = unfitted
         _write_json(measured, told)
         figures = {side: gate.figures(each) for side, each in told.items()}
         verdict = gate.judge(figures["old"], figures["new"])
         plain = {side: {name: each and asdict(each) for name, each in found.items()} for side, found in figures.items()}
-        words = (fitting, *(words for each in commands.values() for words in each.values()))
-        return Outcome(words, {**plain, **asdict(verdict)}, (moved, measured))
+        words = tuple(words for each in commands.values() for words in each.values())
+        made = (moved, measured) if fitting and not unfitted else (measured,)
+        return Outcome((fitting, *words) if fitting else words, {**plain, **asdict(verdict)}, made)
+
+    def _refit(self, number: int, words: Words) -> dict[str, Any]:
+        """Nothing, or why the last optimum cannot be fitted to the new model."""
+        try:
+            self._call(number, "gate-refit", words)
+        except UsageError as error:
+            return {"failed": str(error)}
+        return {}
 
     def _measure(self, number: int, name: str, words: Words) -> dict[str, Any]:
         """What `inspect` tells; drives that lose too few roads, or all of them at once, tell nothing."""

@@ -58,7 +58,12 @@ class Plan:
     def next(self, finished: Sequence[Any]) -> Phase | None:
         """The first phase that is not finished; `None`: all are."""
         done = set(finished)
-        return next((each for each in self if each not in done), None)
+        return next((each for each in self if each not in done and not self._late(each, done)), None)
+
+    @staticmethod
+    def _late(phase: Phase, done: set[Any]) -> bool:
+        """A gate that a finished evolution had not: its model counted then."""
+        return phase.name == GATE and Phase(phase.round, EVOLVE) in done
 
     def since(self, phase: Phase, finished: Sequence[Phase]) -> tuple[Phase, ...]:
         """A finished phase and all behind it that were finished or begun; `UsageError` if it is not finished."""

@@ -71,6 +71,10 @@ def _open(args: argparse.Namespace, layout: Layout, stop: Stop) -> Iteration:
     more = _flags_before(args)
     settings = _run_settings(args, [*more, *config.flags_of_run(1)], new=begun is None)
     _run_settings(args, [*more, *config.flags_of_run(2)], new=begun is None)  # what is wrong with them is said now
+    if config.go_on and "feedback=last" in settings["variant"]:
+        raise UsageError(
+            "--go-on fits a controller to the next model, and one with feedback=last cannot be: leave one out"
+        )
     ledger = begun.take(config, settings, layout.root) if begun else Ledger.begin(config, settings)
     if config.local == 0 and not args.listen:
         raise UsageError("nobody would score: give --local slots here, or --listen for workers of other hosts")

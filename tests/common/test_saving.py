@@ -25,6 +25,19 @@ def test_where_no_file_can_be_is_said_before_the_work(tmp_path):
         check_out(tmp_path / "file" / "tiny.json")
 
 
+def test_a_device_or_pipe_stays_what_it_is(tmp_path):
+    pipe, link = tmp_path / "pipe", tmp_path / "link"
+    os.mkfifo(pipe)
+    link.symlink_to(pipe)
+    for path in (pipe, link):
+        with pytest.raises(UsageError, match="it is no regular file: name another"):
+            check_out(path)
+        with pytest.raises(DreamfleetError, match="cannot write"), saving(path):
+            pass
+    assert pipe.is_fifo()
+    assert link.is_symlink()
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_that_nobody_may_write_in_is_said_before_the_work(tmp_path):
     tmp_path.chmod(0o500)

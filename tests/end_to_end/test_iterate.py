@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from threading import Event
 
+import numpy as np
 import pytest
 
 from dreamfleet.common.bundle import Bundle, find_bundle
@@ -152,19 +153,16 @@ def test_a_gate_that_can_measure_nothing_refuses_nothing_and_says_so(undisturbed
     told = json.loads(layout.measured(2).read_text())
     assert told["old"] == told["new"]
     assert told["new"]["probe"]["failed"].startswith("a probe needs two drives on the road at least")
-    moved = Controller.load(layout.moved(2))
-    assert moved.bundle == Bundle.open(layout.bundle(2)).sha256
-    assert moved.provenance["of_world_model"] == Bundle.open(layout.bundle(1)).sha256
 
 
-def gate(layout, new, **changes):
+def gate(layout, new, drives=write_drives, **changes):
     """The figures of a gate that holds the bundle `new` to `tiny`."""
     tiny = find_bundle("tiny").path
     places = {layout.bundle(1): tiny, layout.bundle(2): new, layout.run(1) / "bundle.zip": tiny}
     for place, source in {**places, layout.run(1) / "controller.npz": tiny.with_suffix(".npz")}.items():
         place.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, place)
-    write_drives(layout.root)
+    drives(layout.root)
     config = IterateConfig(**changes)
     ledger = Ledger.begin(config, {}).add(Entry(1, "bundle", 0, 0.0, "")).add(Entry(2, "bundle", 0, 0.0, ""))
     phases = Phases(Commands(config, layout, ledger), None, lambda words, log: ask(words, log, never), never)
@@ -180,9 +178,29 @@ def test_a_model_that_knows_clearly_less_is_refused(tmp_path):
     assert figures["why"].endswith("refused, clearly worse in knows")
 
 
-def test_the_same_model_loses_the_road_as_often_on_the_same_drives(tmp_path):
-    figures = gate(Layout(tmp_path / "data"), find_bundle("tiny").path, gate_drives=0, gate_losses=4)
+def test_a_driver_that_cannot_be_fitted_leaves_losses_unmeasured(tmp_path):
+    layout = Layout(tmp_path / "data")
+    small = {"vae": VAEConfig(latent=2, channels=(2, 2, 2, 2)), "rnn": MDNRNNConfig(latent=2, hidden=2)}
+    ignorant = write_random_bundle(tmp_path / "ignorant.zip", **small)
+    figures = gate(layout, ignorant.path, drives=lost_drives, gate_drives=0, gate_losses=4)
     assert figures["kept"]
+    assert figures["why"] == "kept: nothing was measured of both"
+    assert "none of the 2 drives keeps to its road" in layout.measured(2).read_text()
+    assert not layout.moved(2).exists()
+
+
+def lost_drives(folder):
+    for path in write_drives(folder, episodes=2):
+        with np.load(path) as drive:
+            arrays = dict(drive)
+        np.savez(path, **{**arrays, "reward": np.full_like(arrays["reward"], -0.1)})
+
+
+def test_the_same_model_loses_the_road_as_often_on_the_same_drives(tmp_path):
+    layout = Layout(tmp_path / "data")
+    figures = gate(layout, find_bundle("tiny").path, gate_drives=0, gate_losses=4)
+    assert figures["kept"]
+    assert Controller.load(layout.moved(2)).bundle == find_bundle("tiny").sha256
     assert figures["new"] == figures["old"]
     assert abs(figures["old"]["loses"]["value"]) <= 1
 
@@ -219,6 +237,7 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
             "--mdnrnn-flags: --z-factor must be from",
         ),
         (("--local", 0), "nobody would score"),
+        (("--go-on", "--run-flags", "--generations 1 --variant feedback=last"), "--go-on fits a controller"),
     ],
 )
 def test_what_could_not_work_is_refused_before_anything_is_driven(processes, flags, said):
@@ -243,7 +262,7 @@ BEGUN = {
     Phase(2, "take"): "rounds/02", Phase(2, "drive"): "episodes/000004.npz",
     Phase(2, "vae"): "rounds/02/vae.safetensors", Phase(2, "encode"): "encoded/000003.npz",
     Phase(2, "mdnrnn"): "rounds/02/mdnrnn.safetensors", Phase(2, "bundle"): "rounds/02/logs/mdnrnn.log",
-    Phase(2, "gate"): "rounds/02/moved.npz", Phase(2, "evolve"): "runs/round-02/journal.sqlite",
+    Phase(2, "gate"): "rounds/02/logs/bundle.log", Phase(2, "evolve"): "runs/round-02/journal.sqlite",
 }  # fmt: skip
 
 

@@ -75,7 +75,7 @@ def inspect(
             on_section(len(sections), section.name)
             if section.picture is not None:
                 (out / f"{section.name}.png").write_bytes(section.picture)
-        (out / PAGE).write_text(_page(subject, trained, sections).html())
+        (out / PAGE).write_text(_page(subject, trained, sections).html(), encoding="utf-8", errors="replace")
     except OSError as error:
         raise DatasetError(f"cannot write in {out}: {error.strerror}; choose another --out") from error
     return out / PAGE

@@ -51,6 +51,8 @@ def compare(
     if len(begun) < 2:
         raise UsageError(f"dreams are held to two drives at least that keep to the road for {SHORTEST} steps")
     imagination = Imagination(bundle, controller, temperature, dreams)
+    if begun[0].drive.truth.keys() <= {OFF}:
+        raise UsageError("the world's truth tells nothing that dreams could be held to")
     names = [name for name in begun[0].drive.truth if name != OFF]
     truths = [np.stack([each.drive.truth[name][each.steps] for name in names], axis=1) for each in begun]
     foreseen = [imagination.foresee(each.drive)[0][each.steps] for each in begun]
@@ -61,8 +63,12 @@ def compare(
         probe = LinearProbe.fit(*(np.concatenate([each[row] for row in rest]) for each in (foreseen, truths)))
         for row in fold:
             dreamt = _going(imagination.dream(begun[row], own=True)[0])
+            if not len(dreamt):
+                continue
             told = {"reality": truths[row], "foreseen": probe.predict(foreseen[row]), "dream": probe.predict(dreamt)}
             shares.append({where: (np.abs(values) > rare).mean(axis=0) for where, values in told.items()})
+    if len(shares) < 2:
+        raise UsageError("the dreams of all drives but one end as they begin: nothing of them can be told")
     found = {where: np.stack([each[where] for each in shares], axis=1) for where in shares[0]}
     return [
         Alike(name, float(rare[row]), {where: Estimate.of(list(each[row])) for where, each in found.items()})

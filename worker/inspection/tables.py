@@ -67,7 +67,7 @@ def measured_rows(told: Any) -> Iterator[tuple[str, str]]:
 
     Whatever else a manifest holds there tells nothing.
     """
-    with suppress(KeyError, TypeError, ValueError, AttributeError):
+    with suppress(KeyError, TypeError, ValueError, AttributeError, OverflowError):
         for each in told.get("probe", {}).get("known", ()):
             yield f"R² of {each['quantity']}, linear on [z, h]", _estimate(each["found"]["zh_linear"])
         for each in told.get("losses", {}).get("begun", ()):

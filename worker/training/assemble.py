@@ -6,6 +6,7 @@ import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,7 @@ def assemble(
 
     `measured` are figures that `inspect --json` told of the same bundle without them; `DatasetError` if of another.
     """
+    told = [(path, *_figures(path)) for path in measured]
     vae = load_weights(folder / train_vae.CHECKPOINT)
     rnn = load_weights(folder / train_mdnrnn.CHECKPOINT)
     configs = (
@@ -105,27 +107,31 @@ def assemble(
         parts[WEIGHTS] = save(
             tensors, {"vae": json.dumps(written(configs[0])), "mdnrnn": json.dumps(written(configs[1]))}
         )
-    bundle = write_bundle(out, manifest(name, provenance, *configs), parts)
-    if not measured:
-        return bundle
-    provenance["measured"] = [_figures(path, bundle) for path in measured]
+    if told:
+        with TemporaryDirectory() as aside:
+            bare = write_bundle(Path(aside) / out.name, manifest(name, provenance, *configs), parts).sha256
+        for path, of, _ in told:
+            if of != bare:
+                raise DatasetError(
+                    f"{path} was measured of the world model {str(of)[:12]}..., and this folder makes {bare[:12]}...: "
+                    "bundle that without --measured, and measure it"
+                )
+        provenance["measured"] = [figures for *_, figures in told]
     return write_bundle(out, manifest(name, provenance, *configs), parts)
 
 
-def _figures(path: Path, bundle: Bundle) -> dict[str, Any]:
-    """What `inspect --json` told of this bundle."""
+def _figures(path: Path) -> tuple[object, dict[str, Any]]:
+    """Of which bundle `inspect --json` told figures, and these."""
     try:
         told = json.loads(read_regular(path, MOST_FIGURES))
         figures = {name: told[name] for name in MEASURED if name in told}
-        measured, circumstances = told["bundle"], {name: told[name] for name in CIRCUMSTANCES}
+        circumstances = {name: told[name] for name in CIRCUMSTANCES}
+        json.dumps(figures | circumstances, allow_nan=False)
+        if not figures:
+            raise ValueError(f"none of {', '.join(MEASURED)}")
+        return told["bundle"], circumstances | figures
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(f"{path} holds no figures of `inspect BUNDLE --probe --json` ({error})") from error
-    if measured != bundle.sha256:
-        raise DatasetError(
-            f"{path} was measured of the world model {str(measured)[:12]}..., and this folder makes "
-            f"{bundle.sha256[:12]}..., which {bundle.path} now holds: measure that"
-        )
-    return circumstances | figures
 
 
 def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED) -> Manifest:

@@ -120,8 +120,8 @@ def refit(
 
     It is left as it is where that one sees and remembers as its own does, to the bit.
 
-    `ControllerError` if the two worlds or their pictures differ, or if it looks at its own last choices;
-    `DatasetError` if the drives have other pictures or are damaged; `UsageError` if none of them keeps to its road.
+    `ControllerError` if the two worlds or their pictures differ; `DatasetError` if the drives have other pictures or
+    actions or are damaged; `UsageError` if it looks at its own last choices, or if none of them keeps to its road.
     """
     if all(own.read(part) == bundle.read(part) for part in (ENCODER, DREAM)):
         return Refit(replace(controller, bundle=bundle.sha256), 0, 0, ())
@@ -132,7 +132,7 @@ def refit(
     same_eyes = own.read(ENCODER) == bundle.read(ENCODER)
     (weights, biases), *above = controller.shape.unpack(controller.parameters)
     kept: list[Sums | None] = [None, None]  # of the drives that it is fitted to, and of the others
-    for first, drives in _followed(paths):
+    for first, drives in _followed(paths, own.manifest.actions):
         latent = old.see(drives)
         before, after = old.features(drives, latent), new.features(drives, latent if same_eyes else new.see(drives))
         for row, drive in enumerate(drives):
@@ -181,21 +181,23 @@ def _check(controller: Controller, own: Bundle, bundle: Bundle, paths: Sequence[
             f"{sees[1][0]}: no drive shows both"
         )
     if controller.variant.seen:
-        raise ControllerError("it looks at its own last choices, which no recorded drive holds: it cannot be refitted")
+        raise UsageError("it looks at its own last choices, which no recorded drive holds: it cannot be refitted")
     check_whole(paths, "picture", "preprocessing", "action", "reward", "ended")
     for path in paths:
         if (found := preprocessing_of(path)) != sees[0][1]:
             raise DatasetError(f"{path} holds pictures {found!r}, and the controller sees {sees[0][1]!r}")
 
 
-def _followed(paths: Sequence[Path]) -> Iterator[tuple[int, list[Drive]]]:
+def _followed(paths: Sequence[Path], actions: int) -> Iterator[tuple[int, list[Drive]]]:
     """The drives, few at a time, with the number of the first of them."""
     for first in range(0, len(paths), TOGETHER):
-        yield first, [_load(path) for path in paths[first : first + TOGETHER]]
+        yield first, [_load(path, actions) for path in paths[first : first + TOGETHER]]
 
 
-def _load(path: Path) -> Drive:
+def _load(path: Path, actions: int) -> Drive:
     steps, pictures = load_steps(path), load_pictures(path)
     if len(pictures) != len(steps["reward"]):
         raise DatasetError(f"{path} holds {len(pictures)} pictures and another number of actions; delete it")
+    if steps["action"].shape[1] != actions or not all(np.isfinite(steps[name]).all() for name in ("action", "reward")):
+        raise DatasetError(f"{path} holds other actions than {actions} numbers a step, or NaN or infinity; delete it")
     return Drive(pictures, steps["action"], steps["reward"])

@@ -8,6 +8,7 @@ from pathlib import Path
 from dreamfleet.common.bundle import MOST_RECORDED
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.saving import check_out
 
 SUMMARY = "freeze a trained world model into one file that workers fetch by its hash"
 EXTRAS = ("train",)
@@ -36,6 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
     if not 0 <= args.recorded <= MOST_RECORDED:
         raise UsageError(f"--recorded must be from 0 to {MOST_RECORDED}, not {args.recorded}")
+    check_out(args.out)
     bundle = assemble(
         args.data, args.out, args.out.stem, with_weights=args.with_weights, recorded=args.recorded,
         measured=args.measured,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.saving import check_out, told
 from dreamfleet.common.site import offer
 from dreamfleet.common.threads import pin_thread_pools
 
@@ -35,6 +36,7 @@ def run(args: argparse.Namespace) -> int:
     pin_thread_pools()  # of NumPy, which is not loaded yet
     if args.episodes < 2:
         raise UsageError(f"--episodes must be at least 2, not {args.episodes}")
+    check_out(args.out)
     from dreamfleet.common.bundle import find_bundle
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.common.shelf import bundle_for, find_controller
@@ -44,10 +46,13 @@ def run(args: argparse.Namespace) -> int:
     own = bundle_for(controller, args.bundle, beside)
     if own is None:
         raise UsageError(f"controller {args.controller} sees no world model: give one that was evolved with one")
+    if own.sha256 != controller.bundle:
+        raise UsageError(f"--bundle {args.bundle} is not the world model that {args.controller} was evolved with")
     paths = last_drives(args.data, args.episodes)
     with progress_bar("refit", len(paths), "drives") as bar:
         fitted = refit(controller, own, find_bundle(args.to), paths, bar.move)
-    fitted.controller.save(args.out)
+    with told(args.out):
+        fitted.controller.save(args.out)
     r_squared = [None if math.isnan(each) else round(each, 4) for each in fitted.r_squared]
     spoken = ", ".join("-" if each is None else f"{each:.2f}" for each in r_squared)
     text = f"{args.out}: fitted on {fitted.steps} steps of {fitted.drives} drives; R² on held-out ones {spoken}"

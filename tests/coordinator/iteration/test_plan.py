@@ -44,6 +44,12 @@ def test_what_comes_next_follows_from_what_is_finished():
     assert Plan(IterateConfig(rounds=1)).next(finished) is None
 
 
+def test_a_round_whose_evolution_is_finished_gets_no_gate_behind_it():
+    before = Plan(IterateConfig(rounds=2, gate_drives=0, gate_losses=0))
+    finished = [*before.phases(1), *before.phases(2)]
+    assert Plan(IterateConfig(rounds=2)).next(finished) is None
+
+
 def test_a_phase_done_again_takes_all_behind_it_along_and_what_was_begun():
     plan = Plan(IterateConfig(rounds=2))
     finished = [*plan.phases(1), *plan.phases(2)[:2]]

@@ -134,6 +134,12 @@ def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
         likeness.compare(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
 
 
+def test_dreams_that_all_end_as_they_begin_tell_nothing(drives, tiny, controller, monkeypatch):
+    monkeypatch.setattr(likeness, "_going", lambda features: features[0, :0])
+    with pytest.raises(UsageError, match="end as they begin"):
+        likeness.compare(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
+
+
 def test_steps_behind_a_dreams_end_do_not_count():
     features = np.arange(24.0).reshape(2, 4, 3)
     features[1, 2:] = features[1, 1]

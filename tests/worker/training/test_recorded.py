@@ -174,11 +174,14 @@ def test_figures_that_were_measured_stay_with_the_bundle(trained, tmp_path, caps
     assert rows["road lost in dreams begun 40 steps before"] == "0.60 ± 0.07"
     for content, said in (
         (json.dumps({"bundle": "0" * 64, **FIGURES}), "was measured of the world model 000000000000"),
+        (json.dumps({"bundle": bare, **FIGURES, "noise": float("nan")}), "holds no figures"),
+        (json.dumps({"bundle": bare, "driver": "", "noise": 0, "first_seed": 0}), "holds no figures"),
         ("{}", "holds no figures"), ("[" * 100_000, "holds no figures"), ("", "holds no figures"),
     ):  # fmt: skip
         told.write_text(content)
         with pytest.raises(DatasetError, match=said):
             call(capsys, folder, "--measured", str(told))
+        assert Bundle.open(folder / "b.zip").sha256 == bundle.sha256
 
 
 @pytest.mark.parametrize("told", [7, [7], [{"probe": 7}], [{"probe": {"known": [{"quantity": 1}]}}]])

@@ -110,7 +110,7 @@ def test_steps_behind_a_loss_of_the_road_are_left_out():
 
 def test_what_cannot_be_fitted_is_refused(bundles, drives, folder, tmp_path):
     old, new = bundles
-    with pytest.raises(ControllerError, match="looks at its own last choices"):
+    with pytest.raises(UsageError, match="looks at its own last choices"):
         refit(controller(old, variant=Variant(feedback="last")), old, new, drives, ignore)
     wide = write_random_bundle(tmp_path / "wide.zip", 1, VAEConfig(latent=4, picture=96, channels=(2, 2, 2, 2)), MEMORY)
     with pytest.raises(ControllerError, match="no drive shows both"):
@@ -124,6 +124,10 @@ def test_what_cannot_be_fitted_is_refused(bundles, drives, folder, tmp_path):
     np.savez(lost, **{**arrays, "reward": np.full_like(arrays["reward"], -0.1)})
     with pytest.raises(UsageError, match="none of the 1 drives keeps to its road"):
         refit(controller(old), old, new, [lost], ignore)
+    for action in (arrays["action"][:, :2], np.full_like(arrays["action"], np.nan)):
+        np.savez(lost, **{**arrays, "action": action})
+        with pytest.raises(DatasetError, match="other actions than 3 numbers a step, or NaN"):
+            refit(controller(old), old, new, [lost], ignore)
     np.savez(lost, **{**arrays, "picture": arrays["picture"][1:]})
     with pytest.raises(DatasetError, match="another number of actions"):
         refit(controller(old), old, new, [lost], ignore)
@@ -146,3 +150,7 @@ def test_the_verb_writes_a_controller_of_the_other_model(bundles, drives, folder
     assert len(told["r_squared"]) == 3
     with pytest.raises(UsageError, match="--episodes must be at least 2"):
         call(tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 1)
+    with pytest.raises(UsageError, match="is a folder"):
+        call(tmp_path / "before.npz", "--to", new.path, *flags, "--out", tmp_path)
+    with pytest.raises(UsageError, match="is not the world model that"):
+        call(tmp_path / "before.npz", "--to", new.path, *flags, "--bundle", new.path)
