@@ -1,4 +1,7 @@
-"""Which moments of recorded drives a bundle keeps for dreams to begin at. Pure: rewards and chance in, steps out."""
+"""Moments of recorded drives: losses of the road, and which a bundle keeps for dreams to begin at.
+
+Pure: rewards and chance in, steps out.
+"""
 
 from __future__ import annotations
 
@@ -43,6 +46,14 @@ def losses(rewards: Floats) -> list[int]:
     paid = np.flatnonzero(rewards > 0)
     unpaid = np.diff(paid, append=len(rewards)) - 1
     return [int(step) + 1 for step in paid[unpaid >= LASTING]]
+
+
+def on_the_way(reward: Floats) -> NDArray[np.bool_]:
+    """The steps of a drive `(T,)` that another reward follows before the road counts as lost."""
+    steps = np.arange(len(reward))
+    paid = np.where(reward > 0, steps, 2 * len(reward) + LASTING)
+    following = np.minimum.accumulate(paid[::-1])[::-1]
+    return np.asarray(following - steps < LASTING)
 
 
 def draw_moments(drives: Sequence[Floats], count: int, random: np.random.Generator) -> Moments:

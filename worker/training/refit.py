@@ -19,7 +19,7 @@ from dreamfleet.common.bundle import DREAM, ENCODER, Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
 from dreamfleet.worker.training.dataset import check_whole, episodes, load_pictures, load_steps, pad, preprocessing_of
-from dreamfleet.worker.training.moments import LASTING
+from dreamfleet.worker.training.moments import on_the_way
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, RewardLabel
 
 RIDGE = 0.01  # against the mean square of a feature, which is below 1 for h and about 1 for what z tells
@@ -159,14 +159,6 @@ def refit(
 def last_drives(folder: Path, count: int) -> list[Path]:
     """A folder's last drives, so many at most; those of controllers lie behind random ones."""
     return episodes(folder)[-count:]
-
-
-def on_the_way(reward: Floats) -> NDArray[np.bool_]:
-    """The steps of a drive `(T,)` that another reward follows before the road counts as lost."""
-    steps = np.arange(len(reward))
-    paid = np.where(reward > 0, steps, 2 * len(reward) + LASTING)
-    following = np.minimum.accumulate(paid[::-1])[::-1]
-    return np.asarray(following - steps < LASTING)
 
 
 def _sees(controller: Controller, own: Bundle) -> str:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dreamfleet.worker.training.moments import FIRST, LASTING, Moment, draw_moments, losses
+from dreamfleet.worker.training.moments import FIRST, LASTING, Moment, draw_moments, losses, on_the_way
 
 
 def drive(steps, *paid):
@@ -67,3 +67,10 @@ def test_no_moment_is_drawn_twice_or_of_the_first_steps_and_all_may_be():
 def test_they_follow_from_the_seed():
     drives = [drive(200, *range(80)), drive(90)]
     assert drawn(drives, 20, seed=1) == drawn(drives, 20, seed=1) != drawn(drives, 20, seed=2)
+
+
+def test_steps_behind_a_loss_of_the_road_are_left_out():
+    reward = np.full(100, -0.1, np.float32)
+    reward[[3, 30, 90]] = 3
+    assert np.flatnonzero(~on_the_way(reward)).tolist() == [*range(31, 51), *range(91, 100)]
+    assert not on_the_way(np.full(5, -0.1, np.float32)).any()

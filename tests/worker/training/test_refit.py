@@ -11,7 +11,7 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
 from dreamfleet.common.variants import PLAIN, Variant
-from dreamfleet.worker.training.refit import Drive, Onlooker, Sums, on_the_way, refit
+from dreamfleet.worker.training.refit import Drive, Onlooker, Sums, refit
 from dreamfleet.worker.verbs import refit as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -99,13 +99,6 @@ def test_least_squares_find_a_map_and_tell_how_much_it_explains():
     assert np.allclose(parts.r_squared(solved), [1, 1 - left.var() / targets[:, 1].var()])
     assert np.abs(parts.solve(1)[:3]).sum() < np.abs(solved[:3]).sum()
     assert np.isnan(Sums.of(inputs, np.ones((200, 1))).r_squared(np.zeros((4, 1)))).all()
-
-
-def test_steps_behind_a_loss_of_the_road_are_left_out():
-    reward = np.full(100, -0.1, np.float32)
-    reward[[3, 30, 90]] = 3
-    assert np.flatnonzero(~on_the_way(reward)).tolist() == [*range(31, 51), *range(91, 100)]
-    assert not on_the_way(np.full(5, -0.1, np.float32)).any()
 
 
 def test_what_cannot_be_fitted_is_refused(bundles, drives, folder, tmp_path):
