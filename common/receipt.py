@@ -63,6 +63,7 @@ class Receipt:
     versions: dict[str, str] | None = field(default=None, metadata=OPTIONAL)  # of what the coordinator computed with
     # The first validation seed, and how many, of each evaluation and of the confirmation.
     seeds: dict[str, tuple[int, ...]] | None = field(default=None, metadata=OPTIONAL)
+    subspace: str | None = field(default=None, metadata=OPTIONAL)  # that the search kept to, whole, as a journal has it
 
     @property
     def total(self) -> Effort:

@@ -30,6 +30,7 @@ class Stage:
     racing: bool
     search: int  # number of the stage that began the search which goes on in this one
     end: StageSettings
+    whole: bool = True  # whether the search goes through all parameters, not in the run's subspace
 
     @property
     def anew(self) -> bool:
@@ -51,6 +52,7 @@ class Stage:
         patience = f", patience {self.patience}" if self.patience else ""
         search = f"a new search with step size {self.sigma0:g}" if self.anew else "the search goes on"
         raced = ", racing" if self.racing else ""
+        search += "" if self.whole else " in the subspace"
         return f"{self.horizon} steps{patience}, {self.population} x {self.episodes} episodes{raced}, {search}"
 
     def spec(self, own: TaskSpec) -> TaskSpec:
@@ -73,7 +75,7 @@ def stages_of(settings: RunSettings) -> tuple[Stage, ...]:
     found = [
         Stage(
             1, spec.horizon, spec.patience, settings.episodes, settings.population, settings.sigma0, settings.racing,
-            search=1, end=settings.stages[0].end if settings.stages else StageSettings(),
+            search=1, end=settings.stages[0].end if settings.stages else StageSettings(), whole=not settings.subspace,
         )
     ]  # fmt: skip
     for each in settings.stages[1:]:
@@ -84,9 +86,10 @@ def stages_of(settings: RunSettings) -> tuple[Stage, ...]:
 def _after(before: Stage, each: StageSettings) -> Stage:
     named: dict[str, Any] = {name: getattr(before, name) for name in ("horizon", "patience", "episodes", "racing")}
     named |= {"population": before.population, "sigma0": before.sigma0, **each.named}
-    anew = each.sigma0 is not None or named["population"] != before.population
+    whole = before.whole or each.whole
+    anew = each.sigma0 is not None or named["population"] != before.population or whole != before.whole
     number = before.number + 1
-    return Stage(number, **named, search=number if anew else before.search, end=each.end)
+    return Stage(number, **named, search=number if anew else before.search, end=each.end, whole=whole)
 
 
 def begun_stages(

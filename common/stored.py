@@ -35,6 +35,7 @@ class StageSettings:
     population: Population | None = field(default=None, metadata=OPTIONAL)
     sigma0: float | None = field(default=None, metadata=OPTIONAL)
     racing: bool | None = field(default=None, metadata=OPTIONAL)
+    whole: bool = field(default=False, metadata=OPTIONAL)  # from here on the search leaves the run's subspace
 
     @property
     def named(self) -> dict[str, Any]:
@@ -81,6 +82,7 @@ class RunSettings:
     optimiser_options: tuple[str, ...] = field(default=(), metadata=OPTIONAL)  # each as name=value
     # Fresh tracks on which the reported mean is driven as the run ends; 0: never, as in runs from before this.
     confirm_episodes: Annotated[int, Between(0, 10**4)] = field(default=0, metadata=OPTIONAL)
+    subspace: str = field(default="", metadata=OPTIONAL)  # SHA-256 of the one that the search keeps to; empty: none
     # Of a schedule; all of the above is the first one's, which names nothing itself. The last one has no end.
     stages: Annotated[tuple[StageSettings, ...], Length(0, MOST_STAGES)] = field(default=(), metadata=OPTIONAL)
 

@@ -21,12 +21,16 @@ _LIMITS = Limits(1 << 30, members=4096)  # bytes: more than SQLite keeps in one 
 
 @dataclass(frozen=True)
 class Head:
-    """Which optimiser wrote a state with what installed, its mean `(dimension,)` and its step size."""
+    """Which optimiser wrote a state with what installed, its mean `(dimension,)` and its step size.
+
+    A search in a subspace has an origin `(dimension,)` too, from which its coordinates count.
+    """
 
     name: str
     requirement: str
     mean: NDArray[np.float64]
     sigma: float
+    origin: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Checkpoint:
 
     def packed(self) -> bytes:
         """As one `.npz`."""
-        head = {PREFIX + name: np.array(value) for name, value in vars(self.head).items()}
+        head = {PREFIX + name: np.array(value) for name, value in vars(self.head).items() if value is not None}
         buffer = io.BytesIO()
         np.savez(buffer, **self.state, **head)  # type: ignore[arg-type]
         return buffer.getvalue()
@@ -58,7 +62,7 @@ class Checkpoint:
         if not head:
             return cls(_first_head(arrays), arrays)
         name, requirement, mean, sigma = (head[PREFIX + each] for each in ("name", "requirement", "mean", "sigma"))
-        return cls(Head(str(name), str(requirement), mean, float(sigma)), arrays)
+        return cls(Head(str(name), str(requirement), mean, float(sigma), head.get(PREFIX + "origin")), arrays)
 
 
 def _first_head(arrays: State) -> Head:

@@ -19,11 +19,12 @@ from dreamfleet.common.messages import COLDEST, HOTTEST, MAX_OPTIONS, TaskSpec
 from dreamfleet.common.presets import check_preset, preset_help
 from dreamfleet.common.stages import Stage, stages_of
 from dreamfleet.common.stored import NAMED, RunSettings, StageSettings
+from dreamfleet.common.subspace import Subspace
 from dreamfleet.common.tasks import GYM, check_task, describe_task, describes_itself
 from dreamfleet.common.variants import WORLD, Variant
 from dreamfleet.coordinator.schedule import check_schedule, unfold
 
-DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
+DEFAULT_BUNDLE, NO_BUNDLE, NO_SUBSPACE = "tiny", "none", "none"
 DREAM = "dream"
 
 
@@ -65,6 +66,11 @@ class RunConfig:
     optimiser: str = option("cma", "what asks for candidates: cma, cmaes-lra, cmaes-sep, or yours as module:attribute")
     optimiser_options: tuple[str, ...] = option((), "the optimiser's own options, each as name=value")
     covariance: Literal["diagonal", "full"] = option("diagonal", "the model of CMA-ES; an option of cma")
+    subspace: str | None = option(
+        None,
+        "a file of `dreamfleet subspace`: the search changes what controllers make of these few features alone, from "
+        "where it begins; none: everything",
+    )
     racing: bool = option(False, "let only the better half of the candidates drive the second half of the episodes")
     horizon: int = option(1000, "steps of a scored episode at most")
     patience: int = option(0, "cut a scored episode after so many steps without reward; 0: never")
@@ -94,6 +100,7 @@ class RunConfig:
         "patience, episodes, population, sigma0 and racing (docs/operations.md); none: no stages",
     )
     stages: tuple[StageSettings, ...] = ()  # what the schedule, or the configuration file, holds
+    searched: Subspace | None = None  # what that file holds
 
     def __post_init__(self) -> None:
         for name, (least, most) in BOUNDS.items():
@@ -135,6 +142,8 @@ class RunConfig:
                 own = replace(self, **named, stages=stages)
             return own.settings(bundle)
         spec, shape, packages = self._described() if bundle is None else self._on(bundle)
+        if self.searched is not None:
+            _check_subspace(self.searched, spec, shape)
         settings = RunSettings(
             task=spec,
             packages=packages,
@@ -154,6 +163,7 @@ class RunConfig:
             heat=self.heat,
             optimiser=self.optimiser,
             optimiser_options=tuple(filter(None, self.optimiser_options)),
+            subspace="" if self.searched is None else self.searched.sha256,
             stages=self.stages,
         )
         check_schedule(settings)
@@ -161,7 +171,7 @@ class RunConfig:
             with _of_stage(stage.number if self.stages else None):
                 replace(self, **{name: getattr(stage, name) for name in NAMED})  # which looks at each value
                 if stage.anew:
-                    _try_optimiser(settings, stage)
+                    _try_optimiser(settings, stage, self.searched)
         return settings
 
     @property
@@ -275,16 +285,26 @@ def _of_stage(number: int | None) -> Iterator[None]:
         raise error if number is None else UsageError(f"stage {number}: {error}") from error
 
 
-def _try_optimiser(settings: RunSettings, stage: Stage) -> None:
+def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape) -> None:
+    """`UsageError` for one of another world model, or of controllers that see something else."""
+    if subspace.bundle != spec.bundle:
+        own = f"world model {spec.bundle[:12]}" if spec.bundle else "a task without a world model"
+        raise UsageError(f"--subspace is of world model {subspace.bundle[:12]}, and the run is on {own}")
+    if (inputs := subspace.weights.shape[1]) != shape.features:
+        raise UsageError(f"--subspace is of controllers that see {inputs} numbers, and this run's see {shape.features}")
+
+
+def _try_optimiser(settings: RunSettings, stage: Stage, subspace: Subspace | None) -> None:
     """Build the run's optimiser once, so that what it cannot do is said before there is a run."""
     from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig  # heavy: `--help` reads this module too
 
-    Evolution(EvolutionConfig.of(settings, stage))
+    Evolution(EvolutionConfig.of(settings, stage, subspace))
 
 
 def settings_of(run: RunSettings, bundle: Path) -> dict[str, Any]:
     """The settings of a run as they would be configured; `bundle` is where its copy of the world model lies."""
     frozen = {each.name: getattr(run, each.name) for each in fields(RunConfig) if hasattr(run, each.name)}
+    del frozen["subspace"]  # its hash there, where a file is named here
     spec, hidden = run.task, run.controller.hidden
     frozen |= {"controller": "hidden", "hidden_units": hidden} if hidden else {"controller": "linear"}
     frozen |= {name: getattr(spec, name) for name in ("task", "horizon", "patience", "temperature", "recorded")}

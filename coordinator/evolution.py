@@ -14,6 +14,7 @@ from dreamfleet.common.printable import one_line
 from dreamfleet.common.seeds import search_seed
 from dreamfleet.common.stages import Stage
 from dreamfleet.common.stored import RunSettings
+from dreamfleet.common.subspace import SearchSpace, Subspace
 from dreamfleet.coordinator.checkpoint import PREFIX, Checkpoint, Head
 from dreamfleet.coordinator.optimisers.api import Search
 from dreamfleet.coordinator.optimisers.registry import build_optimiser
@@ -32,6 +33,7 @@ class EvolutionConfig:
     seed: int
     optimiser: str = "cma"
     optimiser_options: tuple[str, ...] = ()  # each as name=value
+    space: SearchSpace | None = None  # what the search keeps to; `None`: all parameters
 
     def __post_init__(self) -> None:
         if self.population < 2:
@@ -40,8 +42,8 @@ class EvolutionConfig:
             raise UsageError(f"sigma0 must be a positive number, not {self.sigma0}")
 
     @classmethod
-    def of(cls, settings: RunSettings, stage: Stage) -> EvolutionConfig:
-        """As a run's settings say for the search that goes on in this stage."""
+    def of(cls, settings: RunSettings, stage: Stage, subspace: Subspace | None = None) -> EvolutionConfig:
+        """As a run's settings say for the search that goes on in this stage; `subspace` is the run's."""
         return cls(
             settings.controller.size,
             stage.population,
@@ -50,11 +52,12 @@ class EvolutionConfig:
             search_seed(settings.seed, stage.search),
             settings.optimiser,
             settings.optimiser_options,
+            None if subspace is None or stage.whole else SearchSpace(subspace, settings.controller),
         )
 
-    def search(self, start: NDArray[np.float64] | None = None) -> Search:
-        """What the optimiser is built from; it begins at zero without a `start` `(dimension,)`."""
-        mean = np.zeros(self.dimension) if start is None else np.asarray(start, dtype=np.float64)
+    def search(self, start: NDArray[np.float64]) -> Search:
+        """What the optimiser is built from, to begin at `start` `(dimension,)`: of a subspace at its origin."""
+        mean = start if self.space is None else np.zeros(self.space.dimension)
         # It is a setting of its own, older than options; its default is none, so that every optimiser takes it.
         covariance = () if self.covariance == "diagonal" else (f"covariance={self.covariance}",)
         options = _options([*self.optimiser_options, *covariance])
@@ -71,25 +74,28 @@ class Evolution:
 
     def __init__(self, config: EvolutionConfig, start: NDArray[np.float64] | None = None) -> None:
         self._config = config
-        self._optimiser = build_optimiser(config.optimiser, config.search(start))
+        self._origin = np.zeros(config.dimension) if start is None else np.asarray(start, dtype=np.float64)
+        self._optimiser = build_optimiser(config.optimiser, config.search(self._origin))
         self._is_open = False  # asked, and not yet told
 
     @property
     def mean(self) -> NDArray[np.float64]:
         """The best guess `(dimension,)`."""
-        return np.array(self._optimiser.mean, dtype=np.float64)
+        return self._lifted(np.array(self._optimiser.mean, dtype=np.float64))
 
     @property
     def sigma(self) -> float:
-        """The overall step size."""
+        """The overall step size, of a search in a subspace in its coordinates."""
         return float(self._optimiser.sigma)
 
     def ask(self) -> NDArray[np.float64]:
         """The next population `(population, dimension)`; `DreamfleetError` if the optimiser breaks its contract."""
         asked = np.asarray(self._optimiser.ask(), dtype=np.float64)
-        wanted = self._config.population, self._config.dimension
+        space = self._config.space
+        wanted = self._config.population, self._config.dimension if space is None else space.dimension
         if asked.shape != wanted:
             raise DreamfleetError(f"optimiser {self._config.optimiser!r} asked for {asked.shape} numbers, not {wanted}")
+        asked = self._lifted(asked)
         with np.errstate(over="ignore"):
             travels = np.isfinite(asked.astype(np.float32)).all() and np.isfinite(self.sigma)
         if not travels:
@@ -121,7 +127,14 @@ class Evolution:
                 f"optimiser {self._config.optimiser!r} has a state that cannot be kept, in {', '.join(unfit)}: arrays "
                 f"hold numbers or text, and names that begin with {PREFIX!r} are taken"
             )
-        return Checkpoint(Head(self._config.optimiser, self._optimiser.requirement, self.mean, self.sigma), state)
+        origin = None if self._config.space is None else self._origin
+        head = Head(self._config.optimiser, self._optimiser.requirement, self.mean, self.sigma, origin)
+        return Checkpoint(head, state)
+
+    def _lifted(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The parameters `(..., dimension)` that what the optimiser knows of stands for."""
+        space = self._config.space
+        return coordinates if space is None else space.lift(self._origin, coordinates)
 
     def restore(self, state: bytes) -> None:
         """Continue from a packed `state` of an equal configuration; `JournalError` if another optimiser wrote it."""
@@ -133,6 +146,10 @@ class Evolution:
             raise JournalError(
                 f"this run was written with {head.requirement}: pip install {head.requirement} (now {requirement})"
             )
+        if self._config.space is not None:
+            if head.origin is None or head.origin.shape != self._origin.shape:
+                raise JournalError("the journal's last state is damaged (its subspace has no origin): restore it")
+            self._origin = head.origin.astype(np.float64)
         try:
             self._optimiser.restore(checkpoint.state)
         except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:

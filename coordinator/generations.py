@@ -17,7 +17,7 @@ from dreamfleet.coordinator.generation import Generation, Standing
 from dreamfleet.coordinator.history import History
 from dreamfleet.coordinator.jobs import travelling
 from dreamfleet.coordinator.journal import Journal, OpenGeneration
-from dreamfleet.coordinator.start import kept_start
+from dreamfleet.coordinator.start import SUBSPACE, kept_start, kept_subspace
 
 
 class Generations:
@@ -34,6 +34,7 @@ class Generations:
         self._settings = settings
         self._agenda = agenda
         self._evaluations = evaluations
+        self._subspace = kept_subspace(journal.fact(SUBSPACE), settings, journal.path)
         self._strategy = self._search(stages_of(settings)[0], kept_start(journal))
 
     @property
@@ -105,7 +106,7 @@ class Generations:
         return self._agenda.terms(number, self.history.rows, self._evaluations)
 
     def _search(self, stage: Stage, start: NDArray[np.float64] | None) -> Evolution:
-        return Evolution(EvolutionConfig.of(self._settings, stage), start)
+        return Evolution(EvolutionConfig.of(self._settings, stage, self._subspace), start)
 
     def _recall(self, stored: OpenGeneration, terms: Terms) -> Generation:
         generation = self._generation(stored.number, stored.vectors, stored.seeds, terms)

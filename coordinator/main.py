@@ -24,7 +24,7 @@ from dreamfleet.coordinator.kept import facts_of
 from dreamfleet.coordinator.run import Run
 from dreamfleet.coordinator.served import ServedBundle
 from dreamfleet.coordinator.service import Service
-from dreamfleet.coordinator.start import Start
+from dreamfleet.coordinator.start import SUBSPACE, Start
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,8 @@ def _open(request: RunRequest, folder: Path, settings: RunSettings, bundle: Bund
     facts = facts_of(request.limits, request.network)
     if request.config is not None:
         start = request.start.facts if request.start else {}
-        return Journal.create(folder, settings, bundle.path if bundle else None, {**facts, **start})
+        searched = {SUBSPACE: request.config.searched.text} if request.config.searched else {}
+        return Journal.create(folder, settings, bundle.path if bundle else None, {**facts, **start, **searched})
     journal = Journal(folder / JOURNAL)
     for name, text in facts.items():
         journal.set_fact(name, text)

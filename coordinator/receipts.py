@@ -10,7 +10,7 @@ from dreamfleet.common.receipt import Receipt, StartReceipt, validation_uses
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.journal import Journal
 from dreamfleet.coordinator.kept import NETWORK, is_mixed
-from dreamfleet.coordinator.start import EFFORT, MEAN, SOURCE, start_effort
+from dreamfleet.coordinator.start import EFFORT, MEAN, SOURCE, SUBSPACE, start_effort
 
 DECIDING = ("dreamfleet", "numpy", "cma", "cmaes")  # packages whose versions decide what is asked for
 
@@ -19,7 +19,7 @@ def draw_up(journal: Journal, settings: RunSettings, generations: int) -> Receip
     """The receipt of a run that has closed so many generations. It costs the same however long the run is."""
     return Receipt(
         generations, journal.effort, _start(journal), journal.fingerprint(), is_mixed(journal.fact(NETWORK)),
-        versions(), validation_uses(settings),
+        versions(), validation_uses(settings), journal.fact(SUBSPACE),
     )  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from dreamfleet.common.bundle import Bundle
@@ -13,6 +13,7 @@ from dreamfleet.common.files import is_there
 from dreamfleet.common.receipt import Receipt, receipt_of, settings_in
 from dreamfleet.common.runs import CONTROLLER, JOURNAL, RunFolder, open_run
 from dreamfleet.common.stored import RunSettings
+from dreamfleet.common.subspace import Subspace
 from dreamfleet.coordinator.config import LimitsConfig, RunConfig, settings_of
 from dreamfleet.coordinator.kept import kept_network
 from dreamfleet.coordinator.optimisers.registry import known_optimisers
@@ -66,6 +67,15 @@ class Repetition:
         kept, spec = self.receipt.start, self.settings.task
         return None if kept is None else Start(kept.vector, spec.bundle, kept.source, spec.options, kept.effort)
 
+    @property
+    def _subspace(self) -> Subspace | None:
+        """What the search kept to; `ControllerError` where the receipt holds another one than the settings name."""
+        try:
+            kept = self.receipt.subspace
+            return Subspace.of_text(kept) if kept is not None else None
+        except ValueError as error:
+            raise ControllerError(f"the subspace in the controller's receipt is damaged: {error}") from error
+
     def plan(self, folder: Path) -> tuple[RunConfig | None, Table]:
         """How to begin the run in a folder, or `None` and the network it had, where it was begun there before.
 
@@ -90,7 +100,7 @@ class Repetition:
 
     def _config(self) -> RunConfig:
         path = self.bundle.path if self.bundle is not None else Path()
-        config = RunConfig(**settings_of(self.settings, path))
+        config = replace(RunConfig(**settings_of(self.settings, path)), searched=self._subspace)
         made = config.settings(self.bundle)
         others = [each.name for each in fields(made) if getattr(made, each.name) != getattr(self.settings, each.name)]
         if others:

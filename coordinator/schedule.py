@@ -29,6 +29,7 @@ class StageConfig:
     population: int | None = option(None, "as --population; another one begins the search anew from the mean")
     sigma0: float | None = option(None, "as --sigma0; begins the search anew from the mean")
     racing: bool | None = option(None, "as --racing")
+    whole: bool = option(False, "true: from here on the search leaves the subspace, from the mean; it needs a sigma0")
 
     def __post_init__(self) -> None:
         for name in ("generations", "steps"):
@@ -77,6 +78,8 @@ def unfold(stages: tuple[StageSettings, ...]) -> tuple[dict[str, Any], tuple[Sta
     if not stages:
         return {}, ()
     first = stages[0]
+    if first.whole:
+        raise UsageError("stage 1: whole is of a later stage, which leaves the subspace; without --subspace all are")
     return first.named, (first.end, *stages[1:]) if first.ends or len(stages) > 1 else ()
 
 
@@ -89,6 +92,13 @@ def remaining(settings: RunSettings, stage: Stage) -> dict[str, Any]:
 def check_schedule(settings: RunSettings) -> None:
     """`UsageError` for a stage that never ends before the last one, or by what can never be reached."""
     stages = stages_of(settings)
+    for before, stage, each in zip(stages, stages[1:], settings.stages[1:], strict=False):
+        if each.whole and before.whole:
+            raise UsageError(f"stage {stage.number}: the search is whole already; leave that out, or give --subspace")
+        if each.whole and each.sigma0 is None:
+            raise UsageError(
+                f"stage {stage.number} leaves the subspace, where a step is something else: give it a sigma0"
+            )
     for stage in stages[:-1]:
         if not stage.end.ends:
             raise UsageError(

@@ -21,12 +21,14 @@ from dreamfleet.common.receipt import receipt_of
 from dreamfleet.common.runs import JOURNAL, RunFolder, open_run
 from dreamfleet.common.shelf import find_controller
 from dreamfleet.common.stored import RunSettings
+from dreamfleet.common.subspace import Subspace
 from dreamfleet.common.variants import Variant
 from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.config import RunConfig
 from dreamfleet.coordinator.journal import Journal
 
 SOURCE, MEAN, EFFORT = "start", "start_mean", "start_effort"  # the facts' names
+SUBSPACE = "subspace"
 
 
 @dataclass(frozen=True)
@@ -144,3 +146,16 @@ def kept_start(journal: Journal) -> NDArray[np.float64] | None:
         return np.frombuffer(base64.b64decode(kept, validate=True), dtype="<f8").astype(np.float64)
     except ValueError as error:
         raise JournalError(f"the start kept in {journal.path} is damaged: {error}; restore the folder") from error
+
+
+def kept_subspace(kept: str | None, settings: RunSettings, where: Path) -> Subspace | None:
+    """The subspace that a run's search keeps to, by the fact that is kept of it `where`; `None`: it has none."""
+    if not settings.subspace:
+        return None
+    try:
+        subspace = Subspace.of_text(kept or "")
+        if subspace.sha256 != settings.subspace:
+            raise ValueError("it is another one than the run's")
+    except ValueError as error:
+        raise JournalError(f"the subspace kept in {where} is damaged: {error}; restore the folder") from error
+    return subspace

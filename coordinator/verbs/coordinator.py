@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.config import Table, add_flags, given, load
@@ -16,7 +17,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.site import offer
 from dreamfleet.common.unblocked import unblock_stderr
-from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig, RunConfig, find_preset
+from dreamfleet.coordinator.config import NO_SUBSPACE, LimitsConfig, NetworkConfig, RunConfig, find_preset
 from dreamfleet.coordinator.schedule import find_schedule, unfold
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def serve(args: argparse.Namespace, base: Table, start: Start | None) -> int:
 
 def configured(args: argparse.Namespace, base: Table) -> tuple[RunConfig, LimitsConfig]:
     """What a new run is, and when it ends, as its flags, the environment and the file say."""
-    config = _scheduled(args, load(RunConfig, "run", base=base, preset=find_preset, **args.sources))
+    config = _searched(_scheduled(args, load(RunConfig, "run", base=base, preset=find_preset, **args.sources)))
     limits = load(LimitsConfig, "limits", **args.sources)
     _check_target(limits, config.evaluate_every)
     return config, limits
@@ -96,6 +97,15 @@ def _scheduled(args: argparse.Namespace, config: RunConfig) -> RunConfig:
     if twice:
         raise UsageError(f"--{twice[0]} and {twice[0]} of stage 1 are the same setting: leave one of them out")
     return replace(config, stages=found)
+
+
+def _searched(config: RunConfig) -> RunConfig:
+    """The configuration with the subspace that its file holds."""
+    from dreamfleet.common.subspace import Subspace
+
+    if config.subspace is None:
+        return config
+    return replace(config, searched=None if config.subspace == NO_SUBSPACE else Subspace.load(Path(config.subspace)))
 
 
 def _resume(args: argparse.Namespace) -> int:

@@ -19,11 +19,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the new run until it ends."""
+    from dreamfleet.common.errors import UsageError
     from dreamfleet.common.runs import open_run
     from dreamfleet.common.terms import terms_of
     from dreamfleet.coordinator.config import settings_of
     from dreamfleet.coordinator.schedule import remaining
-    from dreamfleet.coordinator.start import latest, start_of
+    from dreamfleet.coordinator.start import SUBSPACE, kept_subspace, latest, start_of
     from dreamfleet.coordinator.verbs.coordinator import serve
 
     with open_run(args.runs_dir, args.source) as stored:
@@ -31,9 +32,13 @@ def run(args: argparse.Namespace) -> int:
         terms = terms_of(stored, len(stored.history()))
         present = {**remaining(stored.settings, terms.stage), "sigma0": sigma, "temperature": terms.spec.temperature}
         settings = {**settings_of(stored.settings, stored.bundle_path), **present}
+        if not terms.stage.whole:
+            settings["searched"] = kept_subspace(stored.fact(SUBSPACE), stored.settings, stored.path)
     if {"environment", "normalise"} & args.given:
         settings.pop("task_options", None)  # described anew, and refused if that makes another world of it
     if "optimiser" in args.given and "optimiser_options" not in args.given:
         settings.pop("optimiser_options", None)  # they are the other one's
+    if "subspace" in args.given and "sigma0" not in args.given:
+        raise UsageError("--subspace makes a step something else than in the run: give --sigma0 too")
     args.run_name = args.run_name or f"{args.source}-fork"
     return serve(args, settings, start)

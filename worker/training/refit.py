@@ -132,7 +132,7 @@ def refit(
     same_eyes = own.read(ENCODER) == bundle.read(ENCODER)
     (weights, biases), *above = controller.shape.unpack(controller.parameters)
     kept: list[Sums | None] = [None, None]  # of the drives that it is fitted to, and of the others
-    for first, drives in _followed(paths, own.manifest.actions):
+    for first, drives in followed(paths, own.manifest.actions):
         latent = old.see(drives)
         before, after = old.features(drives, latent), new.features(drives, latent if same_eyes else new.see(drives))
         for row, drive in enumerate(drives):
@@ -174,13 +174,18 @@ def _check(controller: Controller, own: Bundle, bundle: Bundle, paths: Sequence[
         )
     if controller.variant.seen:
         raise UsageError("it looks at its own last choices, which no recorded drive holds: it cannot be refitted")
+    check_drives(paths, sees[0][1])
+
+
+def check_drives(paths: Sequence[Path], preprocessing: str) -> None:
+    """`DatasetError` for a drive that is not whole, or holds other pictures than a model of these sees."""
     check_whole(paths, "picture", "preprocessing", "action", "reward", "ended")
     for path in paths:
-        if (found := preprocessing_of(path)) != sees[0][1]:
-            raise DatasetError(f"{path} holds pictures {found!r}, and the controller sees {sees[0][1]!r}")
+        if (found := preprocessing_of(path)) != preprocessing:
+            raise DatasetError(f"{path} holds pictures {found!r}, and the world model sees {preprocessing!r}")
 
 
-def _followed(paths: Sequence[Path], actions: int) -> Iterator[tuple[int, list[Drive]]]:
+def followed(paths: Sequence[Path], actions: int) -> Iterator[tuple[int, list[Drive]]]:
     """The drives, few at a time, with the number of the first of them."""
     for first in range(0, len(paths), TOGETHER):
         yield first, [_load(path, actions) for path in paths[first : first + TOGETHER]]

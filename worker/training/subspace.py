@@ -1,0 +1,127 @@
+"""A subspace for a search: what a driver will do and earn, as far as a world model's [z, h] foretells it linearly.
+
+Recorded drives are their own teachers: for each moment, what was done in windows of the following steps, how large that
+was, and what was earned, are regressed on what the model saw and remembered before (ridge regression, in closed form).
+The few directions that foretell best something of that, such as how tightly the road is about to be steered, are the
+features. It is reduced-rank regression (Izenman 1975) with targets that say what the ranks mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.actions import Continuous
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.subspace import Subspace
+from dreamfleet.worker.tasks.api import World
+from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.training.moments import FIRST, on_the_way
+from dreamfleet.worker.training.refit import HELD_OUT, Drive, Onlooker, Sums, check_drives, followed
+
+RIDGE = 0.001  # against the mean square of a feature; see `refit`
+WINDOWS = ((0, 3), (3, 8), (8, 15), (15, 22), (22, 30), (30, 40))  # steps from now on, in which an action is asked for
+NEXT = (0, 5)
+EARNED = ((0, 6), (6, 20), (20, 40))  # and the reward
+LEAST = 0.05  # R² on held-out drives of what counts as foretold
+
+Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Found:
+    """The subspace, R² of each of its features on held-out drives; of how many drives and steps."""
+
+    subspace: Subspace
+    r_squared: tuple[float, ...]
+    drives: int
+    steps: int
+
+
+@dataclass(frozen=True)
+class Target:
+    """One thing to foretell: the mean of a column over a window of steps, or its size."""
+
+    name: str
+    column: int  # of actions; behind them the reward
+    window: tuple[int, int]
+    size: bool = False
+
+    def of(self, sums: Doubles) -> Doubles:
+        """At each step `(T,)` of a drive, by the running sums of its columns `(T + 1, columns)`; cut at its end."""
+        steps = len(sums) - 1
+        start, end = (np.minimum(np.arange(steps) + each, steps) for each in self.window)
+        mean: Doubles = (sums[end, self.column] - sums[start, self.column]) / (self.window[1] - self.window[0])
+        return np.abs(mean) if self.size else mean
+
+
+def targets_of(world: World, columns: int) -> list[Target]:
+    """What is asked for of so many actions: all windows of one that goes both ways, of others what comes next."""
+    actions, found = world.actions, []
+    for column in range(columns):
+        name = world.action_names[column] if column < len(world.action_names) else f"action {column + 1}"
+        both = isinstance(actions, Continuous) and actions.low[column] < 0 < actions.high[column]
+        windows = WINDOWS if both else (NEXT,)
+        found += [Target(_spoken(name, window), column, window) for window in windows]
+        found += [Target(_spoken(f"|{name}|", window), column, window, size=True) for window in windows if both]
+    return found + [Target(_spoken("reward", window), columns, window) for window in EARNED]
+
+
+def find_subspace(bundle: Bundle, paths: Sequence[Path], told: Callable[[int], None]) -> Found:
+    """The subspace of these drives for the default controllers of a world model; `told` hears how many are followed.
+
+    `DatasetError` if they have other pictures or actions or are damaged; `UsageError` if nothing is foretold.
+    """
+    check_drives(paths, bundle.manifest.preprocessing)
+    onlooker = Onlooker(bundle)
+    targets = targets_of(find_task(bundle.manifest.task).world, bundle.manifest.actions)
+    kept: list[Sums | None] = [None, None]  # of the drives that it is fitted to, and of the others
+    for first, drives in followed(paths, bundle.manifest.actions):
+        features = onlooker.features(drives, onlooker.see(drives))
+        for row, drive in enumerate(drives):
+            on, wanted = _asked(drive, targets)
+            sums, side = (
+                Sums.of(features[row, : len(on)][on], wanted[on]),
+                int((first + row) % HELD_OUT == HELD_OUT - 1),
+            )
+            so_far = kept[side]
+            kept[side] = sums if so_far is None else so_far + sums
+        told(first + len(drives))
+    used, others = kept
+    if used is None or others is None or not (used.steps and others.steps):
+        raise UsageError(f"the {len(paths)} drives hardly keep to their road: there is nothing to foretell")
+    r_squared = others.r_squared(used.solve(RIDGE))
+    foretold = [index for index, each in enumerate(r_squared) if each >= LEAST]
+    if not foretold:
+        raise UsageError(f"{bundle.manifest.name} foretells nothing of these {len(paths)} drives: give others")
+    whole = used + others
+    subspace = _standardised(whole, whole.solve(RIDGE)[:, foretold], [targets[each].name for each in foretold], bundle)
+    return Found(subspace, tuple(float(r_squared[each]) for each in foretold), len(paths), whole.steps)
+
+
+def _asked(drive: Drive, targets: Sequence[Target]) -> tuple[NDArray[np.bool_], Doubles]:
+    """The steps `(T,)` that count, and what is to be foretold at each `(T, targets)`."""
+    columns = np.concatenate([drive.action, drive.reward[:, None]], axis=1).astype(np.float64)
+    sums = np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
+    on = on_the_way(drive.reward)
+    on[:FIRST] = False
+    on[max(len(on) - WINDOWS[-1][1], 0) :] = False
+    return on, np.stack([each.of(sums) for each in targets], axis=1)
+
+
+def _standardised(sums: Sums, solved: Doubles, names: Sequence[str], bundle: Bundle) -> Subspace:
+    """The foretold values with mean 0 and deviation 1 on these steps."""
+    mean = sums.inputs[-1] @ solved / sums.steps
+    squares = (solved * (sums.inputs @ solved)).sum(axis=0) / sums.steps
+    deviation = np.sqrt(squares - mean**2)
+    weights, offsets = solved[:-1] / deviation, (solved[-1] - mean) / deviation
+    return Subspace(weights.T.astype(np.float32), offsets.astype(np.float32), tuple(names), bundle.sha256)
+
+
+def _spoken(name: str, window: tuple[int, int]) -> str:
+    return f"{name} {window[0]}-{window[1]}"

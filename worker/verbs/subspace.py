@@ -1,0 +1,53 @@
+"""`dreamfleet subspace`: fewer features for a search."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.saving import check_out, told
+from dreamfleet.common.threads import pin_thread_pools
+
+SUMMARY = "find a few features that foretell what a driver will do and earn, for a search in them (--subspace)"
+EXTRAS = ("worker",)
+DRIVES = 300
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("bundle", metavar="BUNDLE", help="the world model: a file, or one that ships")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the drives that it watches")
+    parser.add_argument("--out", type=Path, required=True, help="the subspace to write, NAME.npz")
+    parser.add_argument(
+        "--episodes", type=int, default=DRIVES, help=f"drives at most, the folder's last ones (default {DRIVES})"
+    )
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Find it, and tell how well each feature is foretold."""
+    pin_thread_pools()  # of NumPy, which is not loaded yet
+    if args.episodes < 5:
+        raise UsageError(f"--episodes must be at least 5, not {args.episodes}: every fifth is held out")
+    check_out(args.out)
+    from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.training.refit import last_drives
+    from dreamfleet.worker.training.subspace import find_subspace
+
+    bundle, paths = find_bundle(args.bundle), last_drives(args.data, args.episodes)
+    with progress_bar("subspace", len(paths), "drives") as bar:
+        found = find_subspace(bundle, paths, bar.move)
+    subspace, r_squared = found.subspace, [round(each, 4) for each in found.r_squared]
+    with told(args.out):
+        subspace.save(args.out, {"drives": found.drives, "steps": found.steps, "r_squared": r_squared})
+    width = max(map(len, subspace.names))
+    rows = [f"{name:<{width}}  {each:.2f}" for name, each in zip(subspace.names, r_squared, strict=True)]
+    told_first = "what is foretold, in which steps from now, and its R² on held-out drives:"
+    last = f"{args.out}: {len(rows)} features, by {found.steps} steps of {found.drives} drives"
+    text = "\n".join([told_first, *rows, last])
+    answer(args, text, subspace=args.out, sha256=subspace.sha256, bundle=bundle.sha256, features=subspace.names,
+           r_squared=r_squared, drives=found.drives, steps=found.steps)  # fmt: skip
+    return 0
