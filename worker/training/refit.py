@@ -8,6 +8,7 @@ It is behavioural cloning (Pomerleau 1991) of a controller by itself, on states 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,15 +16,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.actions import Continuous
 from dreamfleet.common.bundle import DREAM, ENCODER, Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
+from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.training.dataset import check_whole, episodes, load_pictures, load_steps, pad, preprocessing_of
 from dreamfleet.worker.training.moments import on_the_way
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, RewardLabel
 
 RIDGE = 0.01  # against the mean square of a feature, which is below 1 for h and about 1 for what z tells
 BOUND = 2.5  # tanh has 0.987 there: how much further a value lies makes no action
+RESTING = 0.3  # how far behind its action's bound a value stays: a search can find the way back from there
 HELD_OUT = 5  # every fifth drive tells how well it went
 TOGETHER = 16  # drives that are followed at once
 PICTURES = 100  # that are encoded at once
@@ -129,6 +133,7 @@ def refit(
     fitted = bundle.under(bundle.shape_of(_sees(controller, own), controller.shape.hidden, controller.variant),
                           controller.variant)  # fmt: skip
     old, new = Onlooker(own.fitting(controller)), Onlooker(fitted)
+    lowest, highest = bounds(controller, own)
     same_eyes = own.read(ENCODER) == bundle.read(ENCODER)
     (weights, biases), *above = controller.shape.unpack(controller.parameters)
     kept: list[Sums | None] = [None, None]  # of the drives that it is fitted to, and of the others
@@ -138,7 +143,7 @@ def refit(
         for row, drive in enumerate(drives):
             on = on_the_way(drive.reward)
             wanted = before[row, : len(on)][on].astype(np.float64) @ weights.T.astype(np.float64) + biases
-            sums = Sums.of(after[row, : len(on)][on], np.clip(wanted, -BOUND, BOUND))
+            sums = Sums.of(after[row, : len(on)][on], np.clip(wanted, lowest, highest))
             side = int((first + row) % HELD_OUT == HELD_OUT - 1)
             so_far = kept[side]
             kept[side] = sums if so_far is None else so_far + sums
@@ -159,6 +164,31 @@ def refit(
 def last_drives(folder: Path, count: int) -> list[Path]:
     """A folder's last drives, so many at most; those of controllers lie behind random ones."""
     return episodes(folder)[-count:]
+
+
+def bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles]:
+    """The values of the first layer `(outputs,)` below and above which nothing is told apart.
+
+    An action that is cut off at a bound, such as a brake below 0, is the same however far behind it a value lies.
+    """
+    outputs = controller.shape.layers[0][0]
+    lowest, highest = np.full(outputs, -BOUND), np.full(outputs, BOUND)
+    actions = controller.variant.actions if not controller.variant.plain else find_task(own.manifest.task).world.actions
+    if controller.shape.hidden or not isinstance(actions, Continuous) or actions.outputs_of:
+        return lowest, highest
+    for output, (scale, shift, low, high) in enumerate(
+        zip(actions.scale, actions.shift, actions.low, actions.high, strict=True)
+    ):
+        for bound, beyond in ((low, -1), (high, 1)):
+            squashed = (bound - shift) / scale
+            if abs(squashed) >= 1:
+                continue  # tanh never comes there
+            rest = math.atanh(squashed)
+            if beyond * scale < 0:
+                lowest[output] = max(lowest[output], rest - RESTING)
+            else:
+                highest[output] = min(highest[output], rest + RESTING)
+    return lowest, highest
 
 
 def _sees(controller: Controller, own: Bundle) -> str:

@@ -11,7 +11,7 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
 from dreamfleet.common.variants import PLAIN, Variant
-from dreamfleet.worker.training.refit import Drive, Onlooker, Sums, refit
+from dreamfleet.worker.training.refit import Drive, Onlooker, Sums, bounds, refit
 from dreamfleet.worker.verbs import refit as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -56,7 +56,17 @@ def first_values(chosen, bundle, paths):
             with_pictures.append(Drive(drive["picture"], drive["action"], drive["reward"]))
     looking = Onlooker(bundle.fitting(chosen))
     (weights, biases), *_ = chosen.shape.unpack(chosen.parameters)
-    return np.clip(looking.features(with_pictures, looking.see(with_pictures)) @ weights.T + biases, -2.5, 2.5)
+    values = looking.features(with_pictures, looking.see(with_pictures)) @ weights.T + biases
+    return np.clip(values, *bounds(chosen, bundle))
+
+
+def test_what_lies_behind_an_actions_bound_is_kept_near_it(bundles):
+    lowest, highest = bounds(controller(bundles[0]), bundles[0])
+    np.testing.assert_allclose(lowest, [-2.5, -2.5, -0.3])  # only the brake is cut off, below 0
+    np.testing.assert_allclose(highest, [2.5, 2.5, 2.5])
+    for other in (controller(bundles[0], hidden=5), controller(bundles[0], variant=Variant(pedals="one"))):
+        lowest, highest = bounds(other, bundles[0])
+        assert (set(lowest), set(highest)) == ({-2.5}, {2.5})
 
 
 @pytest.mark.parametrize("features", ["z", "zh"])
