@@ -81,6 +81,11 @@ class Commands:
         optimum = layout.run(number - 1) / CONTROLLER
         return _spelt("refit", optimum, "--to", layout.bundle(number), "--data", layout.root, "--out", path, "--json")
 
+    def subspace(self, number: int, path: Path) -> Words:
+        """What the model that counts foretells of the last drives."""
+        bundle = self.layout.bundle(self.ledger.kept(number))
+        return _spelt("subspace", bundle, "--data", self.layout.root, "--out", path, "--json")
+
     def gate(self, number: int) -> dict[str, dict[str, Words]]:
         """What is measured of the `old` and the `new` world model: `probe`, `losses`, or both.
 
@@ -99,10 +104,14 @@ class Commands:
                 found[side]["losses"] = _measure(bundle, "--losses", driver, config.gate_losses)
         return found
 
-    def begin_run(self, number: int, listen: Sequence[str], more: Sequence[str], start: Path | None) -> Words:
+    def begin_run(
+        self, number: int, listen: Sequence[str], more: Sequence[str], start: Path | None = None,
+        subspace: Path | None = None,
+    ) -> Words:  # fmt: skip
         """A round's evolution; `more` are flags that stand before those of the run."""
         layout = self.layout
-        begun = () if start is None else ("--init", start)
+        places = {"--init": start, "--subspace": subspace}
+        begun = [word for flag, path in places.items() if path is not None for word in (flag, path)]
         return (
             *_spelt("coordinator", *more, *self.config.flags_of_run(number)),
             *_spelt("--run", layout.run_name(number), "--bundle", layout.bundle(self.ledger.kept(number)),

@@ -47,6 +47,9 @@ class IterateConfig:
     go_on: bool = option(
         False, "begin each evolution at the last round's optimum, fitted to the new model, instead of at zero"
     )
+    subspace: bool = option(
+        False, "let each such evolution search what its model foretells of the last drives alone: needs --go-on"
+    )
     gate_drives: int = option(20, "drives of `inspect --probe` that a new world model is held to the old by; 0: none")
     gate_losses: int = option(30, "losses of `inspect --losses` that it is held to it by; 0: none")
     seed: int = option(0, "makes the iteration: drives, training, populations and tracks follow from it")
@@ -66,6 +69,8 @@ class IterateConfig:
             raise UsageError(f"--spells must be from 0 to 1, not {self.spells}")
         if self.gate_drives == 1 or 0 < self.gate_losses < 4:
             raise UsageError("--gate-drives must be 0 or at least 2, --gate-losses 0 or at least 4")
+        if self.subspace and not self.go_on:
+            raise UsageError("--subspace changes a controller that is there: give --go-on too")
         if self.seed > MOST_SEED:
             raise UsageError(f"--seed must be at most {MOST_SEED}, not {self.seed}")
         for name in ("vae_flags", "mdnrnn_flags", *RUN_FLAGS):

@@ -72,6 +72,10 @@ class Layout:
         """Where a round's evolution begins, if not at zero."""
         return self.round(number) / "start.npz"
 
+    def subspace(self, number: int) -> Path:
+        """What a round's evolution searches, if not everything."""
+        return self.round(number) / "subspace.npz"
+
     def relative(self, path: Path) -> str:
         """A path below the folder, as the ledger writes it."""
         return path.relative_to(self.root).as_posix()

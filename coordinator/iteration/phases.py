@@ -176,11 +176,22 @@ class Phases:
     def _run_words(self, number: int, crew: Crew) -> Words:
         if is_there(self._layout.run(number) / JOURNAL):
             return self._commands.resume_run(number, crew.listen)
-        start = None
+        start, subspace = None, None
         if self._config.go_on and number > 1:
             start = self._layout.start(number)
             self._carry(number, start)
-        return self._commands.begin_run(number, crew.listen, crew.coordinator, start)
+            subspace = self._find_subspace(number) if self._config.subspace else None
+        return self._commands.begin_run(number, crew.listen, crew.coordinator, start, subspace)
+
+    def _find_subspace(self, number: int) -> Path | None:
+        """Where a round's search goes; `None`, everywhere, if its model foretells nothing of the last drives."""
+        path = self._layout.subspace(number)
+        try:
+            self._call(number, "subspace", self._commands.subspace(number, path))
+        except UsageError as error:
+            log.warning("round %d searches all parameters: %s", number, error)
+            return None
+        return path
 
     def _carry(self, number: int, path: Path) -> None:
         """Write the last round's optimum as a controller of the world model that counts now."""

@@ -26,7 +26,7 @@ SUMMARY = "make world models and evolve in their dreams in turn, each learning f
 EXTRAS = ("train", "views")
 PACKAGES = ("gymnasium", "matplotlib", "onnx", "onnxruntime", "safetensors", "torch")
 OURS = {"run_name": "run", "resume": None, "init": None}  # of the rounds' runs, beside those of the next line
-OURS |= dict.fromkeys(("bundle", "seed", "runs_dir", "listen", "connect", "config"))
+OURS |= dict.fromkeys(("bundle", "seed", "runs_dir", "listen", "connect", "config", "subspace"))
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -112,7 +112,7 @@ def _run_settings(args: argparse.Namespace, flags: list[str], *, new: bool) -> d
         raise UsageError("a round's run would never end: give --run-flags a limit, such as --generations 32")
     if new:
         replace(config, recorded=0.0).settings(find_bundle(DEFAULT_BUNDLE))  # which holds no recorded states
-    return {**asdict(config), **asdict(limits), "preset": None, "schedule": None, "bundle": None}
+    return {**asdict(config), **asdict(limits), "preset": None, "schedule": None, "bundle": None, "searched": None}
 
 
 def _crew(args: argparse.Namespace, config: IterateConfig, more: tuple[str, ...], task: str) -> Crew:

@@ -15,6 +15,7 @@ from dreamfleet.common.bundle import Bundle, find_bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.stopping import never
+from dreamfleet.common.subspace import Subspace
 from dreamfleet.coordinator.iteration.commands import Commands
 from dreamfleet.coordinator.iteration.config import IterateConfig
 from dreamfleet.coordinator.iteration.layout import Layout
@@ -225,6 +226,19 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
     assert layout.ledger.read_bytes() == before
 
 
+def test_a_later_round_searches_what_its_model_foretells(processes):
+    layout = Layout(processes.folder / "data")
+    flags = ("--go-on", "--subspace", "--drive-steps", 150, "--own-drives", 6, "--drives", 6, "--gate-drives", 0)
+    code, _, err = processes.call(*words(layout.root, "--noise", 1, *flags), timeout=SECONDS)
+    assert code == 0, err
+    with open_run(layout.runs, layout.run_name(1)) as run:
+        assert not run.settings.subspace
+    with open_run(layout.runs, layout.run_name(2)) as run:
+        found = Subspace.load(layout.subspace(2)) if "searches all parameters" not in err else None
+        assert run.settings.subspace == (found.sha256 if found else "")
+        assert str(layout.start(2)) in run.fact("start")
+
+
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
@@ -238,6 +252,11 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
         ),
         (("--local", 0), "nobody would score"),
         (("--go-on", "--run-flags", "--generations 1 --variant feedback=last"), "--go-on fits a controller"),
+        (("--subspace",), "give --go-on too"),
+        (
+            ("--run-flags", "--generations 1 --subspace few.npz"),
+            "--subspace in --run-flags: each round's run has its own",
+        ),
     ],
 )
 def test_what_could_not_work_is_refused_before_anything_is_driven(processes, flags, said):

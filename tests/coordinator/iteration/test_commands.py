@@ -89,6 +89,14 @@ def test_a_round_evolves_in_the_model_that_counts_with_a_seed_of_its_own():
     )
 
 
+def test_an_evolution_in_a_subspace_is_told_where_it_lies():
+    told = commands(*ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), run_flags="--generations 3")
+    few = Path("few.npz")
+    words = said(told.subspace(2, few))
+    assert words == "subspace data/rounds/01/round-1.zip --data data --out few.npz --json", "of the model that counts"
+    assert "--init start.npz --subspace few.npz" in said(told.begin_run(2, (), (), Path("start.npz"), few))
+
+
 def test_later_rounds_may_evolve_otherwise_than_the_first():
     told = commands(*ROUND_2, run_flags="--generations 32", later_run_flags="--generations 6 --temperature 1")
     first, later = (said(told.begin_run(number, (), (), None)) for number in (1, 2))
