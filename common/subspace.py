@@ -42,8 +42,8 @@ class Subspace:
     def __post_init__(self) -> None:
         """`ValueError` for what no subspace can be."""
         features, inputs = self.weights.shape if self.weights.ndim == 2 else (0, 0)
-        if not 1 <= features <= inputs:
-            raise ValueError(f"weights of shape {self.weights.shape} are not fewer features of what is seen")
+        if not (features and inputs):
+            raise ValueError(f"weights of shape {self.weights.shape} are no features of what is seen")
         if self.offsets.shape != (features,) or len(self.names) != features:
             raise ValueError(f"{features} features need as many offsets and names")
         if self.weights.dtype != np.float32 or self.offsets.dtype != np.float32:

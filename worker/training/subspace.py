@@ -1,9 +1,9 @@
 """A subspace for a search: what a driver will do and earn, as far as a world model's [z, h] foretells it linearly.
 
-Recorded drives are their own teachers: for each moment, what was done in windows of the following steps, how large that
-was, and what was earned, are regressed on what the model saw and remembered before (ridge regression, in closed form).
-The few directions that foretell best something of that, such as how tightly the road is about to be steered, are the
-features. It is reduced-rank regression (Izenman 1975) with targets that say what the ranks mean.
+Recorded drives are their own teachers: for each moment, what was done in windows of the following steps, how large
+that was, and what was earned, are regressed on what the model saw and remembered before, by ridge regression (Hoerl
+and Kennard 1970) in closed form. What is foretold at all is a feature: the direction of [z, h] that foretells, say,
+how sharply will be steered half a second from now.
 """
 
 from __future__ import annotations
