@@ -27,10 +27,12 @@ from dreamfleet.common.printable import one_line
 
 FORMAT = 1
 _LIMITS = Limits(16 << 20, members=8)
-_MOST_NAME = 100
+_MOST_NUMBERS = 1 << 18  # of its weights: a controller's receipt holds them as text
+_MOST_NAME, _MOST_WORDS = 100, 200
+_LARGEST = 1e6  # of a weight: features have a deviation of about 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Subspace:
     """K features of what the controllers of one world model see: `weights` (K, inputs) and `offsets` (K,), float32."""
 
@@ -44,14 +46,16 @@ class Subspace:
         features, inputs = self.weights.shape if self.weights.ndim == 2 else (0, 0)
         if not (features and inputs):
             raise ValueError(f"weights of shape {self.weights.shape} are no features of what is seen")
+        if self.weights.size > _MOST_NUMBERS:
+            raise ValueError(f"it has {self.weights.size} weights, {_MOST_NUMBERS} at most")
         if self.offsets.shape != (features,) or len(self.names) != features:
             raise ValueError(f"{features} features need as many offsets and names")
         if self.weights.dtype != np.float32 or self.offsets.dtype != np.float32:
             raise ValueError("its numbers must be float32")
-        if not (np.isfinite(self.weights).all() and np.isfinite(self.offsets).all()):
-            raise ValueError("it holds NaN or infinity")
-        if not all(isinstance(name, str) and len(name) <= _MOST_NAME for name in (*self.names, self.bundle)):
-            raise ValueError("its names must be short texts")
+        if not all((np.abs(each) <= _LARGEST).all() for each in (self.weights, self.offsets)):  # false for NaN too
+            raise ValueError(f"it holds NaN, or numbers beyond {_LARGEST:g}")
+        if not all(isinstance(name, str) and 0 < len(name) <= _MOST_NAME for name in (*self.names, self.bundle)):
+            raise ValueError("its names, and its world model's, must be short texts")
 
     @cached_property
     def text(self) -> str:
@@ -73,7 +77,7 @@ class Subspace:
             weights, offsets = (np.frombuffer(base64.b64decode(told[name], validate=True), dtype="<f4")
                                 for name in ("weights", "offsets"))  # fmt: skip
             shaped = weights.reshape(len(offsets), -1).astype(np.float32)
-            return cls(shaped, offsets.astype(np.float32), tuple(told["names"]), told["bundle"])
+            return cls(shaped, offsets.astype(np.float32), _listed(told["names"]), told["bundle"])
         except (KeyError, TypeError, RecursionError) as error:
             raise ValueError(f"{type(error).__name__}: {error}") from error
 
@@ -88,16 +92,24 @@ class Subspace:
         """Read what `save` wrote; `UsageError` if that is no subspace."""
         try:
             arrays = read_arrays(path, _LIMITS)
+            if missing := {"weights", "offsets", "about"} - arrays.keys():
+                raise ValueError(f"it has no {', '.join(sorted(missing))}")
             about = json.loads(str(arrays["about"]))
-            if about["format"] != FORMAT:
-                raise ValueError(f"it is of format {about['format']}, and this version reads {FORMAT}")
-            return cls(arrays["weights"], arrays["offsets"], tuple(about["names"]), about["bundle"])
+            if about["format"] is True or about["format"] != FORMAT:
+                raise ValueError(f"it is of another format than {FORMAT}")
+            return cls(arrays["weights"], arrays["offsets"], _listed(about["names"]), about["bundle"])
         except OSError as error:
-            raise UsageError(f"cannot read the subspace {path}: {error.strerror or error}") from error
+            why = f"{error.strerror or error}: name a file of `dreamfleet subspace`, or none"
+            raise UsageError(f"cannot read the subspace {path}: {why}") from error
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise UsageError(
-                f"{path} is no subspace ({one_line(str(error))}): `dreamfleet subspace` makes one"
-            ) from error
+            why = one_line(str(error))[:_MOST_WORDS]
+            raise UsageError(f"{path} is no subspace ({why}): `dreamfleet subspace` makes one") from error
+
+
+def _listed(names: Any) -> tuple[Any, ...]:
+    if not isinstance(names, list):
+        raise TypeError("its names are no list")
+    return tuple(names)
 
 
 @dataclass(frozen=True)

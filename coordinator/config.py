@@ -289,9 +289,15 @@ def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape) 
     """`UsageError` for one of another world model, or of controllers that see something else."""
     if subspace.bundle != spec.bundle:
         own = f"world model {spec.bundle[:12]}" if spec.bundle else "a task without a world model"
-        raise UsageError(f"--subspace is of world model {subspace.bundle[:12]}, and the run is on {own}")
+        raise UsageError(
+            f"--subspace is of world model {subspace.bundle[:12]}, and the run is on {own}: give its own --bundle, or "
+            f"--subspace {NO_SUBSPACE}"
+        )
     if (inputs := subspace.weights.shape[1]) != shape.features:
-        raise UsageError(f"--subspace is of controllers that see {inputs} numbers, and this run's see {shape.features}")
+        raise UsageError(
+            f"--subspace is of controllers that see {inputs} numbers, latent and hidden state alone, and this run's "
+            f"see {shape.features}: leave --features and feedback=last out, or say --subspace {NO_SUBSPACE}"
+        )
 
 
 def _try_optimiser(settings: RunSettings, stage: Stage, subspace: Subspace | None) -> None:

@@ -131,6 +131,15 @@ class Evolution:
         head = Head(self._config.optimiser, self._optimiser.requirement, self.mean, self.sigma, origin)
         return Checkpoint(head, state)
 
+    def _origin_in(self, head: Head) -> NDArray[np.float64]:
+        """From where a state's coordinates count; `ValueError` if it does not say."""
+        origin = None if head.origin is None else np.asarray(head.origin, dtype=np.float64)
+        if origin is None or origin.shape != self._origin.shape:
+            raise ValueError("the origin of its subspace is not there")
+        if not (np.abs(origin) <= np.finfo(np.float32).max).all():  # false for NaN too
+            raise ValueError("the origin of its subspace holds what no single-precision number can")
+        return origin
+
     def _lifted(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
         """The parameters `(..., dimension)` that what the optimiser knows of stands for."""
         space = self._config.space
@@ -146,11 +155,9 @@ class Evolution:
             raise JournalError(
                 f"this run was written with {head.requirement}: pip install {head.requirement} (now {requirement})"
             )
-        if self._config.space is not None:
-            if head.origin is None or head.origin.shape != self._origin.shape:
-                raise JournalError("the journal's last state is damaged (its subspace has no origin): restore it")
-            self._origin = head.origin.astype(np.float64)
         try:
+            if self._config.space is not None:
+                self._origin = self._origin_in(head)
             self._optimiser.restore(checkpoint.state)
         except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
             why = one_line(f"{type(error).__name__}: {error}")

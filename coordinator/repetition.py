@@ -71,8 +71,11 @@ class Repetition:
     def _subspace(self) -> Subspace | None:
         """What the search kept to; `ControllerError` where the receipt holds another one than the settings name."""
         try:
-            kept = self.receipt.subspace
-            return Subspace.of_text(kept) if kept is not None else None
+            kept, wanted = self.receipt.subspace, self.settings.subspace
+            found = Subspace.of_text(kept) if kept is not None else None
+            if (found.sha256 if found else "") != wanted:
+                raise ValueError("it is another one than the settings name, or none")
+            return found
         except ValueError as error:
             raise ControllerError(f"the subspace in the controller's receipt is damaged: {error}") from error
 

@@ -74,9 +74,13 @@ def run(args: argparse.Namespace) -> int:
     return serve(args, {}, find_start(args.init, args.runs_dir) if args.init else None)
 
 
-def serve(args: argparse.Namespace, base: Table, start: Start | None) -> int:
-    """Serve a new run, whose settings are those of `base` where nothing else is said."""
+def serve(
+    args: argparse.Namespace, base: Table, start: Start | None,
+    looked_at: Callable[[RunConfig], RunConfig] = lambda config: config,
+) -> int:  # fmt: skip
+    """Serve a new run, whose settings are those of `base` where nothing else is said, once they were `looked_at`."""
     config, limits = configured(args, base)
+    config = looked_at(config)
     return serve_request(args, request_of(args, args.run_name, config, limits, {}, start))
 
 
@@ -105,6 +109,8 @@ def _searched(config: RunConfig) -> RunConfig:
 
     if config.subspace is None:
         return config
+    if not config.subspace:
+        raise UsageError(f"--subspace is empty: name a file of `dreamfleet subspace`, or {NO_SUBSPACE}")
     return replace(config, searched=None if config.subspace == NO_SUBSPACE else Subspace.load(Path(config.subspace)))
 
 
@@ -172,6 +178,7 @@ def _tell_frozen(args: argparse.Namespace, stored: RunFolder) -> None:
     preset = find_preset(said.pop("preset")) if "preset" in said else {}
     named, stages = unfold(find_schedule(said.pop("schedule", None), args.sources["file"]) or ())
     said |= named
+    _tell_subspace(said.pop("subspace", None), stored)
     if stages and stages != stored.settings.stages:
         log.warning("run %s keeps its own schedule; the settings say another", stored.name)
     frozen: dict[str, Any] = settings_of(stored.settings, stored.bundle_path)
@@ -179,6 +186,21 @@ def _tell_frozen(args: argparse.Namespace, stored: RunFolder) -> None:
         if name != "bundle" and frozen.get(name, value) != value:
             log.warning("%s is %s in run %s, which keeps it; the settings say %s", name, frozen[name], stored.name,
                         value)  # fmt: skip
+
+
+def _tell_subspace(name: str | None, stored: RunFolder) -> None:
+    """The run has its own whole; the file of another one may be gone."""
+    from dreamfleet.common.subspace import Subspace
+
+    try:
+        own = (
+            name is None
+            or (Subspace.load(Path(name)).sha256 if name != NO_SUBSPACE else "") == stored.settings.subspace
+        )
+    except UsageError:
+        own = False
+    if not own:
+        log.warning("run %s keeps to what it was begun to search; the settings name another subspace", stored.name)
 
 
 def _stop_on_signals(stop: Callable[[], None]) -> None:

@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from dreamfleet.common.errors import UsageError
+
+if TYPE_CHECKING:
+    from dreamfleet.coordinator.config import RunConfig
 
 SUMMARY = "start a new run from another one's mean, step size, temperature and stage; other settings may change"
 EXTRAS = ()
@@ -19,7 +26,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the new run until it ends."""
-    from dreamfleet.common.errors import UsageError
     from dreamfleet.common.runs import open_run
     from dreamfleet.common.terms import terms_of
     from dreamfleet.coordinator.config import settings_of
@@ -38,7 +44,18 @@ def run(args: argparse.Namespace) -> int:
         settings.pop("task_options", None)  # described anew, and refused if that makes another world of it
     if "optimiser" in args.given and "optimiser_options" not in args.given:
         settings.pop("optimiser_options", None)  # they are the other one's
-    if "subspace" in args.given and "sigma0" not in args.given:
-        raise UsageError("--subspace makes a step something else than in the run: give --sigma0 too")
     args.run_name = args.run_name or f"{args.source}-fork"
-    return serve(args, settings, start)
+    return serve(args, settings, start, lambda config: _elsewhere(config, settings, sigma))
+
+
+def _elsewhere(config: RunConfig, before: dict[str, Any], sigma: float) -> RunConfig:
+    """The fork's configuration, of which the source's step `sigma` means nothing in another subspace."""
+    searched, old = config.searched, before.get("searched")
+    if (searched and searched.sha256) == (old and old.sha256):
+        return config
+    stages = config.stages
+    if config.sigma0 == sigma and not (stages and stages[0].sigma0):
+        raise UsageError("another subspace than the run's makes a step something else: give --sigma0 too")
+    if searched is None and stages == before["stages"]:  # inherited ones have nothing left to leave
+        return replace(config, stages=tuple(replace(each, whole=False) for each in stages))
+    return config

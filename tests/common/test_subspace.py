@@ -66,14 +66,20 @@ def test_another_number_is_another_subspace(subspace):
     [
         ({"weights": np.zeros((0, 5), np.float32)}, "no features"),
         ({"weights": np.zeros(5, np.float32)}, "no features"),
-        ({"weights": np.full((3, 5), np.nan, np.float32)}, "NaN or infinity"),
+        ({"weights": np.full((3, 5), np.nan, np.float32)}, "NaN, or numbers beyond"),
+        ({"weights": np.full((3, 5), 2e6, np.float32)}, "NaN, or numbers beyond"),
+        ({"weights": np.zeros((3, 1 << 18), np.float32)}, "786432 weights"),
         ({"weights": np.zeros((3, 5))}, "float32"),
         ({"offsets": np.zeros(2, np.float32)}, "as many offsets and names"),
         ({"about": {"names": ["a", "b"]}}, "as many offsets and names"),
         ({"about": {"names": ["a", "b", "c" * 200]}}, "short texts"),
         ({"about": {"names": ["a", "b", 3]}}, "short texts"),
-        ({"about": {"names": 3}}, "no subspace"),
-        ({"about": {"format": 2}}, "format 2"),
+        ({"about": {"names": 3}}, "names are no list"),
+        ({"about": {"names": "abc"}}, "names are no list"),
+        ({"about": {"bundle": ""}}, "short texts"),
+        ({"about": {"format": 2}}, "another format"),
+        ({"about": {"format": True}}, "another format"),
+        ({"about": {"format": "x" * 5000}}, "another format"),
     ],
 )
 def test_what_is_no_subspace_is_one_line(subspace, tmp_path, changes, why):

@@ -1,19 +1,21 @@
 """A search that keeps to a subspace: it continues to the bit, and leaves it from where it came to."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.controller import Controller, ControllerShape
 from dreamfleet.common.effort import Effort
-from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.errors import ControllerError, JournalError, UsageError
 from dreamfleet.common.receipt import Receipt
 from dreamfleet.common.stages import stages_of
 from dreamfleet.common.stored import RunSettings, StageSettings
 from dreamfleet.common.subspace import SearchSpace, Subspace
 from dreamfleet.coordinator.config import RunConfig
 from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.repetition import Repetition
 from dreamfleet.coordinator.start import kept_subspace
 
 SHAPE = ControllerShape(9, 2)
@@ -52,8 +54,18 @@ def test_it_keeps_to_the_subspace_and_continues_to_the_bit(optimiser, covariance
 
 def test_a_state_without_its_origin_is_damaged():
     other = Evolution(replace(config(), space=None, dimension=6))
-    with pytest.raises(JournalError, match="no origin"):
+    with pytest.raises(JournalError, match=r"damaged .*origin of its subspace is not there"):
         Evolution(config()).restore(other.state().packed())
+
+
+@pytest.mark.parametrize(
+    "origin", [np.full(SHAPE.size, "a"), np.full(SHAPE.size, np.nan), np.full(SHAPE.size, 1e300), np.zeros(3)]
+)
+def test_a_damaged_origin_is_the_journals_fault(origin):
+    checkpoint = Evolution(config()).state()
+    state = replace(checkpoint, head=replace(checkpoint.head, origin=origin)).packed()
+    with pytest.raises(JournalError, match="the journal's last state is damaged"):
+        Evolution(config()).restore(state)
 
 
 @pytest.fixture
@@ -105,7 +117,7 @@ def test_one_of_another_world_model_or_of_other_eyes_is_refused(random_bundle):
     features = random_bundle.controller_shape.features
     with pytest.raises(UsageError, match="--subspace is of world model abababababab"):
         RunConfig(searched=few(features)).settings(random_bundle)
-    with pytest.raises(UsageError, match=f"see {features - 1} numbers, and this run's see {features}"):
+    with pytest.raises(UsageError, match=f"see {features - 1} numbers, .* and this run's see {features}"):
         RunConfig(searched=few(features - 1, random_bundle.sha256)).settings(random_bundle)
     with pytest.raises(UsageError, match="without a world model"):
         RunConfig(task="gym:CartPole-v1", searched=few(4)).settings(None)
@@ -122,3 +134,18 @@ def test_what_a_journal_kept_of_it_is_held_to_the_settings(settings, tmp_path):
 
 def test_a_receipt_holds_it_whole():
     assert Receipt(3, Effort(), subspace=few().text).subspace == few().text
+
+
+def test_a_receipt_of_another_subspace_than_its_settings_is_damaged(random_bundle):
+    subspace = few(random_bundle.controller_shape.features, random_bundle.sha256)
+    settings = RunConfig(searched=subspace).settings(random_bundle)
+    controller = Controller(
+        settings.controller, np.zeros(settings.controller.size, np.float32), "car-racing", random_bundle.sha256
+    )
+    for kept in (None, few().text, "{}"):
+        again = Repetition(controller, random_bundle, settings, Receipt(1, Effort(), subspace=kept))
+        with pytest.raises(ControllerError, match=r"the subspace in the controller's receipt is damaged"):
+            again.plan(Path("nowhere") / "again")
+    again = Repetition(controller, random_bundle, settings, Receipt(1, Effort(), subspace=subspace.text))
+    config, _ = again.plan(Path("nowhere") / "again")
+    assert config.searched.sha256 == subspace.sha256

@@ -100,13 +100,23 @@ def test_a_fork_goes_on_in_it_or_leaves_it_with_a_step_of_its_own(processes, beg
     coordinator.wait_for("generation 1: mean")
     coordinator.end()
     fork = ("fork", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2)
-    code, _, err = processes.call(*fork, "--subspace", "none", "--schedule", "none")
+    code, _, err = processes.call(*fork, "--subspace", "none")
+    assert (code, "give --sigma0 too" in err) == (2, True), err
+    (processes.folder / "fleet.toml").write_text('[run]\nsubspace = "none"\n')
+    code, _, err = processes.call(*fork, "--config", processes.folder / "fleet.toml")
     assert (code, "give --sigma0 too" in err) == (2, True), err
     forked = processes.start(*fork, "--run", "same")
     forked.wait_for("in the subspace")
     forked.end()
-    forked = processes.start(*fork, "--run", "free", "--subspace", "none", "--schedule", "none", "--sigma0", 0.1)
+    forked = processes.start(*fork, "--run", "free", "--subspace", "none", "--sigma0", 0.1)
     forked.wait_for("run free, incarnation 1")
     forked.end()
     with open_run(processes.runs, "same") as same, open_run(processes.runs, "free") as free:
         assert (same.settings.subspace, free.settings.subspace) == (subspace.sha256, "")
+        assert [each.whole for each in same.settings.stages] == [False, True]
+        assert not any(each.whole for each in free.settings.stages)
+    (processes.folder / "fleet.toml").write_text('[run]\nsubspace = "gone.npz"\n')
+    again = processes.start("coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen",
+                            processes.endpoint, "--config", processes.folder / "fleet.toml")  # fmt: skip
+    again.wait_for("the settings name another subspace")
+    again.end()

@@ -28,6 +28,7 @@ RIDGE = 0.001  # against the mean square of a feature; see `refit`
 WINDOWS = ((0, 3), (3, 8), (8, 15), (15, 22), (22, 30), (30, 40))  # steps from now on, in which an action is asked for
 NEXT = (0, 5)
 EARNED = ((0, 6), (6, 20), (20, 40))  # and the reward
+LEAST_STEPS = 500  # that count, of all drives: a model sees hundreds of numbers
 LEAST = 0.05  # R² on held-out drives of what counts as foretold
 
 Doubles = NDArray[np.float64]
@@ -93,8 +94,13 @@ def find_subspace(bundle: Bundle, paths: Sequence[Path], told: Callable[[int], N
             kept[side] = sums if so_far is None else so_far + sums
         told(first + len(drives))
     used, others = kept
-    if used is None or others is None or not (used.steps and others.steps):
-        raise UsageError(f"the {len(paths)} drives hardly keep to their road: there is nothing to foretell")
+    counted = [0 if each is None else each.steps for each in kept]
+    if used is None or others is None or sum(counted) < LEAST_STEPS or not all(counted):
+        raise UsageError(
+            f"{len(paths)} drives of {sum(counted)} steps that count are too few: it takes {HELD_OUT} drives and "
+            f"{LEAST_STEPS} steps; the first {FIRST} of a drive, its last {WINDOWS[-1][1]} and those off the road "
+            "do not count: `dreamfleet collect` drives more"
+        )
     r_squared = others.r_squared(used.solve(RIDGE))
     foretold = [index for index, each in enumerate(r_squared) if each >= LEAST]
     if not foretold:

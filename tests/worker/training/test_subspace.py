@@ -89,15 +89,17 @@ def test_its_features_foretell_held_out_drives_and_have_one_size(bundle, drives)
 
 
 def test_what_foretells_nothing_is_said(bundle, drives, tmp_path):
-    with pytest.raises(UsageError, match="hardly keep to their road"):
+    with pytest.raises(UsageError, match="5 drives of 0 steps that count are too few"):
         find_subspace(bundle, [write_drive(tmp_path / "short", number, steps=30) for number in range(5)], ignore)
-    always = [write_drive(tmp_path / "always", number, steps=90) for number in range(10)]
+    always = [write_drive(tmp_path / "always", number, steps=150) for number in range(10)]
     for path in always:
         with np.load(path) as drive:
             arrays = dict(drive)
-        np.savez(path, **{**arrays, "action": np.ones((90, 3), np.float32), "reward": np.ones(90, np.float32)})
+        np.savez(path, **{**arrays, "action": np.ones((150, 3), np.float32), "reward": np.ones(150, np.float32)})
     with pytest.raises(UsageError, match="foretells nothing of these 10 drives"):
         find_subspace(bundle, always, ignore)
+    with pytest.raises(UsageError, match=r"4 drives of .* steps that count are too few"):
+        find_subspace(bundle, drives[:4], ignore)
     with pytest.raises(DatasetError, match="holds pictures"):
         find_subspace(bundle, [write_drive(tmp_path / "wide", 0, picture=96)], ignore)
 
