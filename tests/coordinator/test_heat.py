@@ -107,7 +107,7 @@ def test_a_fork_begins_as_warm_as_its_run_is(heated, monkeypatch):
     bench, served = heated("night", generations=7), []
     bench.drive(lambda _: 0)
     monkeypatch.setattr(
-        "dreamfleet.coordinator.verbs.coordinator.serve", lambda _args, settings, _start: served.append(settings)
+        "dreamfleet.coordinator.verbs.coordinator.serve", lambda _args, settings, *_: served.append(settings)
     )
     fork.run(argparse.Namespace(source="night", runs_dir=bench.path.parent, run_name=None, given=frozenset()))
     assert [(each["temperature"], each["heat"]) for each in served] == [(1.5, 1.5)]

@@ -200,7 +200,7 @@ def test_a_result_is_bounded_by_the_horizon_of_its_own_stage(staged):
 def forked(bench, monkeypatch, given=frozenset()):
     served = []
     monkeypatch.setattr(
-        "dreamfleet.coordinator.verbs.coordinator.serve", lambda _args, settings, _start: served.append(settings)
+        "dreamfleet.coordinator.verbs.coordinator.serve", lambda _args, settings, *_: served.append(settings)
     )
     fork.run(argparse.Namespace(source="night", runs_dir=bench.path.parent, run_name=None, given=given))
     return served[0]
