@@ -1,6 +1,6 @@
 """Fewer features for a search: what a controller sees, seen through a fixed affine map.
 
-A linear controller on [z, h] has hundreds of weights, most of which matter little, and a search pays for each of them.
+A linear controller on [z, h] has hundreds of weights, and a search pays for each of them, whether it matters or not.
 Restricted to a subspace it moves W = W0 + C M and b = b0 + C m + c alone: M and m make a few features of what is seen,
 and the coordinates C, c are what the optimiser knows of. What is published, journalled and reported are whole
 parameters all the same.
