@@ -189,17 +189,16 @@ def _tell_frozen(args: argparse.Namespace, stored: RunFolder) -> None:
 
 
 def _tell_subspace(name: str | None, stored: RunFolder) -> None:
-    """The run has its own whole; the file of another one may be gone."""
+    """The run has its own, whole; the file of another one may be gone."""
     from dreamfleet.common.subspace import Subspace
 
+    if name is None:
+        return
     try:
-        own = (
-            name is None
-            or (Subspace.load(Path(name)).sha256 if name != NO_SUBSPACE else "") == stored.settings.subspace
-        )
+        said = "" if name == NO_SUBSPACE else Subspace.load(Path(name)).sha256
     except UsageError:
-        own = False
-    if not own:
+        said = None
+    if said != stored.settings.subspace:
         log.warning("run %s keeps to what it was begun to search; the settings name another subspace", stored.name)
 
 

@@ -117,6 +117,20 @@ class Sums:
         return found
 
 
+class Halves:
+    """Sums over drives: of those that a map is fitted to, `used`, and of every fifth, which tells how well it went."""
+
+    def __init__(self) -> None:
+        self.used: Sums | None = None
+        self.others: Sums | None = None
+
+    def add(self, number: int, sums: Sums) -> None:
+        """Those of the drive of this number, counted from 0."""
+        side = "others" if number % HELD_OUT == HELD_OUT - 1 else "used"
+        so_far = getattr(self, side)
+        setattr(self, side, sums if so_far is None else so_far + sums)
+
+
 def refit(
     controller: Controller, own: Bundle, bundle: Bundle, paths: Sequence[Path], told: Callable[[int], None]
 ) -> Refit:
@@ -136,7 +150,7 @@ def refit(
     lowest, highest = bounds(controller, own)
     same_eyes = own.read(ENCODER) == bundle.read(ENCODER)
     (weights, biases), *above = controller.shape.unpack(controller.parameters)
-    kept: list[Sums | None] = [None, None]  # of the drives that it is fitted to, and of the others
+    halves = Halves()
     for first, drives in followed(paths, own.manifest.actions):
         latent = old.see(drives)
         before, after = old.features(drives, latent), new.features(drives, latent if same_eyes else new.see(drives))
@@ -144,11 +158,9 @@ def refit(
             on = on_the_way(drive.reward)
             wanted = before[row, : len(on)][on].astype(np.float64) @ weights.T.astype(np.float64) + biases
             sums = Sums.of(after[row, : len(on)][on], np.clip(wanted, lowest, highest))
-            side = int((first + row) % HELD_OUT == HELD_OUT - 1)
-            so_far = kept[side]
-            kept[side] = sums if so_far is None else so_far + sums
+            halves.add(first + row, sums)
         told(first + len(drives))
-    used, others = kept
+    used, others = halves.used, halves.others
     if used is None or not used.steps:
         raise UsageError(f"none of the {len(paths)} drives keeps to its road: there is nothing to fit a controller to")
     r_squared = others.r_squared(used.solve(RIDGE)) if others and others.steps else np.full(len(biases), np.nan)

@@ -22,7 +22,7 @@ from dreamfleet.common.subspace import Subspace
 from dreamfleet.worker.tasks.api import World
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.training.moments import FIRST, on_the_way
-from dreamfleet.worker.training.refit import HELD_OUT, Drive, Onlooker, Sums, check_drives, followed
+from dreamfleet.worker.training.refit import HELD_OUT, Drive, Halves, Onlooker, Sums, check_drives, followed
 
 RIDGE = 0.001  # against the mean square of a feature; see `refit`
 WINDOWS = ((0, 3), (3, 8), (8, 15), (15, 22), (22, 30), (30, 40))  # steps from now on, in which an action is asked for
@@ -81,20 +81,15 @@ def find_subspace(bundle: Bundle, paths: Sequence[Path], told: Callable[[int], N
     check_drives(paths, bundle.manifest.preprocessing)
     onlooker = Onlooker(bundle)
     targets = targets_of(find_task(bundle.manifest.task).world, bundle.manifest.actions)
-    kept: list[Sums | None] = [None, None]  # of the drives that it is fitted to, and of the others
+    halves = Halves()
     for first, drives in followed(paths, bundle.manifest.actions):
         features = onlooker.features(drives, onlooker.see(drives))
         for row, drive in enumerate(drives):
             on, wanted = _asked(drive, targets)
-            sums, side = (
-                Sums.of(features[row, : len(on)][on], wanted[on]),
-                int((first + row) % HELD_OUT == HELD_OUT - 1),
-            )
-            so_far = kept[side]
-            kept[side] = sums if so_far is None else so_far + sums
+            halves.add(first + row, Sums.of(features[row, : len(on)][on], wanted[on]))
         told(first + len(drives))
-    used, others = kept
-    counted = [0 if each is None else each.steps for each in kept]
+    used, others = halves.used, halves.others
+    counted = [0 if each is None else each.steps for each in (used, others)]
     if used is None or others is None or sum(counted) < LEAST_STEPS or not all(counted):
         raise UsageError(
             f"{len(paths)} drives of {sum(counted)} steps that count are too few: it takes {HELD_OUT} drives and "
