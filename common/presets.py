@@ -1,4 +1,4 @@
-"""The names of both kinds of presets: settings of a run, and amounts and layers of training.
+"""The names of all kinds of presets: settings of a run, amounts and layers of training, and learning baselines.
 
 Each side holds its own settings; the names stand here, so that either can say that a name is the other's.
 """
@@ -9,12 +9,15 @@ from typing import Literal
 
 from dreamfleet.common.errors import UsageError
 
-Kind = Literal["run", "training"]
+Kind = Literal["run", "training", "baseline"]
 NAMES: dict[Kind, tuple[str, ...]] = {
     "run": ("article", "dream", "frugal", "paper"),
     "training": ("article", "attentive", "notebook", "paper", "tiny"),
+    "baseline": ("learning", "notebook"),
 }
-VERBS: dict[Kind, str] = {"run": "coordinator and fork", "training": "collect and train"}
+VERBS: dict[Kind, str] = {
+    "run": "coordinator and fork", "training": "collect and train", "baseline": "baseline train",
+}  # fmt: skip
 
 
 def check_preset(kind: Kind, name: str) -> str:

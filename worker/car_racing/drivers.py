@@ -1,7 +1,7 @@
 """Random drivers: what the first world model learns from.
 
-Three kinds of noise, so that the model sees straight, weaving and spinning cars; all lean on the gas, for a car that
-stands teaches nothing.
+`DRIVERS` are three kinds of noise, so that the model sees straight, weaving and spinning cars; all lean on the gas, for
+a car that stands teaches nothing. The others drive as those of a source do.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+PUSH = (-0.1, 1.0, 0.0)
 HELD_FRAMES = 20  # an action is steering in [-1, 1], gas and brake in [0, 1]
 
 
 class HeldDriver:
-    """A uniform action, held for 20 frames (the article's data)."""
+    """Uniform steering and a uniform pedal, held for 20 frames."""
 
     def __init__(self, random: np.random.Generator) -> None:
         self._random = random
@@ -28,6 +29,39 @@ class HeldDriver:
             self._left = HELD_FRAMES
         self._left -= 1
         return self._action.astype(np.float32)
+
+
+class UniformDriver:
+    """What `action_space.sample()` gives, held for 20 frames: gas and brake apart (the notebook's data)."""
+
+    def __init__(self, random: np.random.Generator) -> None:
+        self._random = random
+        self._steps = 0
+        self._action = np.zeros(3, dtype=np.float32)
+
+    def act(self) -> NDArray[np.float32]:
+        """The held action, or a new one."""
+        if self._steps % HELD_FRAMES == 0:
+            self._action = self._choose()
+        self._steps += 1
+        return self._action
+
+    def _choose(self) -> NDArray[np.float32]:
+        return self._random.uniform((-1, 0, 0), 1).astype(np.float32)
+
+
+class PushedDriver(UniformDriver):
+    """A push at the beginning, then one control at a time, each held for 20 frames (the article's data).
+
+    Of ten choices one is nothing, four are gas, two steer to the left, two to the right, and one brakes.
+    """
+
+    def _choose(self) -> NDArray[np.float32]:
+        if self._steps == 0:
+            return np.array(PUSH, dtype=np.float32)
+        strength = self._random.random()
+        controls = ((0, 0, 0), *[(0, 1, 0)] * 4, *[(-1, 0, 0)] * 2, *[(1, 0, 0)] * 2, (0, 0, 1))
+        return np.array(controls[self._random.integers(len(controls))], dtype=np.float32) * np.float32(strength)
 
 
 class OrnsteinUhlenbeckDriver:

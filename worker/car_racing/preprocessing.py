@@ -46,7 +46,7 @@ def _raw(observation: Pixels) -> Pixels:
 
 
 BOX = Preprocessing("box-64", SMALL, _box)
-RAW = Preprocessing("raw-96", 96, _raw)
+RAW = Preprocessing("raw-96", 96, _raw, mirrors=False)  # the indicator bar would be another one
 PREPROCESSINGS = {each.name: each for each in (BOX, RAW)}
 
 

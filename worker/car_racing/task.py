@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,10 +17,12 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.worker.car_racing.check import make_car_racing
-from dreamfleet.worker.car_racing.drivers import DRIVERS
+from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
+from dreamfleet.worker.car_racing.network import NetworkDriver
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS
 from dreamfleet.worker.car_racing.truth import truth_of
-from dreamfleet.worker.tasks.api import Assignment, DreamReward, Preprocessing, Task, World
+from dreamfleet.worker.tasks.api import Assignment, DreamReward, Policy, Preprocessing, Task, World
+from dreamfleet.worker.tasks.policy import Driven
 from dreamfleet.worker.worldmodel.inference import PolicyStep
 
 ENVIRONMENT = "CarRacing-v3"
@@ -31,8 +34,15 @@ WORLD = World(
     action_names=("steer", "gas", "brake"),
     dream_reward=DreamReward(gain=3.5, cost=0.1),  # a tile gives 1000 / N, of a track's N tiles: 3.5 on average
     stray="off_road",  # `OffRoad` says so
+    threshold=gymnasium.spec(ENVIRONMENT).reward_threshold,
     finish="lap_finished",  # gymnasium says so as an episode ends; one that runs out of time says nothing
 )
+
+POLICIES: dict[str, Callable[[np.random.Generator], Policy]] = {
+    "uniform": lambda random: Driven(UniformDriver(random)),
+    "pushed": lambda random: Driven(PushedDriver(random)),
+    "network": NetworkDriver,
+}
 
 
 class CarRacing(Task):
@@ -41,13 +51,14 @@ class CarRacing(Task):
     name = "car-racing"
     world = WORLD
     drivers = DRIVERS
+    policies = POLICIES
     preprocessings = PREPROCESSINGS
 
     def world_of(self, assignment: Assignment) -> World:
         """The world as the run's variant drives it."""
         variant = assignment.world_model.variant
         return replace(
-            WORLD, actions=variant.actions, version=variant.version, time_cost=variant.time_cost,
+            WORLD, actions=variant.controls, version=variant.version, time_cost=variant.time_cost,
             stray_cost=variant.offroad_cost,
         )  # fmt: skip
 
@@ -61,9 +72,7 @@ class CarRacing(Task):
 
     def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The unmodified environment of gymnasium, preprocessed here."""
-        preprocessing = self.preprocessing(assignment.world_model)
-        made = gymnasium.make(ENVIRONMENT, render_mode=render_mode)
-        return _telling(PictureObservation(made, preprocessing), assignment)
+        return _telling(judge_seeing(self.preprocessing(assignment.world_model), render_mode), assignment)
 
     def make_policy(self, assignment: Assignment) -> CarRacingPolicy:
         """Encoder, controller and MDN-RNN of a bundle that was trained on this task's pictures."""
@@ -97,6 +106,11 @@ class CarRacing(Task):
                 f"{manifest.picture}; {self.name} gives {given}"
             )
         return found
+
+
+def judge_seeing(preprocessing: Preprocessing, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    """The unmodified environment of gymnasium, its observation as the picture of a preprocessing."""
+    return PictureObservation(gymnasium.make(ENVIRONMENT, render_mode=render_mode), preprocessing)
 
 
 class PictureObservation(gymnasium.ObservationWrapper[NDArray[np.uint8], Any, NDArray[np.uint8]]):

@@ -115,6 +115,7 @@ def _world_of(environment: gymnasium.Env[Any, Any], name: str) -> World:
         packages=("numpy", "gymnasium", *engine),
         horizon=ENVIRONMENTS_OWN if _limited(environment) else MOST_STEPS,
         frames_per_second=max(1, round(rate)),
+        threshold=environment.spec.reward_threshold if environment.spec else None,
     )
 
 

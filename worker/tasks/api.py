@@ -40,6 +40,7 @@ __all__ = [
     "Preprocessing",
     "Rewarded",
     "Score",
+    "Sourced",
     "Task",
     "Truthful",
     "World",
@@ -104,6 +105,7 @@ class World:
     action_names: tuple[str, ...] = ()  # of continuous actions, for people
     dream_reward: DreamReward | None = None  # of worlds that world models are trained on
     stray: str = ""  # of the environment's `info`: whether it left the course in this step; empty: it does not say
+    threshold: float | None = None  # mean score at which gymnasium has the world for solved; `None`: it says none
     finish: str = ""  # of the environment's `info`: whether the course was driven to its end; empty: it does not say
 
 
@@ -204,6 +206,7 @@ class Preprocessing:
     name: str  # in bundles' manifests and in recorded rollouts
     size: int  # height and width of its pictures
     picture: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]  # to `(size, size, 3)`, both uint8
+    mirrors: bool = True  # whether a picture turned left for right is one of a drive that steers the other way
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -226,6 +229,14 @@ class Collected(Protocol):
 
     def begin_anywhere(self, environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:
         """Move a reset environment to somewhere else in its world; what is observed there."""
+
+
+@runtime_checkable
+class Sourced(Protocol):
+    """A task that also drives for data sets as others did for theirs."""
+
+    policies: Mapping[str, Callable[[np.random.Generator], Policy]]
+    """Random policies by name, each for one drive; none is taken unless it is named."""
 
 
 @runtime_checkable

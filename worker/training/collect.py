@@ -6,7 +6,6 @@ import os
 from collections.abc import Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.children import die_with, signals_held
-from dreamfleet.common.errors import DatasetError, DreamfleetError, UsageError
+from dreamfleet.common.errors import DatasetError, DreamfleetError
 from dreamfleet.common.files import write_aside
 from dreamfleet.common.threads import pin_thread_pools
 from dreamfleet.worker.scoring.episode import Course, play
@@ -24,37 +23,10 @@ from dreamfleet.worker.scoring.rollout import Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER
 from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.policy import Driven
+from dreamfleet.worker.training.collect_config import ALL, CollectConfig
 from dreamfleet.worker.training.dataset import check_pictures
 from dreamfleet.worker.training.pilot import Pilot
-from dreamfleet.worker.training.world import find_world, preprocessing_to
-
-LOUDEST = 10.0  # noise, in halves of an action's range
-
-
-@dataclass(frozen=True)
-class CollectConfig:
-    """How much and what is driven."""
-
-    episodes: int = 400
-    steps: int = 300
-    seed: int = 0
-    anywhere: float = 0.6  # share of episodes that start somewhere on the track instead of at its beginning
-    patience: int = 120  # steps after the last new tile before an episode ends
-    picture: int = 64  # height and width of what is recorded: 64, or 96 for the whole observation
-    noise: float = 0.3  # on a controller's actions, in halves of their range; random drivers have none
-    spells: float = 0.0  # a step's chance that a controller's resting action is tried; see `scoring.spells`
-
-    def __post_init__(self) -> None:
-        for name in ("episodes", "steps", "patience"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"--{name} must be at least 1, not {getattr(self, name)}")
-        if self.seed < 0:
-            raise UsageError(f"--seed must not be negative, not {self.seed}")
-        if not 0 <= self.noise <= LOUDEST:
-            raise UsageError(f"--noise must be from 0 to {LOUDEST:g}, not {self.noise}")
-        if not 0 <= self.spells <= 1:
-            raise UsageError(f"--spells must be from 0 to 1, not {self.spells}")
-        preprocessing_to(self.picture)
+from dreamfleet.worker.training.world import find_world, preprocessing_to, source_policies
 
 
 def episode_path(folder: Path, number: int) -> Path:
@@ -142,6 +114,10 @@ def _driver(
     if pilots:
         pilot = pilots[number % len(pilots)]
         return DRIVER, pilot.policy(config.noise, config.spells, int(random.integers(2**63)))
+    if config.driver in (policies := source_policies()):
+        policy = policies[config.driver](random)
+        policy.begin(np.zeros(0, dtype=np.float32))
+        return config.driver, policy
     drivers = find_world().drivers
-    name = list(drivers)[number % len(drivers)]
+    name = list(drivers)[number % len(drivers)] if config.driver == ALL else config.driver
     return name, Driven(drivers[name](random))

@@ -1,5 +1,6 @@
-"""Recorded pictures as latents, once, so that the MDN-RNN trains on them many times; each drive also mirrored.
+"""Recorded pictures as latents, once, so that the MDN-RNN trains on them many times.
 
+Each drive also mirrored, where its pictures show nothing that a mirrored drive would not show.
 By the encoder as bundles carry it: the latents that controllers will see, to the bit.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +20,7 @@ from dreamfleet.common.files import write_aside
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.dataset import check_pictures, check_whole, episodes, load, load_pictures, load_steps
 from dreamfleet.worker.training.train_vae import CHECKPOINT
+from dreamfleet.worker.training.world import preprocessing_to
 from dreamfleet.worker.worldmodel.export import export_encoder
 from dreamfleet.worker.worldmodel.inference import open_graph
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -35,7 +38,7 @@ def encode(folder: Path) -> Iterator[int]:
         raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
     config = load_config(folder / CHECKPOINT, VAEConfig)
     look = _encoder(folder, config)
-    vae = _identity(folder)
+    vae, mirrors = identity(folder), mirrored_too(folder)
     check_whole(episodes(folder), "picture", "preprocessing", "action", "reward", "ended")
     check_pictures(episodes(folder), config.picture)
     for path in episodes(folder):
@@ -47,27 +50,41 @@ def encode(folder: Path) -> Iterator[int]:
         if len(drive["action"]) != len(pictures):
             raise DatasetError(f"{path} holds {len(pictures)} pictures and another number of actions; delete it")
         mu, logvar = look(pictures)
-        mirrored_mu, mirrored_logvar = look(np.ascontiguousarray(pictures[:, :, ::-1]))
+        mirrored = dict[str, Any]()
+        if mirrors:
+            found = look(np.ascontiguousarray(pictures[:, :, ::-1]))
+            mirrored = dict(zip(("mirrored_mu", "mirrored_logvar"), found, strict=True))
         with write_aside(target) as file:
             np.savez(
-                file, mu=mu, logvar=logvar, mirrored_mu=mirrored_mu, mirrored_logvar=mirrored_logvar,
-                action=drive["action"], reward=drive["reward"], ended=drive["ended"], vae=np.array(vae),
+                file, mu=mu, logvar=logvar, **mirrored, action=drive["action"], reward=drive["reward"],
+                ended=drive["ended"], vae=np.array(vae),
             )  # fmt: skip
         yield len(pictures)
+
+
+def unencoded(folder: Path) -> int:
+    """How many of a folder's drives have no latents yet."""
+    drives, latents = ({path.name for path in (folder / kind).glob("[0-9]*.npz")} for kind in ("episodes", ENCODED))
+    return len(drives - latents)
 
 
 def encoder_of(folder: Path) -> str:
     """Hash of the encoder that a folder's latents come from; `DatasetError` if it is not the folder's own."""
     if not (folder / CHECKPOINT).exists():
         raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
-    vae = _identity(folder)
+    vae = identity(folder)
     for path in episodes(folder, ENCODED):
         if str(load(path, "vae")["vae"]) != vae:
             raise DatasetError(f"{path} is of another VAE: run `dreamfleet encode --data {folder}` again")
     return vae
 
 
-def _identity(folder: Path) -> str:
+def mirrored_too(folder: Path) -> bool:
+    """Whether a mirrored picture of the folder's VAE is one that a drive may show."""
+    return preprocessing_to(load_config(folder / CHECKPOINT, VAEConfig).picture).mirrors
+
+
+def identity(folder: Path) -> str:
     """SHA-256, hexadecimal, of the encoder's weights: a decoder may learn on, the latents stay."""
     hashed = hashlib.sha256()
     for name, array in sorted(load_weights(folder / CHECKPOINT).items()):

@@ -19,26 +19,31 @@ FIXED = ("actions",)  # what the task says
 def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> None:
     """The flags of a `train` verb whose model is configured by `layers`."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--preset", default="tiny", help=f"{preset_help('training')} (default tiny)")
+    parser.add_argument("--preset", help=f"{preset_help('training')}; the data set's own (default tiny)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--continue-from", type=Path, metavar="FILE", help="begin from this checkpoint's weights")
     parser.add_argument(
         "--new", action="store_true",
         help="begin anew where a checkpoint lies: it goes, and with it its curve and what --keep-every kept",
     )  # fmt: skip
-    parser.add_argument("--summary", action="store_true", help="print layers and parameters, and train nothing")
+    parser.add_argument(
+        "--summary",
+        action="store_true",
+        help="print layers and parameters, and train nothing; a model to continue from must have these layers",
+    )
     add_json(parser)
-    for title, config in (
-        ("training, instead of the preset's", TrainConfig),
-        ("layers, instead of the preset's", layers),
-    ):
-        group, hints = parser.add_argument_group(title), get_type_hints(config)
-        for each in fields(config):
-            if each.name not in FIXED:
-                flag = "--" + each.name.replace("_", "-")
-                group.add_argument(
-                    flag, default=argparse.SUPPRESS, help=each.metadata.get("help"), **_options(hints[each.name])
-                )
+    add_config_flags(parser, "training", TrainConfig)
+    add_config_flags(parser, "layers", layers)
+
+
+def add_config_flags(parser: argparse.ArgumentParser, title: str, config: type[Any]) -> None:
+    """A flag a field of `config`; one that is not given leaves no trace."""
+    group, hints = parser.add_argument_group(f"{title}, instead of the preset's"), get_type_hints(config)
+    for each in fields(config):
+        if each.name not in FIXED:
+            flag, text = "--" + each.name.replace("_", "-"), each.metadata.get("help")
+            text = text and f"{text} (default the preset's)"
+            group.add_argument(flag, default=argparse.SUPPRESS, help=text, **_options(hints[each.name]))
 
 
 def changed(config: T, args: argparse.Namespace) -> T:
@@ -54,5 +59,7 @@ def _options(hint: Any) -> dict[str, Any]:
     if get_origin(hint) is Literal:
         return {"choices": get_args(hint)}
     if get_origin(hint) is tuple:
-        return {"type": get_args(hint)[0], "nargs": "+"}
-    return {"action": argparse.BooleanOptionalAction} if hint is bool else {"type": hint}
+        return {"type": get_args(hint)[0], "nargs": "+", "metavar": "N"}
+    if hint is bool:
+        return {"action": argparse.BooleanOptionalAction}
+    return {"type": hint, "metavar": "N"}

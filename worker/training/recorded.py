@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -17,6 +16,7 @@ from dreamfleet.worker.training.dataset import episodes, load_steps
 from dreamfleet.worker.training.encode import ENCODED
 from dreamfleet.worker.training.following import follow
 from dreamfleet.worker.training.moments import Moment, draw_moments
+from dreamfleet.worker.training.one_thread import on_one_thread
 from dreamfleet.worker.training.rollouts import load_rollouts
 from dreamfleet.worker.training.train_mdnrnn import CHECKPOINT
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
@@ -42,21 +42,10 @@ def recorded_states(folder: Path, count: int) -> RecordedStates:
     paths, model = episodes(folder, ENCODED), MDNRNN(load_config(folder / CHECKPOINT, MDNRNNConfig))
     load_checkpoint(folder / CHECKPOINT, model, None)
     drawn = draw_moments([load_steps(path)["reward"] for path in paths], count, np.random.default_rng(SEED))
-    with _one_thread(), torch.no_grad():
+    with on_one_thread(), torch.no_grad():
         rows = [row for part in _by_drives(drawn.all) for row in _states(paths, model, part)]
     width = 2 * model.config.latent + model.config.state
     return RecordedStates(np.array(rows, dtype=np.float16).reshape(-1, width), len(drawn.before_losses))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Then the bits do not depend on a host's cores; and steps as small as these take others several times as long."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _by_drives(moments: Sequence[Moment]) -> Iterator[list[Moment]]:

@@ -79,9 +79,12 @@ def ends(config: MDNRNNConfig, rollouts: Rollouts) -> Tensor:
 
 
 def inputs_of(config: MDNRNNConfig, latents: Tensor, rollouts: Rollouts) -> Tensor:
-    """`(N, T, inputs)`: latents, actions, and where the model takes it the reward head's label of the step before."""
+    """`(N, T, inputs)`: latents, actions, and where the model takes it the reward head's label of the step before.
+
+    The first step has `first_reward` instead.
+    """
     parts = [latents, rollouts.action]
     if config.previous_reward:
         labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
-        parts.append(functional.pad(labels, (1, 0))[:, :-1, None])
+        parts.append(functional.pad(labels, (1, 0), value=config.first_reward)[:, :-1, None])
     return torch.cat(parts, dim=-1)

@@ -12,7 +12,12 @@ import torch
 
 from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.common.stopping import Stop
-from dreamfleet.worker.training.checkpoint import load_checkpoint, load_progress, save_checkpoint
+from dreamfleet.worker.training.checkpoint import (
+    check_config,
+    load_checkpoint,
+    load_progress,
+    save_checkpoint,
+)
 from dreamfleet.worker.training.train_config import TrainConfig
 
 
@@ -21,11 +26,12 @@ class Schedule:
 
     def __init__(
         self, path: Path, model: torch.nn.Module, config: TrainConfig, episodes: int, other: Path | None = None,
-        new: bool = False,
+        new: bool = False, free: frozenset[str] = frozenset(),
     ) -> None:  # fmt: skip
         """`episodes` to train on, in all; `other` is a checkpoint to begin from where `path` has none.
 
-        `new`: what `path` has is not gone on with, and replaced.
+        `new`: what `path` has is not gone on with, and replaced. What is `free` of the configuration, as for
+        `load_checkpoint`, is so of `other`, and of what `path` has while it has made no update.
         """
         if new and other is not None and other.resolve() == path.resolve():
             raise UsageError(f"--new replaces {path}, which --continue-from names: leave one of the two out")
@@ -34,9 +40,10 @@ class Schedule:
         keep_triton_from_mesa()
         self.optimiser = torch.optim.Adam(model.parameters(), lr=config.rate)
         self.progress: dict[str, Any] = {"update": 0}
-        if not new and (found := load_checkpoint(path, model, self.optimiser)) is not None:
+        begun = not new and path.exists() and load_progress(path).get("update") != 0
+        if not new and (found := load_checkpoint(path, model, self.optimiser, frozenset() if begun else free)):
             self.progress = found
-        elif other is not None and load_checkpoint(other, model, self.optimiser) is None:
+        elif other is not None and load_checkpoint(other, model, self.optimiser, free) is None:
             raise UsageError(f"--continue-from: no checkpoint at {other}")
         # Ended early: only something new to learn from, or no patience at all, makes it go on.
         if self.progress.get("stopped") not in (None, episodes) or not config.patience:
@@ -156,8 +163,10 @@ def device_of(name: str) -> torch.device:
     return torch.device(name)
 
 
-def summary(model: torch.nn.Module) -> str:
-    """Layers and how many parameters of each are learnt."""
+def summary(model: torch.nn.Module, other: Path | None = None, free: frozenset[str] = frozenset()) -> str:
+    """Layers and how many parameters of each are learnt; `DatasetError` if `other` is of another model."""
+    if other is not None:
+        check_config(other, model.config, free)
     rows = []
     for name, module in model.named_modules():
         learnt = [each for each in module.parameters(recurse=False) if each.requires_grad]

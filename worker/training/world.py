@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.tasks.api import Collected, Preprocessing
+from dreamfleet.worker.tasks.api import Collected, Policy, Preprocessing, Sourced
 from dreamfleet.worker.tasks.registry import find_task
 
 WORLD = "car-racing"  # of data sets that do not say another
@@ -24,3 +28,14 @@ def preprocessing_to(size: int, world: str = WORLD) -> Preprocessing:
         if each.size == size:
             return each
     raise UsageError(f"pictures are {' or '.join(str(each.size) for each in known)} pixels wide, not {size}")
+
+
+def source_policies(world: str = WORLD) -> Mapping[str, Callable[[np.random.Generator], Policy]]:
+    """The random policies that drive as those of a source do, by name; a world may have none."""
+    task = find_world(world)
+    return task.policies if isinstance(task, Sourced) else {}
+
+
+def known_drivers(world: str = WORLD) -> tuple[str, ...]:
+    """Who may drive at random, by name."""
+    return (*find_world(world).drivers, *source_policies(world))

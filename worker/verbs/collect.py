@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 import os
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.config import add_flags
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.presets import preset_help
 from dreamfleet.common.site import offer
+from dreamfleet.worker.training.collect_config import CollectConfig
 
 if TYPE_CHECKING:
     from dreamfleet.worker.training.pilot import Pilot
@@ -24,20 +25,12 @@ EXTRAS = ("worker",)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--preset", default="tiny", help=f"{preset_help('training')} (default tiny)")
-    parser.add_argument("--episodes", type=int, help="episodes in all, instead of the preset's")
-    parser.add_argument("--steps", type=int, help="steps of an episode at most, instead of the preset's")
-    parser.add_argument("--seed", type=int, help="makes the data set, instead of the preset's")
-    parser.add_argument("--picture", type=int, help="64, or 96 for the whole observation, instead of the preset's")
+    parser.add_argument("--preset", help=f"{preset_help('training')} (default tiny); the data set keeps it")
+    add_flags(parser, CollectConfig, default="the preset's")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
     parser.add_argument(
         "--controller", nargs="+", default=[], metavar="CONTROLLER",
         help="who drives the episodes that are missing, in turn, instead of random drivers: files, runs, or what ships",
-    )  # fmt: skip
-    parser.add_argument("--noise", type=float, help="on a controller's actions, of half their range (default 0.3)")
-    parser.add_argument(
-        "--spells", type=float, metavar="CHANCE",
-        help="of each step, that an action which a controller leaves at its bound, as a brake, is tried (default 0)",
     )  # fmt: skip
     parser.add_argument("--from-run", metavar="RUN", help="drive nothing: take in what this run collected, each once")
     offer(parser, "runs_dir")
@@ -49,23 +42,25 @@ def run(args: argparse.Namespace) -> int:
     if args.from_run is not None:
         return _take_in(args)
     for flag in ("noise", "spells"):
-        if getattr(args, flag) is not None and not args.controller:
+        if hasattr(args, flag) and not args.controller:
             raise UsageError(f"--{flag} is on a controller's actions: give --controller too")
+    if hasattr(args, "driver") and args.controller:
+        raise UsageError("--driver is who drives at random: leave it or --controller out")
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.common.stopping import heeding_signals
     from dreamfleet.worker.training.collect import collect, missing, present
+    from dreamfleet.worker.training.flags import changed
+    from dreamfleet.worker.training.origin import agreed_preset, keep_preset
     from dreamfleet.worker.training.presets import find_preset
 
-    config = find_preset(args.preset).collect
-    names = ("episodes", "steps", "seed", "picture", "noise", "spells")
-    changes = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    config = replace(config, **changes)
-    pilots = _pilots(args)
+    preset = find_preset(agreed_preset(args.data, args.preset))
+    config, pilots = changed(preset.collect, args), _pilots(args)
     frames = done = 0
     before = len(present(args.data))
     total = before + len(missing(args.data, config))
     with progress_bar("collect", total, "episodes") as bar, heeding_signals() as stop:
         bar.move(before)
+        keep_preset(args.data, preset.name)
         with closing(collect(args.data, config, max(1, args.jobs), pilots)) as counts:
             for count in counts:
                 frames, done = frames + count, done + 1

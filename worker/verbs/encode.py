@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     """Encode what is not encoded yet."""
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.worker.training.dataset import episodes
-    from dreamfleet.worker.training.encode import encode
+    from dreamfleet.worker.training.encode import encode, mirrored_too
 
     total = len(episodes(args.data))
     frames = 0
@@ -29,5 +29,6 @@ def run(args: argparse.Namespace) -> int:
         for done, count in enumerate(encode(args.data), start=1):
             frames += count
             bar.move(done)
-    answer(args, f"{args.data}: {frames} frames encoded, each also mirrored", data=args.data, new_frames=frames)
+    also = ", each also mirrored" if mirrored_too(args.data) else ""
+    answer(args, f"{args.data}: {frames} frames encoded{also}", data=args.data, new_frames=frames)
     return 0

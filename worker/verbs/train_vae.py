@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.listing import answer
+
 if TYPE_CHECKING:
     from dreamfleet.common.stopping import Stop
     from dreamfleet.worker.training.train_vae import Report
@@ -27,16 +29,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
     from dreamfleet.worker.training.flags import changed
+    from dreamfleet.worker.training.origin import agreed_preset
     from dreamfleet.worker.training.presets import find_preset
     from dreamfleet.worker.training.schedule import device_of, summary
     from dreamfleet.worker.training.telling import show
     from dreamfleet.worker.training.train_vae import CHECKPOINT, train_vae
     from dreamfleet.worker.worldmodel.vae import VAE
 
-    preset = find_preset(args.preset)
+    preset = find_preset(agreed_preset(args.data, args.preset))
     config, layers = changed(preset.vae, args), changed(preset.vae_layers, args)
     if args.summary:
-        print(summary(VAE(layers)))
+        text = summary(VAE(layers), args.continue_from)
+        answer(args, text, summary=text.splitlines())
         return 0
 
     def train(report: Report, stop: Stop) -> dict[str, float]:

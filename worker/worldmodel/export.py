@@ -17,7 +17,7 @@ from dreamfleet.common.actions import Continuous
 from dreamfleet.worker.worldmodel.graph import GraphBuilder
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.recurrent import Recurrent, Weights, export_dream
-from dreamfleet.worker.worldmodel.vae_config import LEAK, VAEConfig
+from dreamfleet.worker.worldmodel.vae_config import LEAK, Layer, VAEConfig
 
 __all__ = ["Weights", "export_controller", "export_decoder", "export_dream", "export_encoder", "export_policy"]
 EPSILON = 1e-5  # of torch's batch normalisation
@@ -38,12 +38,12 @@ def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
     latent = graph.take("latent", TensorProto.FLOAT, config.latent)
     kernel, bias = graph.weight(vae["dense.weight"]), graph.weight(vae["dense.bias"])
     value = graph.node("Gemm", latent, kernel, bias, transB=1)
-    side, last = config.decoder_sides[0], len(config.channels) - 1
-    value = graph.node("Reshape", value, graph.shape(-1, config.decoder_channels[0], side, side))
-    for layer in range(last + 1):
-        weights, offsets = _folded(vae, "decoder", layer, config)
-        value = graph.node("ConvTranspose", value, graph.weight(weights), graph.weight(offsets), **_window(config))
-        value = graph.node("Sigmoid", value) if layer == last else _activate(graph, value, config)
+    side, last = config.decoder_sides[0], len(config.up) - 1
+    value = graph.node("Reshape", value, graph.shape(-1, config.up[0].inputs, side, side))
+    for index, layer in enumerate(config.up):
+        weights, offsets = _folded(vae, "decoder", index, config)
+        value = graph.node("ConvTranspose", value, graph.weight(weights), graph.weight(offsets), **_window(layer))
+        value = graph.node("Sigmoid", value) if index == last else _activate(graph, value, config)
     value = graph.node("Mul", value, graph.constant(np.array(255, np.float32)))
     value = graph.node("Cast", graph.node("Round", value), to=TensorProto.UINT8)
     value = graph.node("Transpose", value, perm=[0, 2, 3, 1])
@@ -94,16 +94,17 @@ def export_controller(actions: Continuous, *, hidden: bool) -> bytes:
 def _encode(graph: GraphBuilder, picture: str, vae: Weights, config: VAEConfig) -> str:
     """Convolutions over the picture; its scale of 1/255 is folded into the first."""
     value = graph.node("Cast", graph.node("Transpose", picture, perm=[0, 3, 1, 2]), to=TensorProto.FLOAT)
-    for layer in range(len(config.channels)):
-        kernel, bias = _folded(vae, "encoder", layer, config)
-        kernel = (kernel.astype(np.float64) / 255).astype(np.float32) if layer == 0 else kernel
-        value = graph.node("Conv", value, graph.constant(kernel), graph.constant(bias), **_window(config))
+    for index, layer in enumerate(config.down):
+        kernel, bias = _folded(vae, "encoder", index, config)
+        kernel = (kernel.astype(np.float64) / 255).astype(np.float32) if index == 0 else kernel
+        value = graph.node("Conv", value, graph.constant(kernel), graph.constant(bias), **_window(layer))
         value = _activate(graph, value, config)
     return str(graph.node("Reshape", value, graph.shape(-1, config.flat)))
 
 
-def _window(config: VAEConfig) -> dict[str, Any]:
-    return {"strides": [2, 2]} | ({"pads": [1, 1, 1, 1]} if config.padding == "same" else {})
+def _window(layer: Layer) -> dict[str, Any]:
+    pads = {"pads": [layer.before] * 2 + [layer.after] * 2} if layer.after else {}
+    return {"strides": [layer.stride] * 2} | pads
 
 
 def _activate(graph: GraphBuilder, value: str, config: VAEConfig) -> str:

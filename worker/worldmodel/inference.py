@@ -98,7 +98,7 @@ class PolicyStep:
 
     def zero_state(self, rows: int) -> Floats:
         """The state before the first step."""
-        return np.zeros((rows, self.state_size), dtype=np.float32)
+        return self._reward.begin(np.zeros((rows, self.state_size), dtype=np.float32))
 
     def remember(self, state: Floats, rewards: NDArray[np.float64]) -> None:
         """Write the rewards (N,) that followed the last step into `state`, where the model looks at them."""
@@ -112,6 +112,13 @@ class RewardLabel:
         model = bundle.manifest.models.get("mdnrnn", {})
         self._column = 2 * bundle.manifest.hidden if model.get("previous_reward") else None
         self._kind = model.get("reward")
+        self._first = float(model.get("first_reward", 0.0))
+
+    def begin(self, state: Floats) -> Floats:
+        """A zero state, in which the model sees before its first step what training began with."""
+        if self._column is not None:
+            state[:, self._column] = self._first
+        return state
 
     def write(self, state: Floats, rewards: NDArray[np.float64]) -> None:
         """Label `rewards` (N,) of steps that did not end their episodes, as the reward head does."""
@@ -129,7 +136,7 @@ class Controllers:
         self.choices = Choices(variant)
         remembered = self.shape.features - variant.seen > bundle.manifest.latent
         self._hidden = bundle.manifest.hidden if remembered else 0
-        self._actions = variant.actions
+        self._actions = variant.controls
         self._run = open_part(bundle, LAYERED if self.shape.hidden else LINEAR).run if variant.driving.plain else None
         self._parameters = np.zeros((0, self.shape.size), dtype=np.float32)
         self._layers: list[Layer] = []
@@ -191,7 +198,7 @@ class DreamStep:
         self.attends = ATTENTION in outputs
         self._names = [name for name in outputs if name != ATTENTION]
         self._controllers = Controllers(bundle)
-        self._choices = self._controllers.choices
+        self._choices, self._reward = self._controllers.choices, RewardLabel(bundle)
         self._only = onnxruntime.RunOptions()
         self._only.only_execute_path_to_fetches = True
         self._idle: dict[str, Floats] = {}
@@ -262,7 +269,7 @@ class DreamStep:
 
     def zero_state(self, rows: int) -> Floats:
         """The state before the first step."""
-        return np.zeros((rows, self.state_size), dtype=np.float32)
+        return self._reward.begin(np.zeros((rows, self.state_size), dtype=np.float32))
 
 
 class Encoder:

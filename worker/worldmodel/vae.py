@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dreamfleet.worker.worldmodel.vae_config import KERNEL, LEAK, VAEConfig
+from dreamfleet.worker.worldmodel.vae_config import LEAK, Layer, VAEConfig
 
 
 class Loss(NamedTuple):
@@ -21,24 +20,48 @@ class Loss(NamedTuple):
     divergence: Tensor
 
 
+class Down(nn.Conv2d):
+    """A convolution that may pad one row and column more behind than before."""
+
+    def __init__(self, layer: Layer) -> None:
+        super().__init__(layer.inputs, layer.outputs, layer.kernel, layer.stride, layer.before)
+        self._more = layer.after - layer.before
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """The outputs."""
+        return super().forward(functional.pad(pictures, (0, self._more, 0, self._more)) if self._more else pictures)
+
+
+class Up(nn.ConvTranspose2d):
+    """A transposed convolution that may crop one row and column more behind than before."""
+
+    def __init__(self, layer: Layer) -> None:
+        super().__init__(layer.inputs, layer.outputs, layer.kernel, layer.stride, layer.before)
+        self._more = layer.after - layer.before
+
+    def forward(self, pictures: Tensor, output_size: list[int] | None = None) -> Tensor:
+        """The outputs."""
+        whole = super().forward(pictures, output_size)
+        return whole[..., : -self._more, : -self._more] if self._more else whole
+
+
 class VAE(nn.Module):
     """Pictures `(N, 3, side, side)` in [0, 1] to mu and logvar `(N, latent)`, and back."""
 
     def __init__(self, config: VAEConfig) -> None:
         super().__init__()
         self.config = config
-        padding = 1 if config.padding == "same" else 0
         layers: list[nn.Module] = []
-        for before, after in pairwise((3, *config.channels)):
-            layers += [nn.Conv2d(before, after, KERNEL, stride=2, padding=padding), *_after(config, after)]
+        for each in config.down:
+            layers += [Down(each), *_after(config, each.outputs)]
         self.encoder = nn.Sequential(*layers, nn.Flatten())
         self.mu = nn.Linear(config.flat, config.latent)
         self.logvar = nn.Linear(config.flat, config.latent)
-        self._start = (config.decoder_channels[0], *[config.decoder_sides[0]] * 2)
+        self._start = (config.up[0].inputs, *[config.decoder_sides[0]] * 2)
         self.dense = nn.Linear(config.latent, self._start[0] * self._start[1] ** 2)
         layers = []
-        for (before, after), kernel in zip(pairwise(config.decoder_channels), config.decoder_kernels, strict=True):
-            layers += [nn.ConvTranspose2d(before, after, kernel, stride=2, padding=padding), *_after(config, after)]
+        for each in config.up:
+            layers += [Up(each), *_after(config, each.outputs)]
         self.decoder = nn.Sequential(*layers[: 1 - config.modules_a_layer], nn.Sigmoid())
 
     def encode(self, pictures: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,47 +4,86 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
+from dreamfleet.common.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.worldmodel.factors import check_factors, factor
+from dreamfleet.worker.worldmodel.factors import check_factors, factor, later
 
 LEAK = 0.2  # slope of the leaky activation below zero
-KERNEL = 4
+KERNEL, STRIDE = 4, 2
 PAPER_SIDES = (1, 5, 13, 30, 64)  # of the paper's decoder; its kernels 5, 5, 6, 6 follow
+
+
+class Layer(NamedTuple):
+    """A convolution, or a transposed one: of what it pads, or crops, the most lies behind, as in TensorFlow."""
+
+    inputs: int
+    outputs: int
+    kernel: int
+    stride: int
+    before: int  # rows and columns that are padded or cropped at the beginning
+    after: int  # and at the end: as many, or one more
 
 
 @dataclass(frozen=True)
 class VAEConfig:
     """Layers and loss; the defaults are the paper's."""
 
-    picture: int = 64  # height and width
-    latent: int = 32
-    channels: tuple[int, ...] = (32, 64, 128, 256)
-    padding: Literal["valid", "same"] = "valid"
-    activation: Literal["relu", "leaky_relu"] = "relu"
-    batch_norm: bool = False
-    dropout: float = 0.0
-    loss: Literal["paper", "notebook"] = "paper"
-    kl_tolerance: float = 0.5  # of the paper's loss: nats a latent below which the divergence costs nothing
-    dense: int = 0  # inputs of the paper's decoder; 0: as many as the encoder's outputs
+    picture: int = option(64, "height and width of a picture: 64, or 96 for the whole observation")
+    latent: int = option(32, "latents that a picture becomes")
+    channels: tuple[int, ...] = option(
+        (32, 64, 128, 256), "outputs of each of the encoder's convolutions; the decoder has as many"
+    )
+    padding: Literal["valid", "same"] = option("valid", "what convolutions see beyond a picture's edge: nothing, or 0")
+    activation: Literal["relu", "leaky_relu"] = option("relu", "behind each convolution but the last")
+    batch_norm: bool = option(default=False, text="normalise each convolution's outputs over the batch")
+    dropout: float = option(0.0, "share of each convolution's outputs that is left out while it learns")
+    loss: Literal["paper", "notebook"] = option(
+        "paper", "squared error and a divergence with a tolerance, or 1000 times the mean square and the divergence"
+    )
+    kl_tolerance: float = option(0.5, "of the paper's loss: nats a latent below which the divergence costs nothing")
+    dense: int = option(0, "inputs of a decoder that begins at 1x1; 0: as many as the encoder's outputs")
     error_factor: float = factor("weighs the reconstruction error against the divergence; above 1 latents keep more")
+    kernels: tuple[int, ...] = later((), "kernel of each of the encoder's convolutions, else 4")
+    strides: tuple[int, ...] = later((), "stride of each; the decoder's are the same from behind, else 2")
+    decoder_channels: tuple[int, ...] = later(
+        (), "outputs of the decoder's transposed convolutions but the last, else the encoder's from behind"
+    )
+    decoder_kernels: tuple[int, ...] = later(
+        (), "kernel of each of the decoder's transposed convolutions, else what leads to the picture's size"
+    )
 
     def __post_init__(self) -> None:
         if self.picture not in (64, 96):
             raise UsageError(f"a VAE's pictures are 64 or 96 pixels wide, not {self.picture}")
-        if len(self.channels) != 4 or min(self.channels) < 1 or self.latent < 1:
-            raise UsageError(f"a VAE has 4 layers of channels and a latent, not {self.channels}, {self.latent}")
+        if min(self.channels, default=0) < 1 or self.latent < 1:
+            raise UsageError(f"a VAE has layers of channels and a latent, not {self.channels}, {self.latent}")
         if not 0 <= self.dropout < 1 or self.kl_tolerance < 0 or self.dense < 0:
             raise UsageError("--dropout must be from 0 to below 1; a tolerance and a width must not be negative")
         check_factors(self, "error_factor")
+        count = len(self.channels)
+        wanted = {"kernels": count, "strides": count, "decoder_channels": count - 1, "decoder_kernels": count}
+        for name, length in wanted.items():
+            given = getattr(self, name)
+            if given and (len(given) != length or min(given) < 1):
+                raise UsageError(
+                    f"--{name.replace('_', '-')} takes {length} numbers above 0, as --channels are {count}"
+                )
+        if min(self.sides) < 1:
+            raise UsageError(f"the encoder's convolutions leave nothing of {self.picture} pixels: choose fewer")
+        if min(self.decoder_sides) < 1 or any(layer.before < 0 for layer in self.up):
+            raise UsageError(
+                f"the decoder's kernels {self._up_kernels} do not lead to {self.picture} pixels: choose others"
+            )
 
     @property
     def sides(self) -> tuple[int, ...]:
-        """Height and width of the picture and after each convolution of kernel 4, stride 2."""
+        """Height and width of the picture and after each convolution."""
         sides = [self.picture]
-        for _ in self.channels:
-            sides.append(sides[-1] // 2 if self.padding == "same" else (sides[-1] - KERNEL) // 2 + 1)
+        for kernel, stride in zip(self._down_kernels, self._strides, strict=True):
+            inside = (sides[-1] - kernel) // stride + 1
+            sides.append(-(-sides[-1] // stride) if self.padding == "same" else inside)
         return tuple(sides)
 
     @property
@@ -53,30 +92,77 @@ class VAEConfig:
         return self.channels[-1] * self.sides[-1] ** 2
 
     @property
+    def down(self) -> tuple[Layer, ...]:
+        """The encoder's convolutions."""
+        same = self.padding == "same"
+        channels = pairwise((3, *self.channels))
+        sizes = zip(pairwise(self.sides), self._down_kernels, self._strides, strict=True)
+        return tuple(
+            _layer(*between, kernel, stride, max(0, (small - 1) * stride + kernel - large) if same else 0)
+            for between, ((large, small), kernel, stride) in zip(channels, sizes, strict=True)
+        )
+
+    @property
+    def up(self) -> tuple[Layer, ...]:
+        """The decoder's transposed convolutions."""
+        sizes = zip(pairwise(self.decoder_sides), self._up_kernels, self._strides[::-1], strict=True)
+        return tuple(
+            _layer(*between, kernel, stride, (small - 1) * stride + kernel - large)
+            for between, ((small, large), kernel, stride) in zip(pairwise(self._up_channels), sizes, strict=True)
+        )
+
+    @property
     def decoder_sides(self) -> tuple[int, ...]:
-        """Height and width before and after each transposed convolution: the paper's, else the encoder's mirrored."""
-        paper = (self.picture, self.padding) == (64, "valid")
+        """Height and width before and after each transposed convolution.
+
+        The paper's, or those that the kernels lead to; else the encoder's from behind. 0 where there are none.
+        """
+        if self.padding == "valid" and self.decoder_kernels:
+            sides = [self.picture]
+            for kernel, stride in zip(self.decoder_kernels[::-1], self._strides, strict=True):
+                steps, rest = divmod(sides[0] - kernel, stride)
+                sides.insert(0, steps + 1 if rest == 0 and sides[0] else 0)
+            return tuple(sides)
+        paper = (self.picture, self.padding, self.kernels, self.strides, len(self.channels)) == (64, "valid", (), (), 4)
         return PAPER_SIDES if paper else self.sides[::-1]
-
-    @property
-    def decoder_channels(self) -> tuple[int, ...]:
-        """Channels before and after each transposed convolution."""
-        side = self.decoder_sides[0]
-        return ((self.dense or self.flat) if side == 1 else self.channels[-1], *self.channels[-2::-1], 3)
-
-    @property
-    def decoder_kernels(self) -> tuple[int, ...]:
-        """Kernel of each transposed convolution of stride 2."""
-        if self.padding == "same":
-            return (KERNEL,) * len(self.channels)
-        return tuple(after - 2 * (before - 1) for before, after in pairwise(self.decoder_sides))
 
     @property
     def modules_a_layer(self) -> int:
         """Modules of a layer: convolution, activation, and between and behind them what is configured."""
         return 2 + self.batch_norm + (self.dropout > 0)
 
+    @property
+    def _down_kernels(self) -> tuple[int, ...]:
+        return self.kernels or (KERNEL,) * len(self.channels)
+
+    @property
+    def _strides(self) -> tuple[int, ...]:
+        return self.strides or (STRIDE,) * len(self.channels)
+
+    @property
+    def _up_channels(self) -> tuple[int, ...]:
+        """Channels before and after each transposed convolution."""
+        first = (self.dense or self.flat) if self.decoder_sides[0] == 1 else self.channels[-1]
+        return (first, *(self.decoder_channels or self.channels[-2::-1]), 3)
+
+    @property
+    def _up_kernels(self) -> tuple[int, ...]:
+        """Kernels that were given, the encoder's from behind, or such that nothing is cropped."""
+        if self.decoder_kernels or self.padding == "same":
+            return self.decoder_kernels or self._down_kernels[::-1]
+        sizes = zip(pairwise(self.decoder_sides), self._strides[::-1], strict=True)
+        return tuple(large - stride * (small - 1) for (small, large), stride in sizes)
+
+
+def _layer(inputs: int, outputs: int, kernel: int, stride: int, beyond: int) -> Layer:
+    """`beyond`: rows and columns to pad or crop in all."""
+    return Layer(inputs, outputs, kernel, stride, beyond // 2, beyond - beyond // 2)
+
 
 PAPER = VAEConfig()
-NOTEBOOK = VAEConfig(picture=96, channels=(32, 64, 64, 128), padding="same", loss="notebook")
-ARTICLE = VAEConfig(channels=(32, 64, 64, 128), dense=1024)  # AppliedDataSciencePartners/WorldModels
+# DCtheTall/generative-deep-learning, 8-play/WorldModel.ipynb
+NOTEBOOK = VAEConfig(
+    picture=96, channels=(32, 64, 64, 128), padding="same", loss="notebook", decoder_kernels=(5, 5, 6, 6)
+)
+# AppliedDataSciencePartners/WorldModels, vae/arch.py; its loss is 10,000 times the mean square
+ARTICLE = VAEConfig(channels=(32, 64, 64, 128), dense=1024, loss="notebook", error_factor=10.0)

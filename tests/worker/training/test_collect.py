@@ -6,8 +6,10 @@ import pytest
 from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
 from dreamfleet.common.shelf import find_controller
-from dreamfleet.worker.car_racing.drivers import DRIVERS
-from dreamfleet.worker.training.collect import CollectConfig, collect, drive, episode_path
+from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
+from dreamfleet.worker.car_racing.network import NetworkDriver
+from dreamfleet.worker.training.collect import collect, drive, episode_path
+from dreamfleet.worker.training.collect_config import CollectConfig
 from dreamfleet.worker.training.dataset import load_pictures
 from dreamfleet.worker.training.pilot import Pilot
 
@@ -44,6 +46,7 @@ def test_an_episodes_arrays_belong_together(anywhere):
 
 def test_an_episode_ends_after_its_patience():
     assert len(drive(CollectConfig(steps=300, anywhere=0.0, patience=5), 0)["reward"]) < 60
+    assert len(drive(CollectConfig(steps=200, anywhere=0.0, patience=0), 0)["reward"]) == 200
 
 
 def test_collecting_again_writes_only_what_is_missing_and_the_same(tmp_path):
@@ -59,7 +62,17 @@ def test_collecting_again_writes_only_what_is_missing_and_the_same(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"episodes": 0}, {"steps": 0}, {"patience": 0}, {"seed": -1}, {"noise": -1}, {"spells": 1.1}]
+    "changes",
+    [
+        {"episodes": 0},
+        {"steps": 0},
+        {"patience": -1},
+        {"anywhere": 2},
+        {"driver": "ghost"},
+        {"seed": -1},
+        {"noise": -1},
+        {"spells": 1.1},
+    ],
 )
 def test_impossible_settings_are_refused(changes):
     with pytest.raises(UsageError, match=f"--{next(iter(changes))}"):
@@ -81,6 +94,60 @@ def test_a_driver_stays_within_the_cars_controls_and_moves_it(name):
     assert (actions <= 1).all()
     assert ((actions[:, 1] > 0) & (actions[:, 2] > 0)).sum() == 0  # one pedal at a time
     assert actions[:, 1].mean() > actions[:, 2].mean()
+
+
+SOURCES = ("uniform", "pushed", "network")
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_a_named_driver_drives_alone_as_a_function_of_seed_and_number(name):
+    config = replace(TINY, driver=name, anywhere=0.0, patience=0)
+    first = drive(config, 1)
+    drive(config, 2)
+    assert equal(drive(config, 1), first)
+    assert not np.array_equal(drive(config, 2)["action"], first["action"]) or name == "pushed"
+    assert str(first["driver"]) == name
+    assert (first["action"] >= [-1, 0, 0]).all()
+    assert (first["action"] <= 1).all()
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_one_of_the_random_drivers_may_drive_all(name):
+    assert [str(drive(replace(TINY, driver=name), number)["driver"]) for number in range(3)] == [name] * 3
+
+
+def acted(driver, steps):
+    return np.array([driver.act() for _ in range(steps)])
+
+
+def test_the_notebooks_driver_holds_a_uniform_action_for_20_frames():
+    actions = acted(UniformDriver(np.random.default_rng(0)), 20_000).reshape(-1, 20, 3)
+    assert (actions == actions[:, :1]).all()
+    held = actions[:, 0]
+    np.testing.assert_allclose(held.mean(axis=0), [0, 0.5, 0.5], atol=0.05)
+    np.testing.assert_allclose(held.std(axis=0), np.array([2, 1, 1]) / np.sqrt(12), atol=0.03)
+
+
+def test_the_articles_driver_pushes_first_and_then_moves_one_control_at_a_time():
+    actions = acted(PushedDriver(np.random.default_rng(0)), 40_000).reshape(-1, 20, 3)
+    assert (actions == actions[:, :1]).all()
+    push, *held = actions[:, 0]
+    np.testing.assert_allclose(push, [-0.1, 1, 0], atol=1e-6)
+    kinds = np.array([(each[0] < 0, each[0] > 0, each[1] > 0, each[2] > 0) for each in held])
+    assert (kinds.sum(axis=1) <= 1).all()
+    np.testing.assert_allclose(kinds.mean(axis=0), [0.2, 0.2, 0.4, 0.1], atol=0.04)
+
+
+@pytest.mark.parametrize("side", [64, 96])
+def test_the_network_looks_at_pictures_and_each_drive_has_its_own(side):
+    pictures = np.random.default_rng(0).integers(0, 256, (2, side, side, 3), dtype=np.uint8)
+    drivers = [NetworkDriver(np.random.default_rng(seed)) for seed in range(6)]
+    actions = np.array([[driver.act(pictures[step % 2]) for step in range(8)] for driver in drivers])
+    assert actions.shape == (6, 8, 3)
+    assert np.isfinite(actions).all()
+    assert len(np.unique(actions[:, -1], axis=0)) > 2
+    blind = NetworkDriver(np.random.default_rng(1))
+    assert any(not np.array_equal(blind.act(255 - pictures[step % 2]), actions[1, step]) for step in range(8))
 
 
 @pytest.fixture

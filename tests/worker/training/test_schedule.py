@@ -4,18 +4,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
-from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
+from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config, load_progress, load_weights
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import PRESETS
 from dreamfleet.worker.training.rollouts import load_rollouts
 from dreamfleet.worker.training.schedule import device_of, summary
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
-from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.mdnrnn_config import HEADS_TO_COME, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import write_drive, write_drives
@@ -110,6 +113,47 @@ def test_a_checkpoint_keeps_its_layers_and_refuses_others(encoded):
     assert load_config(encoded / train_vae.CHECKPOINT, VAEConfig) == LAYERS
     with pytest.raises(DatasetError, match=r"of another model: latent 4, not 5; .*same flags"):
         train_vae.train_vae(encoded, SHORT, ignore, replace(LAYERS, latent=5))
+
+
+def test_a_trained_memory_may_be_given_a_head_that_foretells_ends(encoded, tmp_path):
+    """What it knew stays, to the bit; Adam goes on where it was, but for the tensors that grew."""
+    before, folder = tmp_path / "before.safetensors", tmp_path / "data"
+    shutil.copytree(encoded, folder)
+    checkpoint = folder / train_mdnrnn.CHECKPOINT
+    checkpoint.unlink(missing_ok=True)
+    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, SMALL)
+    checkpoint.rename(before)
+    torch.manual_seed(4)
+    grown = MDNRNN(replace(SMALL, done=True, lost=3))
+    optimiser = torch.optim.Adam(grown.parameters())
+    own = grown.state_dict()["heads.weight"][-1].clone()
+    assert load_checkpoint(before, grown, optimiser, HEADS_TO_COME)
+    for name, tensor in load_weights(before).items():
+        assert np.array_equal(grown.state_dict()[name][: len(tensor)].numpy(), tensor)
+    assert torch.equal(grown.state_dict()["heads.weight"][-1], own)
+    shapes = [each.shape for each in grown.parameters()]
+    moments = optimiser.state_dict()["state"]
+    assert moments
+    assert all(state["exp_avg"].shape == shapes[index] for index, state in moments.items())
+    ending = replace(SMALL, done=True, lost=3)
+    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, ending, continue_from=before)
+    with pytest.raises(DatasetError, match="of another model: lost 3, not 5"):
+        load_checkpoint(checkpoint, MDNRNN(replace(ending, lost=5)), None, HEADS_TO_COME)
+    other = checkpoint.rename(tmp_path / "ending.safetensors")
+    with pytest.raises(DatasetError, match="of another model: done True, not False; lost 3, not 0"):
+        train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, SMALL, continue_from=other)
+
+
+def test_a_checkpoint_that_is_cut_short_is_not_filled_up(encoded, tmp_path):
+    folder = linked(encoded, tmp_path)
+    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, SMALL)
+    path = folder / train_mdnrnn.CHECKPOINT
+    whole = load_file(path)
+    with safe_open(path, "pt") as file:
+        about = file.metadata()
+    save_file(whole | {"model.heads.bias": whole["model.heads.bias"][:2].contiguous()}, path, about)
+    with pytest.raises(DatasetError, match="does not fit or is damaged"):
+        load_checkpoint(path, MDNRNN(SMALL), None, HEADS_TO_COME)
 
 
 def test_training_ends_when_held_out_drives_gain_nothing_and_goes_on_with_new_ones(encoded, tmp_path):

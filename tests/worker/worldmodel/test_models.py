@@ -1,17 +1,20 @@
 """The models of the sources: their sizes, and that what is exported is what was trained."""
 
+from dataclasses import asdict, replace
+
 import numpy as np
 import pytest
 import torch
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.fields import written
 from dreamfleet.worker.worldmodel import mdnrnn_config as mdnrnn
 from dreamfleet.worker.worldmodel import vae_config as vae
-from dreamfleet.worker.worldmodel.inference import Decoder, Encoder, PolicyStep
+from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, Encoder, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, reward_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
-from dreamfleet.worker.worldmodel.vae import VAE
-from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from dreamfleet.worker.worldmodel.vae import VAE, Up
+from dreamfleet.worker.worldmodel.vae_config import Layer, VAEConfig
 from tests.support.bundles import random_models, write_random_bundle
 
 TINY = {"latent": 4, "channels": (4, 4, 8, 8)}
@@ -21,6 +24,17 @@ VAES = {
     "article": vae.ARTICLE,
     "valid 96": VAEConfig(picture=96, **TINY),
     "same 64": VAEConfig(padding="same", **TINY),
+    "three layers": VAEConfig(latent=4, channels=(4, 4, 8), kernels=(5, 3, 4), strides=(2, 3, 2)),
+    "five same": VAEConfig(
+        latent=4,
+        channels=(2, 4, 4, 4, 8),
+        kernels=(5, 3, 4, 4, 1),
+        padding="same",
+        picture=96,
+        decoder_kernels=(4, 2, 5, 6, 3),
+        decoder_channels=(4, 3, 3, 2),
+    ),
+    "from 3x3": VAEConfig(picture=96, decoder_kernels=(5, 5, 6, 6), **TINY),
     "everything": VAEConfig(activation="leaky_relu", batch_norm=True, dropout=0.1, **TINY),
     "everything same": VAEConfig(activation="leaky_relu", batch_norm=True, padding="same", picture=96, **TINY),
 }
@@ -34,6 +48,31 @@ def test_the_notebooks_lstm_and_heads_have_its_sizes():
     model = MDNRNN(mdnrnn.NOTEBOOK)
     assert (mdnrnn.NOTEBOOK.lstm_inputs, mdnrnn.NOTEBOOK.hidden, mdnrnn.NOTEBOOK.outputs) == (36, 256, 481)
     assert (learnt(model.lstm), learnt(model.heads)) == (300_032, 123_617)
+
+
+def test_the_notebooks_vae_has_its_size_and_the_kernels_of_its_decoder():
+    model = VAE(vae.NOTEBOOK)
+    assert [each.kernel for each in vae.NOTEBOOK.up] == [5, 5, 6, 6]
+    assert (learnt(model), learnt(model.decoder) + learnt(model.dense)) == (1_062_787, 536_611)
+
+
+def test_what_a_transposed_convolution_crops_lies_behind_as_in_the_notebooks():
+    model = Up(Layer(1, 1, 5, 2, 1, 2)).eval()
+    with torch.no_grad():
+        model.weight.copy_(torch.arange(25.0).reshape(1, 1, 5, 5))
+        model.bias.zero_()
+        assert torch.equal(model(torch.ones(1, 1, 1, 1))[0, 0], torch.tensor([[6.0, 7.0], [11.0, 12.0]]))
+
+
+def test_plain_and_attentive_compare_at_equal_parameters():
+    plain, *others = (
+        learnt(MDNRNN(each))
+        for each in (mdnrnn.REWARDED, *(replace(mdnrnn.ATTENTIVE, hidden=units) for units in (236, 235, 237)))
+    )
+    nearest, *further = (abs(count - plain) for count in others)
+    assert mdnrnn.ATTENTIVE.hidden == 236
+    assert nearest < min(further)
+    assert nearest / plain < 0.004
 
 
 def test_the_papers_vae_and_heads_have_its_sizes():
@@ -96,7 +135,14 @@ def test_the_notebooks_label_is_one_where_nothing_is_gained_and_the_episode_goes
     "make",
     [
         lambda: VAEConfig(picture=32),
-        lambda: VAEConfig(channels=(1, 2)),
+        lambda: VAEConfig(channels=()),
+        lambda: VAEConfig(channels=(1,) * 9),
+        lambda: VAEConfig(kernels=(4, 4, 4)),
+        lambda: VAEConfig(strides=(2, 2, 2, 0)),
+        lambda: VAEConfig(decoder_channels=(8, 8, 8, 3)),
+        lambda: VAEConfig(decoder_kernels=(5, 5, 6, 7)),
+        lambda: VAEConfig(padding="same", decoder_kernels=(1, 1, 1, 1)),
+        lambda: MDNRNNConfig(first_reward=1.0),
         lambda: VAEConfig(dropout=1.0),
         lambda: MDNRNNConfig(hidden=0),
         lambda: MDNRNNConfig(reward="none", previous_reward=True),
@@ -105,3 +151,17 @@ def test_the_notebooks_label_is_one_where_nothing_is_gained_and_the_episode_goes
 def test_sizes_that_make_no_model_are_refused(make):
     with pytest.raises(UsageError):
         make()
+
+
+def test_a_model_of_the_paper_is_written_as_it_was_before_every_layer_had_a_flag():
+    later = {"error_factor", "kernels", "strides", "decoder_channels", "decoder_kernels"}
+    assert set(written(vae.PAPER)) == set(asdict(vae.PAPER)) - later
+    assert not {"lost", "first_reward"} & set(written(mdnrnn.REWARDED))
+
+
+def test_the_first_step_sees_the_label_that_the_notebooks_drives_begin_with(tmp_path):
+    bundle = write_random_bundle(tmp_path / "b.zip", 0, vae.NOTEBOOK, mdnrnn.NOTEBOOK)
+    for step in (PolicyStep(bundle), DreamStep(bundle)):
+        state = step.zero_state(2)
+        assert state[:, 2 * mdnrnn.NOTEBOOK.hidden].tolist() == [1, 1]
+        assert state.sum() == 2

@@ -1,0 +1,173 @@
+"""Presets are their sources; the folder keeps the one that it was begun with."""
+
+import argparse
+import json
+from dataclasses import fields
+
+import pytest
+import torch
+
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.presets import NAMES
+from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training.collect_config import CollectConfig
+from dreamfleet.worker.training.dataset import load
+from dreamfleet.worker.training.encode import encode
+from dreamfleet.worker.training.following import follow
+from dreamfleet.worker.training.origin import agreed_preset, keep_preset, kept_preset
+from dreamfleet.worker.training.presets import PRESETS
+from dreamfleet.worker.training.rollouts import Rollouts, inputs_of, load_rollouts
+from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.verbs import collect
+from dreamfleet.worker.verbs import train_mdnrnn as mdnrnn_verb
+from dreamfleet.worker.verbs import train_vae as vae_verb
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
+from dreamfleet.worker.worldmodel.mdnrnn_config import NOTEBOOK, REWARDED, MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
+from tests.support.drives import write_drive, write_drives
+
+# SWIG warns as Box2D is imported, and an error there kills the process.
+pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
+SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
+SMALL = {64: VAEConfig(channels=(2, 2, 4, 4)), 96: VAEConfig(picture=96, channels=(2, 2, 4, 4))}
+VERBS = (collect, vae_verb, mdnrnn_verb)
+
+
+def ignore(_done, _note):
+    pass
+
+
+def parsed(verb, *arguments):
+    parser = argparse.ArgumentParser()
+    verb.configure(parser)
+    return parser.parse_args(arguments)
+
+
+def call(verb, *arguments):
+    return verb.run(parsed(verb, *arguments))
+
+
+def test_tiny_is_what_it_was():
+    tiny = PRESETS["tiny"]
+    assert tiny.collect == CollectConfig(episodes=620, steps=300, anywhere=0.6, patience=120, driver="random")
+    assert tiny.vae == TrainConfig(updates=1500, batch=100, rate=5e-4, clip=0)
+    assert tiny.mdnrnn == TrainConfig(updates=800, batch=32, rate=1e-3)
+    assert (tiny.vae_layers, tiny.mdnrnn_layers) == (PAPER, REWARDED)
+
+
+@pytest.mark.parametrize(
+    ("name", "episodes", "steps", "driver"),
+    [("notebook", 1000, 300, "uniform"), ("article", 2000, 300, "pushed"), ("paper", 10_000, 1000, "network")],
+)
+def test_a_sources_drives_begin_at_the_tracks_beginning_and_last_their_steps(name, episodes, steps, driver):
+    drives = PRESETS[name].collect
+    assert (drives.episodes, drives.steps, drives.driver) == (episodes, steps, driver)
+    assert (drives.anywhere, drives.patience) == (0, 0)
+    assert PRESETS[name].vae.rate == 1e-4
+
+
+def test_the_notebooks_trainings_end_with_their_last_update():
+    notebook = PRESETS["notebook"]
+    assert (notebook.vae.updates, notebook.mdnrnn.updates) == (30_000, 10_000)
+    assert (notebook.vae.patience, notebook.mdnrnn.patience) == (0, 0)
+    assert (notebook.mdnrnn_layers.z_factor, notebook.mdnrnn_layers.reward_factor) == (1, 1)
+    assert notebook.mdnrnn_layers.reward == "notebook"
+    assert PRESETS["attentive"].collect.steps == 384
+
+
+def test_every_preset_is_named_for_both_sides():
+    assert sorted(PRESETS) == sorted(NAMES["training"])
+
+
+@pytest.mark.parametrize("picture", [64, 96])
+def test_no_drive_is_mirrored_whose_pictures_show_the_indicators(tmp_path, picture, monkeypatch):
+    write_drives(tmp_path, episodes=4, steps=6, picture=picture)
+    train_vae.train_vae(tmp_path, SHORT, ignore, SMALL[picture])
+    assert len(list(encode(tmp_path))) == 4
+    path = tmp_path / "encoded" / "000001.npz"
+    if picture == 96:
+        with pytest.raises(DatasetError, match="mirrored"):
+            load(path, "mirrored_mu")
+    else:
+        assert len(load(path, "mirrored_mu")["mirrored_mu"]) == 5
+    taken = []
+
+    def watched(paths, mirrored=None):
+        taken.extend([] if mirrored is None else mirrored)
+        return load_rollouts(paths, mirrored)
+
+    monkeypatch.setattr(train_mdnrnn, "load_rollouts", watched)
+    train_mdnrnn.train_mdnrnn(tmp_path, TrainConfig(updates=8, batch=8, rate=1e-3), ignore, MDNRNNConfig(hidden=4))
+    assert len(taken) == 24
+    assert any(taken) == (picture == 64)
+
+
+def test_a_drive_follows_from_the_first_reward_in_training_and_behind_it():
+    torch.manual_seed(0)
+    ones, reward = torch.ones(1, 3), torch.tensor([[3.0, -0.1, 3.0]])
+    mu = torch.randn(1, 3, 32)
+    rollouts = Rollouts(mu, mu, torch.randn(1, 3, 3), reward, torch.zeros(1, 3), ones)
+    inputs = inputs_of(NOTEBOOK, mu, rollouts)
+    assert inputs[0, :, -1].tolist() == [1, 0, 1]
+    model = MDNRNN(NOTEBOOK).eval()
+    with torch.no_grad():
+        hidden, states = follow(model, rollouts)
+        torch.testing.assert_close(model.predict(hidden).means, model(inputs).means)
+    assert states[0][0, 2 * NOTEBOOK.hidden] == 1
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_flag_says_what_it_does(verb):
+    parser = argparse.ArgumentParser()
+    verb.configure(parser)
+    assert [each.dest for each in parser._actions if not each.help] == []
+    assert parser.format_help()
+
+
+@pytest.mark.parametrize(
+    ("verb", "kinds"),
+    [(collect, (CollectConfig,)), (vae_verb, (TrainConfig, VAEConfig)), (mdnrnn_verb, (TrainConfig, MDNRNNConfig))],
+)
+def test_every_amount_and_layer_has_a_flag(verb, kinds):
+    parser = argparse.ArgumentParser()
+    verb.configure(parser)
+    said = {each.dest for each in parser._actions}
+    assert {each.name for kind in kinds for each in fields(kind)} - said <= {"actions"}
+
+
+def test_a_later_verb_without_the_data_sets_preset_is_refused(tmp_path, capsys):
+    assert (
+        call(collect, "--data", str(tmp_path), "--preset", "article", "--episodes", "2", "--steps", "3", "--jobs", "1")
+        == 0
+    )
+    assert kept_preset(tmp_path) == "article"
+    for verb in VERBS:
+        with pytest.raises(
+            UsageError, match=r"begun with the preset article, and without .* tiny: give --preset article"
+        ):
+            call(verb, "--data", str(tmp_path))
+        with pytest.raises(UsageError, match="--preset paper is another: give --preset article"):
+            call(verb, "--data", str(tmp_path), "--preset", "paper")
+    assert call(vae_verb, "--data", str(tmp_path), "--preset", "article", "--summary") == 0
+    assert "2,115,971" in capsys.readouterr().out
+
+
+def test_a_data_set_from_before_presets_were_kept_stays_without_one(tmp_path):
+    write_drive(tmp_path, 0)
+    keep_preset(tmp_path, "article")
+    assert kept_preset(tmp_path) is None
+    assert agreed_preset(tmp_path, "paper") == "paper"
+    assert agreed_preset(tmp_path, None) == "tiny"
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"preset": 5}', '{"preset": "dream"}', "[" * 900])
+def test_a_damaged_note_of_the_preset_is_told_in_a_line(tmp_path, content):
+    (tmp_path / "preset.json").write_text(content)
+    with pytest.raises(DatasetError, match="names no preset"):
+        agreed_preset(tmp_path, None)
+
+
+def test_a_preset_is_kept_once(tmp_path):
+    keep_preset(tmp_path, "paper")
+    keep_preset(tmp_path, "tiny")
+    assert json.loads((tmp_path / "preset.json").read_text()) == {"preset": "paper"}
