@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +17,8 @@ class Continuous:
     """Outputs in [-1, 1], each scaled, shifted and bounded: `clip(scale * tanh(x) + shift, low, high)`.
 
     An action has an output of its own unless `outputs_of` says which one each action takes; several may take the same.
+    With `choices`, actions that are known, there is an output for each of them, and the one of the largest is done, of
+    equals the first; nothing is squashed then.
     """
 
     scale: tuple[float, ...]
@@ -24,6 +26,7 @@ class Continuous:
     low: tuple[float, ...]
     high: tuple[float, ...]
     outputs_of: tuple[int, ...] = ()
+    choices: tuple[tuple[float, ...], ...] = ()
 
     @classmethod
     def between(cls, low: Any, high: Any) -> Continuous:
@@ -36,6 +39,8 @@ class Continuous:
     @property
     def outputs(self) -> int:
         """Outputs of a controller."""
+        if self.choices:
+            return len(self.choices)
         return max(self.outputs_of) + 1 if self.outputs_of else self.actions
 
     @property
@@ -45,6 +50,9 @@ class Continuous:
 
     def of(self, logits: Floats) -> Floats:
         """The actions `(..., actions)` of what a controller's last layer adds up to `(..., outputs)`."""
+        if self.choices:
+            done: Floats = self._table[np.argmax(logits, axis=-1)]
+            return done
         scale, shift, low, high = self._ranges
         outputs = np.tanh(logits)
         taken = outputs[..., self.outputs_of] if self.outputs_of else outputs
@@ -55,13 +63,21 @@ class Continuous:
         """Actions `(..., actions)` as a controller gives them `(..., outputs)`.
 
         Where several take one output they are added up, each with the sign of its scale: of one pedal gas less brake.
+        Of choices it is 1 for that which was done, and 0 for the others.
         """
+        if self.choices:
+            chosen: Floats = (action[..., None, :] == self._table).all(axis=-1).astype(np.float32)
+            return chosen
         if not self.outputs_of:
             return action
         back = np.zeros((*action.shape[:-1], self.outputs), np.float32)
         for place, (output, scale) in enumerate(zip(self.outputs_of, self.scale, strict=True)):
             back[..., output] += np.copysign(np.float32(1), np.float32(scale)) * action[..., place]
         return back
+
+    @cached_property
+    def _table(self) -> Floats:
+        return np.array(self.choices, np.float32)
 
     @cached_property
     def _ranges(self) -> list[Floats]:
@@ -84,3 +100,7 @@ Actions = Continuous | Discrete
 
 # hardmaru/WorldModelsExperiments, carracing: steering tanh; gas (tanh + 1) / 2; brake clip(tanh, 0, 1).
 STEERING_GAS_BRAKE = Continuous(scale=(1, 0.5, 1), shift=(0, 0.5, 0), low=(-1, 0, 0), high=(1, 1, 1))
+# gymnasium's CarRacing-v3 with continuous=False: nothing, right, left, gas, brake.
+FIVE_CHOICES = replace(
+    STEERING_GAS_BRAKE, choices=((0, 0, 0), (0.6, 0, 0), (-0.6, 0, 0), (0, 0.2, 0), (0, 0, 0.8))
+)  # fmt: skip

@@ -129,7 +129,7 @@ class Bundle:
         A `variant` has outputs of its own, and may see more.
         """
         width = self.manifest.latent + (self.manifest.hidden if features == "zh" else 0)
-        outputs = self.manifest.actions if variant.plain else variant.actions.outputs
+        outputs = self.manifest.actions if variant.plain else variant.controls.outputs
         return ControllerShape(width + variant.seen, outputs, hidden)
 
     def under(self, shape: ControllerShape | None, variant: Variant = PLAIN) -> Bundle:

@@ -12,11 +12,12 @@ from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, Literal
 
-from dreamfleet.common.actions import STEERING_GAS_BRAKE, Continuous
+from dreamfleet.common.actions import FIVE_CHOICES, STEERING_GAS_BRAKE, Continuous
 from dreamfleet.common.errors import UsageError
 
 WORLD = "car-racing"  # whose options these are, and its dream's
 KNOWN = {
+    "actions": "continuous, or discrete without pedals=one",
     "pedals": "two or one",
     "pedal_shift": "a number from -1 to 1, and 0 unless pedals=one",
     "decide_every": "a whole number from 1 to 50",
@@ -33,6 +34,7 @@ class Variant:
     `UsageError` for a value that is out of its range.
     """
 
+    actions: Literal["continuous", "discrete"] = "continuous"  # discrete: one of gymnasium's five
     pedals: Literal["two", "one"] = "two"  # one: an output above 0 is gas, one below it brake
     pedal_shift: float = 0.0  # added to the one pedal
     decide_every: int = 1  # steps for which a choice is held
@@ -42,6 +44,7 @@ class Variant:
 
     def __post_init__(self) -> None:
         fits = {
+            "actions": self.actions == "continuous" or (self.actions == "discrete" and self.pedals != "one"),
             "pedals": self.pedals in ("two", "one"),
             "pedal_shift": _within(self.pedal_shift, -1, 1) and (self.pedals == "one" or not self.pedal_shift),
             "decide_every": type(self.decide_every) is int and 1 <= self.decide_every <= 50,
@@ -95,8 +98,10 @@ class Variant:
         return replace(self, time_cost=0.0, offroad_cost=0.0)
 
     @property
-    def actions(self) -> Continuous:
+    def controls(self) -> Continuous:
         """How outputs become steering, gas and brake."""
+        if self.actions == "discrete":
+            return FIVE_CHOICES
         if self.pedals == "two":
             return STEERING_GAS_BRAKE
         shift = (0.0, self.pedal_shift, -self.pedal_shift)
@@ -105,7 +110,7 @@ class Variant:
     @property
     def seen(self) -> int:
         """Features beside those of the world model: each output's last choice and its change."""
-        return 2 * self.actions.outputs if self.feedback == "last" else 0
+        return 2 * self.controls.outputs if self.feedback == "last" else 0
 
     @property
     def _differing(self) -> dict[str, Any]:

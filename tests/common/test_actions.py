@@ -3,7 +3,7 @@ import numpy as np
 from dreamfleet.common.actions import STEERING_GAS_BRAKE, Continuous
 from dreamfleet.common.variants import Variant
 
-ONE_PEDAL = Variant(pedals="one").actions
+ONE_PEDAL = Variant(pedals="one").controls
 
 
 def logits(*outputs):
@@ -17,7 +17,7 @@ def test_one_pedal_is_gas_above_zero_and_brake_below():
 
 
 def test_a_shifted_pedal_gives_gas_where_its_output_is_zero():
-    shifted = Variant(pedals="one", pedal_shift=0.25).actions
+    shifted = Variant(pedals="one", pedal_shift=0.25).controls
     for pedal, gas, brake in ((0.0, 0.25, 0), (-0.25, 0, 0), (-0.5, 0, 0.25), (0.9, 1, 0)):
         np.testing.assert_allclose(shifted.of(logits(0.0, pedal)), [0, gas, brake], atol=1e-6)
 
@@ -28,6 +28,18 @@ def test_a_brake_that_shares_its_output_feels_every_step_of_it():
     assert len({ONE_PEDAL.of(each).tobytes() for each in near}) == 4
     flat = [np.array([0, 0, brake], np.float32) for brake in (-0.3, -0.31)]
     assert np.array_equal(*(STEERING_GAS_BRAKE.of(each) for each in flat))
+
+
+def test_the_largest_output_of_choices_is_done_and_of_equals_the_first():
+    five = Variant(actions="discrete").controls
+    assert (five.outputs, five.actions) == (5, 3)
+    assert five.of(np.array([9, -1, 0, 9, 3], np.float32)).tolist() == [0, 0, 0]
+    many = np.random.default_rng(0).normal(size=(64, 5)).astype(np.float32) * 9
+    done = five.of(many)
+    assert done.dtype == np.float32
+    assert all(np.array_equal(five.of(row), action) for row, action in zip(many, done, strict=True))
+    assert np.array_equal(five.back(done), np.eye(5)[many.argmax(axis=1)])
+    assert not five.back(np.array([[0.5, 0, 0]], np.float32)).any(), "what is no choice was none"
 
 
 def test_many_actions_are_each_the_one_alone():

@@ -11,6 +11,8 @@ from dreamfleet.common.variants import KNOWN, PLAIN, Variant
     "options",
     [
         '{"pedals": "one"}',
+        '{"actions": "discrete"}',
+        '{"actions": "discrete", "decide_every": 4}',
         '{"pedal_shift": 0.25, "pedals": "one"}',
         '{"decide_every": 4}',
         '{"feedback": "last"}',
@@ -29,7 +31,7 @@ def test_a_variant_is_its_options_and_back(options):
 def test_the_plain_way_is_named_by_nothing():
     assert Variant.of("") == Variant.named({"pedals": "two", "decide_every": 1, "time_cost": 0}) == PLAIN
     assert (PLAIN.options, PLAIN.plain, PLAIN.version, PLAIN.seen) == ("", True, 1, 0)
-    assert PLAIN.actions == STEERING_GAS_BRAKE
+    assert PLAIN.controls == STEERING_GAS_BRAKE
 
 
 def test_a_whole_number_is_written_as_the_number_that_it_means():
@@ -51,11 +53,12 @@ def test_what_candidates_pay_is_no_part_of_how_they_drive():
 def test_each_output_of_a_controller_is_seen_twice():
     assert Variant(feedback="last").seen == 6
     assert Variant(feedback="last", pedals="one").seen == 4
+    assert Variant(feedback="last", actions="discrete").seen == 10
 
 
 def test_an_unknown_option_names_those_that_there_are():
     with pytest.raises(
-        UsageError, match="car-racing knows no option gears, pedal: known are pedals, pedal_shift, "
+        UsageError, match="car-racing knows no option gears, pedal: known are actions, pedals, pedal_shift, "
     ) as told:
         Variant.of('{"pedal": "one", "gears": 5}')
     assert all(name in str(told.value) for name in KNOWN)
@@ -65,6 +68,7 @@ def test_an_unknown_option_names_those_that_there_are():
 @pytest.mark.parametrize(
     ("name", "values"),
     [
+        ("actions", ["five", 1, None]),
         ("pedals", ["three", 1, ["one"], None]),
         ("pedal_shift", [0.5, "0", True]),  # of two pedals
         ("decide_every", [0, 51, 2.0, True, "4"]),
@@ -87,6 +91,8 @@ def test_options_that_are_no_object_are_refused(options):
 
 
 def test_a_shift_that_leaves_no_pedal_is_refused():
-    assert Variant(pedals="one", pedal_shift=-1).actions.shift == (0, -1, 1)
+    assert Variant(pedals="one", pedal_shift=-1).controls.shift == (0, -1, 1)
+    with pytest.raises(UsageError, match="discrete without pedals=one"):
+        Variant(actions="discrete", pedals="one")
     with pytest.raises(UsageError, match="from -1 to 1"):
         Variant(pedals="one", pedal_shift=1.5)

@@ -13,6 +13,7 @@ pytestmark = pytest.mark.timeout(300)
 POPULATION, GENERATIONS, HORIZON = 4, 2, 30
 RUNS = {
     "pedals": (("--variant", "pedals=one", "pedal_shift=0.25"), (288, 2)),
+    "discrete": (("--variant", "actions=discrete"), (288, 5)),
     "held": (("--variant", "decide_every=4"), (288, 3)),
     "feedback": (("--variant", "feedback=last"), (294, 3)),
     "time": (("--variant", "time_cost=0.5"), (288, 3)),
@@ -98,7 +99,7 @@ def test_a_run_begins_from_a_controller_that_drives_alike_alone(processes, rando
             "the plain way",
         ),
         (("fork", "one", "--variant", "feedback=last"), "leave --variant out, and it brings its own"),
-        (("coordinator", "--run", "two", "--variant", "pedal=one"), "knows no option pedal: known are pedals, "),
+        (("coordinator", "--run", "two", "--variant", "pedal=one"), "knows no option pedal: known are actions, "),
         (("coordinator", "--run", "two", "--task", "gym:CartPole-v1", "--variant", "pedals=one"), "with a world model"),
     ):
         bundle = ("--bundle", random_bundle.path) if {"--init", "one"} <= set(flags) else ()

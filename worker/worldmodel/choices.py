@@ -25,7 +25,7 @@ class Choices:
     """
 
     def __init__(self, variant: Variant) -> None:
-        self._every, self._actions = variant.decide_every, variant.actions
+        self._every, self._actions = variant.decide_every, variant.controls
         self._size = self._actions.actions
         self.seen = variant.seen > 0  # whether they are features too
         self.columns = 2 * self._size + 1 if self.seen or self._every > 1 else 0

@@ -11,9 +11,14 @@ from dreamfleet.common.fields import OPTIONAL
 LEAST, MOST = 1e-6, 1e6  # beyond which float32 loses the lighter part beside the heavier one
 
 
+def later(default: Any, text: str) -> Any:
+    """A field that a later version added: at its default it is not written."""
+    return field(default=default, metadata={**OPTIONAL, "help": text})
+
+
 def factor(text: str) -> Any:
     """A field of a model's configuration that weighs a part of its loss; 1, which is not written: as it stands."""
-    return field(default=1.0, metadata={**OPTIONAL, "help": f"{text} (default 1)"})
+    return later(1.0, f"{text}; 1 as its source has it")
 
 
 def check_factors(config: Any, *names: str) -> None:

@@ -185,7 +185,7 @@ def test_a_variant_is_dreamt_and_driven(random_bundle):
     scorer = Scorer(spec, random_bundle)
     alone = scorer.score("score", vector, 3)
     assert scorer.score_all([("score", vector, 3), ("score", -vector, 3)], lambda _: None)[0] == alone
-    assert scorer.world.actions == VARIANTS["all"].actions
+    assert scorer.world.actions == VARIANTS["all"].controls
     scorer.close()
 
 

@@ -16,7 +16,8 @@ from dreamfleet.worker.tools.evaluation import evaluate
 from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
-from dreamfleet.worker.training.collect import CollectConfig, collect, episode_path
+from dreamfleet.worker.training.collect import collect, episode_path
+from dreamfleet.worker.training.collect_config import CollectConfig
 from dreamfleet.worker.training.dataset import load_pictures
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.intake import take_in

@@ -75,10 +75,10 @@ def test_a_controller_acts_by_its_formula_in_the_dream_and_in_reality(random_bun
     seen = [real.latent, given["state"][:, :256]] if features == "zh" else [real.latent]
     if variant.feedback == "last":
         last, before = given["state"][:, -7:-4], given["state"][:, -4:-1]
-        told = [variant.actions.back(each) for each in (last, before)]
+        told = [variant.controls.back(each) for each in (last, before)]
         seen += [told[0], told[0] - told[1]]
     for row, value in enumerate(np.concatenate(seen, axis=1)):
-        expected = act(bundle.controller_shape, parameters[row], value, variant.actions)
+        expected = act(bundle.controller_shape, parameters[row], value, variant.controls)
         np.testing.assert_allclose(real.action[row], expected, atol=1e-5)
 
 
@@ -113,7 +113,7 @@ def test_a_choice_and_its_change_are_those_of_decisions_not_of_held_steps(random
     actions, states = drive(varied, pictures, vectors(varied, 1))
     choices = Controllers(varied).choices
     assert not choices.features(states[:1]).any()
-    last, before = (varied.variant.actions.back(actions[step]) for step in (2, 0))
+    last, before = (varied.variant.controls.back(actions[step]) for step in (2, 0))
     assert np.array_equal(choices.features(states[4:5])[0], np.concatenate([last, last - before]))
 
 
