@@ -41,6 +41,7 @@ class Moment(NamedTuple):
     ended: bool  # the environment says so
     cut: bool  # patience is at its end
     info: dict[str, Any]  # what else the environment says
+    terminal: bool = False  # it ended for good, and was not only cut short by the environment's own limit
 
 
 Begin = Callable[[gymnasium.Env[Any, Any], Any], Any]
@@ -70,7 +71,7 @@ def play(
         idle = 0 if reward > 0 else idle + 1
         ended = bool(terminated or truncated)
         over = not ended and 0 < course.patience <= idle
-        yield Moment(seen, action, reward, step, ended, over, info)
+        yield Moment(seen, action, reward, step, ended, over, info, bool(terminated))
         if ended or over:
             return
 

@@ -36,16 +36,23 @@ def record(
     video ends early, with a step at least.
     """
     task, assignment = find_task(controller.task), Assignment(spec_for(controller, bundle), bundle)
-    world = task.world_of(assignment)
     environment = task.make_judge(assignment, "rgb_array")
     policy: Any = task.make_policy(assignment)
     policy.begin(controller.parameters)
     config = dreaming or DaydreamConfig(seed=seed)
     mind = None if bundle is None else Thoughts(assignment.world_model, policy, controller, config)
+    world, course = task.world_of(assignment), Course(seed, steps)
+    return record_policy(policy, environment, world, course, out, mind, on_step, stop)
+
+
+def record_policy(
+    policy: Any, environment: gymnasium.Env[Any, Any], world: World, course: Course, out: Path,
+    thoughts: Thoughts | None = None, on_step: Callable[[int], None] = lambda _steps: None, stop: Stop = never,
+) -> float:  # fmt: skip
+    """Drive one episode of any policy that has begun into an mp4, close its environment, and return the score."""
     score = 0.0
-    with Film(out, environment, world, seed) as film:
-        actor = Filmed(policy, film, mind)
-        for moment in play(environment, actor, Course(seed, steps)):
+    with Film(out, environment, world, course.seed) as film:
+        for moment in play(environment, Filmed(policy, film, thoughts), course):
             score += moment.reward
             on_step(moment.step)
             if stop():

@@ -1,0 +1,50 @@
+"""A baseline's training as a process that is interrupted and killed."""
+
+import argparse
+import os
+import signal
+
+import pytest
+
+from dreamfleet.worker.baselines.presets import find_preset
+from dreamfleet.worker.baselines.train import CHECKPOINT, CURVE, train_drqn
+from dreamfleet.worker.training.checkpoint import load_progress, load_weights
+from dreamfleet.worker.training.flags import changed
+
+pytestmark = pytest.mark.timeout(120)
+EPISODES, TUPLES = 12, ("channels", "kernels", "strides")
+SETTINGS = {
+    "channels": 2, "kernels": 8, "strides": 8, "hidden": 4, "steps": 60, "random_episodes": 2, "batch": 2,
+    "learn_every": 2, "report_every": 1, "replay": 100, "episodes": EPISODES,
+}  # fmt: skip
+
+
+def finish(folder):
+    """Train to the end, here."""
+    args = argparse.Namespace(**{name: [value] if name in TUPLES else value for name, value in SETTINGS.items()})
+    preset = find_preset("learning")
+    train_drqn(folder, changed(preset.agent, args), changed(preset.learning, args))
+
+
+def state(folder):
+    weights = {name: array.tobytes() for name, array in load_weights(folder / CHECKPOINT).items()}
+    kept = {path.name: path.read_bytes() for path in (folder / "replay").iterdir()}
+    return weights, load_progress(folder / CHECKPOINT), (folder / CURVE).read_bytes(), kept
+
+
+def test_a_training_that_was_interrupted_and_killed_goes_on_to_the_same_bits(processes, tmp_path):
+    flags = (word for name, value in SETTINGS.items() for word in ("--" + name.replace("_", "-"), value))
+    words = ("baseline", "train", "drqn", "--data", tmp_path / "broken", *flags)
+    first = processes.start(*words)
+    first.wait_for("episode 3:")
+    os.killpg(first.popen.pid, signal.SIGINT)
+    assert first.finish()[0] == 130, "".join(first.lines)
+    assert "drqn.safetensors keeps those before it; the same command drives it again" in first.lines[-1]
+    second = processes.start(*words)
+    second.wait_for("episode 6:")
+    os.killpg(second.popen.pid, signal.SIGKILL)
+    assert second.finish()[0] == -signal.SIGKILL
+    assert 6 <= len(load_progress(tmp_path / "broken" / CHECKPOINT)["episodes"]) < EPISODES
+    finish(tmp_path / "broken")
+    finish(tmp_path / "whole")
+    assert state(tmp_path / "broken") == state(tmp_path / "whole")

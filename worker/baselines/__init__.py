@@ -1,0 +1,1 @@
+"""What controllers are measured against: random drivers, and a network that learns without a world model."""

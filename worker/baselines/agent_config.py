@@ -1,0 +1,77 @@
+"""What the recurrent duelling network is made of and how it drives; apart from it, so that a flag needs no torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, Literal
+
+from dreamfleet.common.actions import FIVE_CHOICES
+from dreamfleet.common.errors import UsageError
+
+# Steering, gas, brake of each choice, in gymnasium's order: nothing, right, left, gas, brake.
+CHOICES: dict[str, tuple[tuple[float, ...], ...]] = {
+    "gymnasium": FIVE_CHOICES.choices,
+    "notebook": ((0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, 0, 1)),
+}
+
+
+def said(default: Any, text: str) -> Any:
+    """A field with its default and what `--help` says of it."""
+    return field(default=default, metadata={"help": text})
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """Layers, pictures and choices: all that drives again what has learnt.
+
+    The layers are those of Hausknecht & Stone 2015 (arXiv:1507.06527) with the streams of Wang et al. 2016
+    (arXiv:1511.06581).
+    """
+
+    picture: int = said(64, "height and width of what it sees: 64, or 96 for the whole observation")
+    choices: Literal["gymnasium", "notebook"] = said(
+        "gymnasium", "its five actions: steering 0.6, gas 0.2, brake 0.8 as gymnasium has them, or 1 each (notebook)"
+    )
+    frame_skip: int = said(1, "steps for which a choice is held")
+    channels: tuple[int, ...] = said((32, 64, 64), "of each convolution")
+    kernels: tuple[int, ...] = said((8, 4, 3), "of each convolution")
+    strides: tuple[int, ...] = said((4, 2, 1), "of each convolution")
+    hidden: int = said(512, "units of the LSTM")
+    heads: Literal["linear", "softmax"] = said(
+        "linear", "softmax bounds the advantages, as the notebook does: no return can then be told"
+    )
+
+    def __post_init__(self) -> None:
+        if self.picture not in (64, 96):
+            raise UsageError(f"--picture must be 64 or 96, not {self.picture}")
+        counts = {len(self.channels), len(self.kernels), len(self.strides)}
+        if len(counts) > 1 or 0 in counts:
+            raise UsageError("--channels, --kernels and --strides must name the same number of layers, at least one")
+        if min(*self.channels, *self.kernels, *self.strides, self.hidden, self.frame_skip) < 1:
+            raise UsageError("--channels, --kernels, --strides, --hidden and --frame-skip must be at least 1")
+        if min(self.sides) < 1:
+            raise UsageError(f"--kernels and --strides leave nothing of {self.picture} pixels: make them smaller")
+
+    @property
+    def sides(self) -> tuple[int, ...]:
+        """Height and width of the picture and after each convolution."""
+        sides = [self.picture]
+        for kernel, stride in zip(self.kernels, self.strides, strict=True):
+            sides.append((sides[-1] - kernel) // stride + 1)
+        return tuple(sides)
+
+    @property
+    def flat(self) -> int:
+        """Outputs of the last convolution."""
+        return int(self.channels[-1] * self.sides[-1] ** 2)
+
+    @property
+    def planes(self) -> tuple[tuple[int, int], ...]:
+        """Channels before and after each convolution."""
+        return tuple(pairwise((3, *self.channels)))
+
+    @property
+    def table(self) -> tuple[tuple[float, ...], ...]:
+        """Steering, gas and brake of each choice."""
+        return CHOICES[self.choices]

@@ -1,0 +1,63 @@
+"""One update of the recurrent duelling double network."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.baselines.equations import double_q_target, masked_loss
+from dreamfleet.worker.baselines.learning_config import LearningConfig
+from dreamfleet.worker.baselines.network import Networks, QNetwork
+from dreamfleet.worker.baselines.traces import Traces
+
+
+class Learner:
+    """Networks and their optimiser; the target follows every `target_every` updates."""
+
+    def __init__(self, networks: Networks, optimiser: torch.optim.Adam, config: LearningConfig, updates: int) -> None:
+        """`updates` that were made before."""
+        self._networks, self._optimiser, self._config = networks, optimiser, config
+        self.updates = updates
+
+    def learn(self, traces: Traces) -> float:
+        """Make an update; its loss. `DatasetError` where that is no number: what was saved last is kept."""
+        loss = loss_of(self._networks, traces, self._config)
+        self._optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        if not math.isfinite(told := loss.item()):
+            raise DatasetError(
+                f"the loss of update {self.updates + 1} is {told}: the rate is too high; the checkpoint of the last "
+                "whole episode is kept, and the same command with a lower --rate goes on from it"
+            )
+        if self._config.clip:
+            torch.nn.utils.clip_grad_norm_(self._networks.online.parameters(), self._config.clip)
+        self._optimiser.step()
+        self.updates += 1
+        if self.updates % self._config.target_every == 0:
+            self._networks.renew_target()
+        return told
+
+
+def loss_of(networks: Networks, traces: Traces, config: LearningConfig) -> Tensor:
+    """How far the online network is from what is foretold behind each choice of the traces."""
+    device = networks.online.value.weight.device
+    of = {name: torch.from_numpy(array).to(device) for name, array in vars(traces).items()}
+    online = along(networks.online, of["picture"], of["real"])
+    with torch.no_grad():
+        target = along(networks.target, of["picture"], of["real"])
+        behind = slice(config.n_step, None)  # the moments behind the rewards of each choice
+        wanted = double_q_target(of["value"], of["discount"], online[:, behind], target[:, behind])
+    told = online[:, : config.trace].gather(-1, of["choice"][..., None]).squeeze(-1)
+    return masked_loss(told, wanted, of["mask"], config.loss)
+
+
+def along(network: QNetwork, pictures: Tensor, real: Tensor) -> Tensor:
+    """What each choice is worth `(N, L + n, choices)` along traces, behind their burn-in."""
+    burn_in = real.shape[1]
+    with torch.no_grad():
+        memory = network.warm(network.features(pictures[:, :burn_in]), real) if burn_in else None
+    worth, _ = network(network.features(pictures[:, burn_in:]), memory)
+    return torch.as_tensor(worth)

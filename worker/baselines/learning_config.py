@@ -1,0 +1,59 @@
+"""How the recurrent duelling network learns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.baselines.agent_config import said
+
+AT_LEAST_ONE = (
+    "episodes", "steps", "batch", "trace", "n_step", "epsilon_episodes", "learn_every", "target_every", "replay",
+    "report_every",
+)  # fmt: skip
+NOT_NEGATIVE = ("random_episodes", "patience", "burn_in", "clip", "seed")
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """Amounts of one training; a decision of the agent is held for its `frame_skip` steps of the environment."""
+
+    episodes: int = said(1000, "to drive in all")
+    random_episodes: int = said(20, "of them at first that are driven at random, and nothing is learnt in")
+    steps: int = said(1000, "of an episode at most, in the environment's steps")
+    patience: int = said(0, "steps without a reward after which an episode is cut; 0: never")
+    batch: int = said(32, "traces an update")
+    trace: int = said(8, "decisions of a trace that are learnt from")
+    burn_in: int = said(4, "decisions before them that only warm the memory")
+    n_step: int = said(1, "rewards that are added up before the rest is foretold")
+    gamma: float = said(0.99, "what a reward is worth a decision later")
+    epsilon_first: float = said(1.0, "share of random choices after the random episodes")
+    epsilon_last: float = said(0.05, "share of random choices in the end")
+    epsilon_episodes: int = said(300, "episodes in which it falls from one to the other")
+    rate: float = said(1e-4, "of Adam")
+    clip: float = said(10.0, "norm of the gradients at most; 0: any")
+    loss: Literal["huber", "squared"] = said("huber", "of the difference from the target")
+    learn_every: int = said(4, "decisions between two updates")
+    target_every: int = said(500, "updates after which the target network becomes the online one")
+    replay: int = said(50_000, "decisions of the latest whole episodes that are learnt from")
+    goal: float = said(900.0, "training is over when the episodes of a report have this mean score")
+    report_every: int = said(5, "episodes between two reports")
+    seed: int = said(0, "makes the training")
+
+    def __post_init__(self) -> None:
+        for name in AT_LEAST_ONE:
+            if getattr(self, name) < 1:
+                raise UsageError(f"{_flag(name)} must be at least 1, not {getattr(self, name)}")
+        for name in NOT_NEGATIVE:
+            if not getattr(self, name) >= 0:  # true of NaN too
+                raise UsageError(f"{_flag(name)} must not be negative, not {getattr(self, name)}")
+        for name in ("gamma", "epsilon_first", "epsilon_last"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"{_flag(name)} must be from 0 to 1, not {getattr(self, name)}")
+        if not self.rate > 0:
+            raise UsageError(f"--rate must be positive, not {self.rate}")
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")

@@ -1,0 +1,3 @@
+"""The baselines by name."""
+
+RANDOM, DISCRETE, DRQN = NAMES = ("random", "random-discrete", "drqn")

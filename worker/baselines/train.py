@@ -1,0 +1,214 @@
+"""Training the recurrent duelling double network in CarRacing, from rewards alone."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import torch
+
+from dreamfleet.common.errors import StoppedError
+from dreamfleet.common.files import write_aside
+from dreamfleet.common.seeds import training_seed
+from dreamfleet.common.stopping import Stop, never
+from dreamfleet.worker.baselines.agent_config import AgentConfig
+from dreamfleet.worker.baselines.epsilon import epsilon_of
+from dreamfleet.worker.baselines.kept import drop_kept, keep, read_kept
+from dreamfleet.worker.baselines.learner import Learner
+from dreamfleet.worker.baselines.learning_config import LearningConfig
+from dreamfleet.worker.baselines.network import Networks
+from dreamfleet.worker.baselines.policies import NOTHING, QPolicy
+from dreamfleet.worker.baselines.reports import Record, Report, reached, reports
+from dreamfleet.worker.baselines.traces import Episode, Replay, oldest_kept
+from dreamfleet.worker.car_racing.check import make_car_racing
+from dreamfleet.worker.scoring.episode import Course, Moment, play
+from dreamfleet.worker.training.checkpoint import load_checkpoint, save_checkpoint
+from dreamfleet.worker.training.one_thread import on_one_thread
+from dreamfleet.worker.training.room import told_where_full
+from dreamfleet.worker.training.schedule import keep_triton_from_mesa, same_command
+from dreamfleet.worker.training.world import preprocessing_to
+
+CHECKPOINT, CURVE = "drqn.safetensors", "drqn.jsonl"
+
+Hear = Callable[[int, Report | None], None]
+"""Told the episodes that are driven, and a report where one is due."""
+
+
+def ignore(_episodes: int, _report: Report | None) -> None:
+    """Nobody listens."""
+
+
+def train_drqn(
+    folder: Path, layers: AgentConfig, config: LearningConfig, hear: Hear = ignore,
+    device: torch.device | None = None, stop: Stop = never, new: bool = False,
+) -> dict[str, float]:  # fmt: skip
+    """Train, or go on, to `config.episodes` or the goal; returns the figures of the training.
+
+    A checkpoint follows each episode, and everything in an episode follows from the seed, its number and the checkpoint
+    before it: whoever is stopped or killed drives the episode again, to the same bits. `StoppedError` if `stop` asks.
+    """
+    with on_one_thread():
+        training = Training(folder, layers, config, device, new)
+        hear(training.episodes, None)
+        try:
+            while not training.done:
+                training.drive(stop)
+                training.save()
+                hear(training.episodes, training.report)
+        finally:
+            training.close()
+    return training.figures
+
+
+class Training:
+    """Networks, replay and what was driven so far, in memory and on disk."""
+
+    def __init__(
+        self, folder: Path, layers: AgentConfig, config: LearningConfig, device: torch.device | None, new: bool
+    ) -> None:
+        self._folder, self._layers, self._config, self._new = folder, layers, config, new
+        torch.manual_seed(config.seed)
+        self._networks = Networks(layers).to(device)
+        keep_triton_from_mesa()
+        self._optimiser = torch.optim.Adam(self._networks.online.parameters(), lr=config.rate)
+        self._records: list[Record] = []
+        self._oldest = 0  # the first episode that replay holds
+        self._replay = Replay(config)
+        found = None if new else load_checkpoint(self._path, self._networks, self._optimiser)
+        self._learner = Learner(self._networks, self._optimiser, config, found["update"] if found else 0)
+        if found is not None:
+            self._go_on(found["episodes"], found["oldest"])
+        else:
+            self.save()
+            shutil.rmtree(folder / "replay", ignore_errors=True)
+        self._environment = make_car_racing(preprocessing=preprocessing_to(layers.picture).name)
+
+    @property
+    def episodes(self) -> int:
+        """Driven so far."""
+        return len(self._records)
+
+    @property
+    def done(self) -> bool:
+        """Whether all episodes are driven, or the goal is reached."""
+        config = self._config
+        return self.episodes >= config.episodes or reached(self._records, config.report_every, config.goal)
+
+    @property
+    def report(self) -> Report | None:
+        """The report that is due behind the last episode."""
+        due = self.episodes % self._config.report_every == 0
+        return reports(self._records, self._config.report_every)[-1] if due else None
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Of the whole training: episodes, updates, mean of the last report's episodes, best report."""
+        every = self._config.report_every
+        means = [each.mean for each in reports(self._records, every)] or [self._records[-1]["score"]]
+        goal = reached(self._records, every, self._config.goal)
+        return {"episodes": self.episodes, "updates": self._learner.updates, "mean_score": round(means[-1], 2),
+                "best_mean_score": round(max(means), 2), "goal_reached": goal}  # fmt: skip
+
+    def drive(self, stop: Stop) -> None:
+        """Drive the next episode and learn from those before it; it joins them in replay."""
+        number, config = self.episodes, self._config
+        random = np.random.default_rng([config.seed, number])
+        epsilon = epsilon_of(config, number)
+        policy = QPolicy(self._networks.online, epsilon, random)
+        policy.begin(NOTHING)
+        drive, losses = Drive(), []
+        course = Course(training_seed(config.seed, number, 0), config.steps, config.patience)
+        before = sum(each["decisions"] for each in self._records)
+        for moment in play(self._environment, policy, course):
+            if stop():
+                self._leave()
+            drive.see(moment, policy)
+            due = policy.decided and (before + drive.decisions) % config.learn_every == 0
+            if due and number >= config.random_episodes and (traces := self._replay.sample(random)):
+                losses.append(self._learner.learn(traces))
+        episode = drive.episode
+        keep(self._folder, number, episode)
+        self._replay.add(episode)
+        self._records.append({
+            "score": drive.score, "steps": drive.steps, "decisions": len(episode), "epsilon": epsilon,
+            "loss": fmean(losses) if losses else None,
+        })  # fmt: skip
+
+    def save(self) -> None:
+        """Write the checkpoint, then the curve that follows from it; drop the episodes that nothing needs any more."""
+        self._oldest = max(self._oldest, self._first_to_keep)
+        progress = {"update": self._learner.updates, "oldest": self._oldest, "episodes": self._records}
+        save_checkpoint(self._path, self._networks, self._optimiser, progress)
+        self._draw()
+        drop_kept(self._folder, self._oldest)
+
+    def close(self) -> None:
+        """Release the environment."""
+        self._environment.close()
+
+    @property
+    def _path(self) -> Path:
+        return self._folder / CHECKPOINT
+
+    @property
+    def _first_to_keep(self) -> int:
+        return oldest_kept([each["decisions"] for each in self._records], self._config.replay)
+
+    def _go_on(self, records: list[Record], oldest: int) -> None:
+        self._records = records
+        self._oldest = max(oldest, self._first_to_keep)
+        for group in self._optimiser.param_groups:
+            group["lr"] = self._config.rate
+        for number in range(self._oldest, len(records)):
+            self._replay.add(read_kept(self._folder, number, self._layers.picture))
+        self._draw()
+
+    def _draw(self) -> None:
+        path = self._folder / CURVE
+        lines = [json.dumps(asdict(each)) for each in reports(self._records, self._config.report_every)]
+        with told_where_full(path), write_aside(path) as file:
+            file.write("".join(f"{line}\n" for line in lines).encode())
+
+    def _leave(self) -> None:
+        raise StoppedError(
+            f"stopped in episode {self.episodes + 1} of {self._config.episodes}: {self._path} keeps those before it; "
+            f"{same_command(self._new)} drives it again and goes on from there"
+        )
+
+
+class Drive:
+    """An episode while it is driven: steps of the environment become decisions of the agent."""
+
+    def __init__(self) -> None:
+        self._pictures: list[Any] = []
+        self._choices: list[int] = []
+        self._rewards: list[float] = []
+        self._terminal = False
+        self.score, self.steps = 0.0, 0
+
+    @property
+    def decisions(self) -> int:
+        """Made so far."""
+        return len(self._choices)
+
+    def see(self, moment: Moment, policy: QPolicy) -> None:
+        """One step; its reward belongs to the decision that is held."""
+        if policy.decided:
+            self._pictures.append(moment.seen)
+            self._choices.append(policy.choice)
+            self._rewards.append(0.0)
+        self._rewards[-1] += moment.reward
+        self.score += moment.reward
+        self._terminal, self.steps = moment.terminal, moment.step
+
+    @property
+    def episode(self) -> Episode:
+        """The whole of it."""
+        choices, rewards = np.array(self._choices, np.int64), np.array(self._rewards, np.float32)
+        return Episode(np.stack(self._pictures), choices, rewards, self._terminal)

@@ -1,0 +1,64 @@
+"""`dreamfleet baseline evaluate`: a baseline on unseen tracks."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.saving import check_out, saving
+from dreamfleet.common.seeds import TEST, VALIDATION
+from dreamfleet.common.threads import pin_thread_pools
+
+if TYPE_CHECKING:
+    from dreamfleet.common.evaluated import Drive
+
+SUMMARY = "judge a baseline on unseen tracks as controllers are judged, in gymnasium's own unmodified environment"
+EXTRAS = ("worker",)
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    from dreamfleet.worker.baselines.names import NAMES
+
+    parser.add_argument("agent", choices=NAMES, help="who drives")
+    parser.add_argument("--data", type=Path, help="of drqn: the folder of its training")
+    parser.add_argument("--episodes", type=int, default=100, help="tracks (default 100)")
+    parser.add_argument(
+        "--first-seed", type=int, default=TEST.start,
+        help=f"first track's seed: test tracks from {TEST.start} (default), validation tracks from {VALIDATION.start}",
+    )  # fmt: skip
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
+    parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
+    parser.add_argument("--out", type=Path, help="write the same JSON here too, for `compare`")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Drive and print the scores."""
+    pin_thread_pools()  # of NumPy and torch, which are not loaded yet
+    if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
+        raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
+    if args.out:
+        check_out(args.out)
+    seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
+    if not any(seeds[0] in each and seeds[-1] in each for each in (TEST, VALIDATION)):
+        print("note: some of these tracks are neither test nor validation tracks", file=sys.stderr)
+    from dreamfleet.common.progress import progress_bar
+    from dreamfleet.worker.baselines.agents import find_agent
+    from dreamfleet.worker.baselines.judging import judge_agent
+
+    agent = find_agent(args.agent, args.data)
+
+    def move(drives: list[Drive]) -> None:
+        bar.move(len(drives), f"mean {sum(each.score for each in drives) / len(drives):.1f}")
+
+    with progress_bar("evaluate", len(seeds), "tracks") as bar:
+        judgement = judge_agent(agent, args.agent, args.data, seeds, args.jobs, move)
+    print(judgement.to_json() if args.json else judgement.told, flush=True)
+    if args.out:
+        with saving(args.out) as file:
+            file.write(f"{judgement.to_json()}\n".encode())
+    return 0
