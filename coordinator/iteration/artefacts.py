@@ -12,7 +12,7 @@ from dreamfleet.common.files import is_file
 from dreamfleet.common.processes import spoken
 from dreamfleet.coordinator.iteration.layout import ENCODED, EPISODES, Layout
 from dreamfleet.coordinator.iteration.ledger import Entry, Ledger, Made
-from dreamfleet.coordinator.iteration.plan import BUNDLE, COLLECT, DATA, EVOLVE, GATE, MDNRNN, VAE, Phase
+from dreamfleet.coordinator.iteration.plan import BUNDLE, COLLECT, DATA, EVOLVE, GATE, INIT, MDNRNN, VAE, Phase
 
 
 def made(layout: Layout, paths: Iterable[Path]) -> tuple[Made, ...]:
@@ -85,6 +85,7 @@ def _left(layout: Layout, phase: Phase) -> list[Path]:
     """What a phase leaves in its round's folder, finished or not."""
     number, folder = phase.round, layout.round(phase.round)
     return {
+        INIT: [folder],
         VAE: [*folder.glob("vae.*")],
         MDNRNN: [*folder.glob("mdnrnn.*")],
         BUNDLE: [layout.bundle(number)],

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dreamfleet.common.runs import CONTROLLER
 from dreamfleet.common.seeds import VALIDATION
 from dreamfleet.coordinator.iteration.config import IterateConfig, words
 from dreamfleet.coordinator.iteration.layout import Layout
@@ -30,6 +29,10 @@ class Commands:
         """What a phase draws its chance from, each round's training and run their own; a gate's is its first track."""
         ours = self.config.seed + phase.round
         return {VAE: ours - 1, MDNRNN: ours - 1, EVOLVE: ours, GATE: GATE_SEED}.get(phase.name, self.config.seed)
+
+    def unbundle(self) -> Words:
+        """The models of the world model that the iteration goes on from."""
+        return _spelt("unbundle", self.layout.bundle(0), "--data", self.layout.round(0), "--json")
 
     def collect(self, number: int) -> Words:
         """Random drives: those of the first round, or so many more."""
@@ -56,7 +59,7 @@ class Commands:
             "train", model, "--data", self.layout.round(number), "--preset", config.preset, "--device", config.device,
             "--seed", seed, *words(f"{model}_flags", getattr(config, f"{model}_flags")), "--json",
         )  # fmt: skip
-        if number == 1:
+        if config.is_anew(number):
             return common
         before = self.layout.checkpoint(self.ledger.kept(number - 1), model)
         updates = getattr(config, f"{model}_updates")
@@ -64,8 +67,12 @@ class Commands:
         return (*common, *_spelt("--updates", updates, "--continue-from", before, *kept))
 
     def tried(self, model: str) -> Words:
-        """The same without training anything: whether its flags are of the verb."""
+        """The same without training anything: whether its flags are of the verb, and of the model to go on with."""
         return (*self.train(1, model), "--summary")
+
+    def tried_on(self) -> tuple[Words, ...]:
+        """`tried` of both models of the world model that the iteration goes on from: drives are of the same preset."""
+        return tuple(self.tried(model) for model in (VAE, MDNRNN))
 
     def encode(self, number: int) -> Words:
         """Latents of all drives."""
@@ -78,8 +85,8 @@ class Commands:
     def refit(self, number: int, path: Path) -> Words:
         """The last round's optimum fitted to this round's new world model."""
         layout = self.layout
-        optimum = layout.run(number - 1) / CONTROLLER
-        return _spelt("refit", optimum, "--to", layout.bundle(number), "--data", layout.root, "--out", path, "--json")
+        optimum, bundle = layout.optimum(number - 1), layout.bundle(number)
+        return _spelt("refit", optimum, "--to", bundle, "--data", layout.root, "--out", path, "--json")
 
     def subspace(self, number: int, path: Path) -> Words:
         """What the model that counts foretells of the last drives."""
@@ -93,7 +100,7 @@ class Commands:
         model that dreams, so there the new one has it fitted to itself.
         """
         config, layout = self.config, self.layout
-        optimum = layout.run(number - 1) / CONTROLLER
+        optimum = layout.optimum(number - 1)
         sides = {"old": (layout.bundle(self.ledger.kept(number - 1)), optimum),
                  "new": (layout.bundle(number), layout.moved(number))}  # fmt: skip
         found: dict[str, dict[str, Words]] = {side: {} for side in sides}

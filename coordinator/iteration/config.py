@@ -26,11 +26,16 @@ LEAST = {
 class IterateConfig:
     """How many rounds, and what each drives, learns, dreams and is held to."""
 
+    init: str = option(
+        "", "controller to go on from, and with it its world model: a file, or one that ships (default none)"
+    )
     rounds: int = option(5, "rounds in all: each makes a world model and evolves in its dream; more may follow later")
     preset: str = option("tiny", preset_help("training"))
-    drives: int | None = option(None, "random drives that the first world model learns from (default the preset's)")
+    drives: int | None = option(
+        None, "random drives that the first round learns from (default the preset's, 620 of tiny)"
+    )
     more_drives: int = option(0, "random drives that each later round adds")
-    own_drives: int = option(80, "drives of the last round's own means that each later round adds")
+    own_drives: int = option(80, "drives of the last round's own means, or --init's, that each round adds")
     means: int = option(4, "means that drive these: the reported one, the last one, then the best evaluated ones")
     noise: float = option(0.3, "on the actions of these drives, in halves of an action's range")
     spells: float = option(0.0, "chance of each of their steps that an action which rests, as a brake, is tried")
@@ -43,7 +48,7 @@ class IterateConfig:
     run_flags: str = option(
         "--generations 32", "flags of each round's `coordinator`, whose preset is dream unless another is named"
     )
-    later_run_flags: str = option("", "flags that follow these in each round but the first: --temperature 1")
+    later_run_flags: str = option("", "flags that follow these wherever a world model came before: --temperature 1")
     go_on: bool = option(
         False, "begin each evolution at the last round's optimum, fitted to the new model, instead of at zero"
     )
@@ -76,9 +81,13 @@ class IterateConfig:
         for name in ("vae_flags", "mdnrnn_flags", *RUN_FLAGS):
             _check_words(name, words(name, getattr(self, name)))
 
+    def is_anew(self, number: int) -> bool:
+        """Whether a round has nothing before it: no world model, no controller."""
+        return number == 1 and not self.init
+
     def flags_of_run(self, number: int) -> tuple[str, ...]:
         """The flags of a round's `coordinator`; of one that is said twice the latter counts."""
-        names = RUN_FLAGS if number > 1 else RUN_FLAGS[:1]
+        names = RUN_FLAGS[:1] if self.is_anew(number) else RUN_FLAGS
         return tuple(word for name in names for word in words(name, getattr(self, name)))
 
 

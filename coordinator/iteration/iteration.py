@@ -58,9 +58,12 @@ class Iteration:
         self.ledger.save(self._layout.ledger)
 
     def begin(self) -> None:
-        """Look whether what is finished is still there; of a new one, whether training takes its flags."""
+        """Look whether what is finished is still there; of a new one, whether training takes its flags.
+
+        With `init` its first phase looks, for then they must fit a model that is there.
+        """
         artefacts.check(self._layout, self.ledger)
-        if self.ledger.entries:
+        if self.ledger.entries or self._config.init:
             return
         commands = Commands(self._config, self._layout, self.ledger)
         for model in ("vae", "mdnrnn"):

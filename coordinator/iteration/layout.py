@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 EPISODES, ENCODED = "episodes", "encoded"
+BUNDLE, CONTROLLER = "bundle.zip", "controller.npz"  # as a run's folder has them
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,8 @@ class Layout:
         return self.round(number) / "logs" / f"{name}.log"
 
     def bundle(self, number: int) -> Path:
-        """A round's frozen world model."""
-        return self.round(number) / f"round-{number}.zip"
+        """A round's frozen world model; of round 0 beside its controller, where controllers look for theirs."""
+        return self.round(number) / (f"round-{number}.zip" if number else BUNDLE)
 
     def checkpoint(self, number: int, model: str) -> Path:
         """The weights that a round's training of `vae` or `mdnrnn` ended with."""
@@ -55,6 +56,10 @@ class Layout:
     def run(self, number: int) -> Path:
         """The folder of a round's evolution."""
         return self.runs / self.run_name(number)
+
+    def optimum(self, number: int) -> Path:
+        """The controller that a round ended with; of round 0 the one that the iteration goes on from."""
+        return (self.run(number) if number else self.round(number)) / CONTROLLER
 
     def means(self, number: int) -> Path:
         """The means of a round's run that drive for the next one, beside the world model that they see."""

@@ -12,12 +12,13 @@ from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files import read_text, write_aside
 from dreamfleet.coordinator.iteration.config import HARMLESS, IterateConfig
-from dreamfleet.coordinator.iteration.plan import ALL, BUNDLE, DATA, EVOLVE, GATE, Phase
+from dreamfleet.coordinator.iteration.plan import ALL, BUNDLE, DATA, EVOLVE, GATE, INIT, Phase
 
 FORMAT = 1
 MOST_BYTES = 256 << 20
 FIGURES: dict[str, dict[str, Any]] = {  # that later phases, or people, are told of a finished one
     **{phase: {"new": int, "episodes": int} for phase in DATA},
+    INIT: {"sha256": str, "controller": str},
     BUNDLE: {"sha256": str, "frames": int, "quality": dict},
     GATE: {"kept": bool, "why": str, "new": dict},
     EVOLVE: {"generations": int, "ended": str, "score": (dict, type(None))},
@@ -76,9 +77,12 @@ class Ledger:
         return next((each for each in self.entries if each.of == (number, phase)), None)
 
     def kept(self, number: int) -> int:
-        """The round whose world model counts after so many rounds: the last one that no gate refused."""
+        """The round whose world model counts after so many rounds: the last one that no gate refused.
+
+        0: that which the iteration goes on from.
+        """
         built = (each.round for each in self.entries if each.phase == BUNDLE and each.round <= number)
-        return max(each for each in built if self.passed(each))
+        return max((each for each in built if self.passed(each)), default=0)
 
     def passed(self, number: int) -> bool:
         """Whether a round's new world model was kept; one that was held to none is."""
@@ -153,7 +157,7 @@ class Ledger:
 
 def _check(entry: Entry) -> None:
     """`ValueError` for an entry that cannot have been written of a phase."""
-    if entry.phase not in ALL:
+    if entry.phase not in (INIT, *ALL):
         raise ValueError(f"there is no phase {entry.phase!r:.40}")
     told = _unfit(entry.figures, FIGURES.get(entry.phase, {}))
     told = told or _unfit(entry.figures.get("score") or {}, SCORE if entry.figures.get("score") else {})

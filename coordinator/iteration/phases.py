@@ -10,12 +10,16 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.common.files import is_there, write_aside
 from dreamfleet.common.runs import BUNDLE as RUN_BUNDLE
-from dreamfleet.common.runs import CONTROLLER, JOURNAL, RunFolder, open_run
+from dreamfleet.common.runs import JOURNAL, RunFolder, open_run
+from dreamfleet.common.shelf import bundle_for, find_controller
 from dreamfleet.common.stopping import Stop
 from dreamfleet.common.stored import StoredEvaluation, best_of
 from dreamfleet.coordinator.iteration import artefacts, gate
@@ -29,6 +33,7 @@ from dreamfleet.coordinator.iteration.plan import (
     ENCODE,
     EVOLVE,
     GATE,
+    INIT,
     MDNRNN,
     TAKE,
     VAE,
@@ -60,8 +65,8 @@ class Phases:
         number = phase.round
         self._lay_out(number)
         done: dict[str, Callable[[int], Outcome]] = {
-            COLLECT: self._collect, TAKE: self._take, DRIVE: self._drive, VAE: self._vae, ENCODE: self._encode,
-            MDNRNN: self._mdnrnn, BUNDLE: self._bundle, GATE: self._gate, EVOLVE: self._evolve,
+            INIT: self._init, COLLECT: self._collect, TAKE: self._take, DRIVE: self._drive, VAE: self._vae,
+            ENCODE: self._encode, MDNRNN: self._mdnrnn, BUNDLE: self._bundle, GATE: self._gate, EVOLVE: self._evolve,
         }  # fmt: skip
         return done[phase.name](number)
 
@@ -76,6 +81,22 @@ class Phases:
 
     def _call(self, number: int, name: str, words: Words) -> Any:
         return self._ask(words, self._layout.log(number, name))
+
+    def _init(self, number: int) -> Outcome:
+        """The controller that the iteration goes on from, its world model, and what training goes on from."""
+        layout, words = self._layout, self._commands.unbundle()
+        controller, bundle = find_init(self._config.init, layout.runs)
+        checkpoints = [layout.checkpoint(number, model) for model in (VAE, MDNRNN)]
+        for path in checkpoints:  # of a life that was killed
+            path.unlink(missing_ok=True)
+        _copy(bundle.path, layout.bundle(number))
+        self._call(number, INIT, words)
+        for tried in self._commands.tried_on():
+            self._call(number, INIT, tried)
+        controller.save(layout.optimum(number))
+        pilots = self._save_pilots(controller, [controller.parameters], layout.means(number), layout.bundle(number))
+        figures = {"sha256": bundle.sha256, "controller": self._config.init}
+        return Outcome((words,), figures, (layout.bundle(number), *checkpoints, layout.optimum(number), *pilots))
 
     def _collect(self, number: int) -> Outcome:
         return self._drives(number, COLLECT, self._commands.collect(number))
@@ -93,11 +114,10 @@ class Phases:
         return Outcome((words,), {"episodes": told["episodes"], "new": len(new)}, tuple(new))
 
     def _vae(self, number: int) -> Outcome:
-        if number == 1 or self._config.vae != "keep":
+        if self._config.is_anew(number) or self._config.vae != "keep":
             return self._train(number, VAE)
         before, path = (self._layout.checkpoint(each, VAE) for each in (self._ledger.kept(number - 1), number))
-        with before.open("rb") as source, write_aside(path) as target:
-            shutil.copyfileobj(source, target)
+        _copy(before, path)
         return Outcome(made=(path,))
 
     def _mdnrnn(self, number: int) -> Outcome:
@@ -164,8 +184,8 @@ class Phases:
         with open_run(layout.runs, name) as run:
             pilots, means = self._pilots(run, layout.means(number))
             told = _told(run)
-        made = [layout.run(number) / each for each in (RUN_BUNDLE, CONTROLLER)]
-        return Outcome(words, {**told, "means": means}, (*made, *pilots))
+        made = (layout.run(number) / RUN_BUNDLE, layout.optimum(number), *pilots)
+        return Outcome(words, {**told, "means": means}, made)
 
     def _ended(self, number: int) -> bool:
         if not is_there(self._layout.run(number) / JOURNAL):
@@ -177,7 +197,7 @@ class Phases:
         if is_there(self._layout.run(number) / JOURNAL):
             return self._commands.resume_run(number, crew.listen)
         start, subspace = None, None
-        if self._config.go_on and number > 1:
+        if self._config.go_on and not self._config.is_anew(number):
             start = self._layout.start(number)
             self._carry(number, start)
             subspace = self._find_subspace(number) if self._config.subspace else None
@@ -197,7 +217,7 @@ class Phases:
         """Write the last round's optimum as a controller of the world model that counts now."""
         layout = self._layout
         if self._ledger.kept(number) == self._ledger.kept(number - 1):
-            shutil.copyfile(layout.run(number - 1) / CONTROLLER, path)
+            shutil.copyfile(layout.optimum(number - 1), path)
         elif is_there(layout.moved(number)):
             shutil.copyfile(layout.moved(number), path)
         else:
@@ -205,17 +225,37 @@ class Phases:
 
     def _pilots(self, run: RunFolder, folder: Path) -> tuple[list[Path], list[int]]:
         """The means that drive for the next round, as files beside a link to their world model; their generations."""
-        folder.mkdir(parents=True, exist_ok=True)
-        if not is_there(folder / RUN_BUNDLE):
-            (folder / RUN_BUNDLE).symlink_to(Path("..", "..", "..", *run.bundle_path.parts[-3:]))
         reported = Controller.load(run.controller_path)
         told = reported.provenance.get("generation")
         others = other_means(run.evaluations(), told, self._config.means - 1)
         vectors = [reported.parameters, *(run.evaluated(each) for each in others)]
+        return self._save_pilots(reported, vectors, folder, run.bundle_path), [int(told or 0), *others]
+
+    def _save_pilots(
+        self, like: Controller, vectors: Sequence[NDArray[np.float32]], folder: Path, bundle: Path
+    ) -> list[Path]:
+        """Controllers of these parameters, beside a link to their world model, which lies in the same layout."""
+        folder.mkdir(parents=True, exist_ok=True)
+        if not is_there(folder / RUN_BUNDLE):
+            (folder / RUN_BUNDLE).symlink_to(Path("..", "..", "..", self._layout.relative(bundle)))
         paths = [folder / f"{row}.npz" for row in range(len(vectors))]
         for path, vector in zip(paths, vectors, strict=True):
-            replace(reported, parameters=vector, provenance={}).save(path)
-        return paths, [int(told or 0), *others]
+            replace(like, parameters=vector, provenance={}).save(path)
+        return paths
+
+
+def find_init(name: str, runs_dir: Path) -> tuple[Controller, Bundle]:
+    """The controller that an iteration goes on from, and its world model; a `DreamfleetError` says what is missing."""
+    controller, beside = find_controller(name, runs_dir)
+    try:
+        bundle = bundle_for(controller, None, beside)
+    except BundleError as error:
+        raise BundleError(
+            f"{error}".replace("name it with --bundle FILE", f"put it beside {name}, as {RUN_BUNDLE}")
+        ) from error
+    if bundle is None:
+        raise UsageError(f"controller {name} sees no world model, and an iteration goes on with one")
+    return controller, bundle
 
 
 def other_means(evaluations: Sequence[StoredEvaluation], reported: int | None, count: int) -> list[int]:
@@ -242,6 +282,14 @@ def _score(run: RunFolder) -> dict[str, Any] | None:
         return None
     facts = {"generation": judged.generation, "episodes": judged.episodes, "confirmed": confirmed is not None}
     return {"mean": judged.mean, "error": judged.error, **facts}
+
+
+def _copy(before: Path, path: Path) -> None:
+    try:
+        with before.open("rb") as source, write_aside(path) as target:
+            shutil.copyfileobj(source, target)
+    except OSError as error:
+        raise DatasetError(f"cannot write {path}: {error.strerror}; make room, or choose another --data") from error
 
 
 def _write_json(path: Path, content: Any) -> None:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.iteration.config import IterateConfig
 
+INIT = "init"  # of round 0: what an iteration goes on from
 COLLECT, TAKE, DRIVE = "collect", "take", "drive"  # random drives, the last run's kept ones, its means' own
 VAE, ENCODE, MDNRNN, BUNDLE, GATE, EVOLVE = "vae", "encode", "mdnrnn", "bundle", "gate", "evolve"
 DATA = (COLLECT, TAKE, DRIVE)
@@ -16,7 +17,7 @@ ALL = (*DATA, VAE, ENCODE, MDNRNN, BUNDLE, GATE, EVOLVE)
 
 
 class Phase(NamedTuple):
-    """A part of a round that is finished or not; rounds count from 1."""
+    """A part of a round that is finished or not; rounds count from 1, and 0 is what was there before them."""
 
     round: int
     name: str
@@ -28,8 +29,11 @@ class Phase(NamedTuple):
     def of(cls, text: str) -> Phase:
         """The phase that is written so; `UsageError` if it is none."""
         number, _, name = text.partition("/")
-        if not (number.isascii() and number.isdigit() and len(number) < 10 and int(number) and name in ALL):
-            raise UsageError(f"{text!r} is no phase: write ROUND/PHASE, such as 2/mdnrnn; phases are {', '.join(ALL)}")
+        known = (INIT,) if number == "0" else ALL
+        if not (number.isascii() and number.isdigit() and len(number) < 10 and name in known):
+            raise UsageError(
+                f"{text!r} is no phase: write ROUND/PHASE, such as 2/mdnrnn; phases are {', '.join(ALL)}, and 0/init"
+            )
         return cls(int(number), name)
 
 
@@ -42,16 +46,18 @@ class Plan:
 
     def phases(self, number: int) -> tuple[Phase, ...]:
         """The phases of one round, in order."""
-        first, config = number == 1, self.config
+        config, anew = self.config, self.config.is_anew(number)
         left_out = {
-            COLLECT: not (first or config.more_drives),
-            TAKE: first or not self.collects,
-            DRIVE: first or not config.own_drives,
-            GATE: first or not (config.gate_drives or config.gate_losses),
+            COLLECT: not (number == 1 or config.more_drives),
+            TAKE: number == 1 or not self.collects,
+            DRIVE: anew or not config.own_drives,
+            GATE: anew or not (config.gate_drives or config.gate_losses),
         }
         return tuple(Phase(number, name) for name in ALL if not left_out.get(name))
 
     def __iter__(self) -> Iterator[Phase]:
+        if self.config.init:
+            yield Phase(0, INIT)
         for number in range(1, self.config.rounds + 1):
             yield from self.phases(number)
 

@@ -8,7 +8,7 @@ from typing import Any
 from dreamfleet.coordinator.iteration.gate import KNOWS, LOSES
 from dreamfleet.coordinator.iteration.layout import Layout
 from dreamfleet.coordinator.iteration.ledger import Entry, Ledger
-from dreamfleet.coordinator.iteration.plan import BUNDLE, DATA, EVOLVE, GATE, MDNRNN, VAE
+from dreamfleet.coordinator.iteration.plan import BUNDLE, DATA, EVOLVE, GATE, INIT, MDNRNN, VAE
 
 SHOWN = {  # figures of training, as `train` names them
     VAE: ("reconstruction_error", "active_latents"),
@@ -26,6 +26,8 @@ def outcome(entry: Entry) -> str:
     figures = entry.figures
     if entry.phase in DATA:
         return f"{figures['new']} drives, {figures['episodes']} in all"
+    if entry.phase == INIT:
+        return f"{figures['controller']}, of {figures['sha256'][:12]}"
     if entry.phase in SHOWN:
         return ", ".join(f"{name} {figures[name]}" for name in SHOWN[entry.phase] if name in figures)
     if entry.phase == BUNDLE:
@@ -33,7 +35,8 @@ def outcome(entry: Entry) -> str:
     if entry.phase == GATE:
         return str(figures["why"])
     if entry.phase == EVOLVE:
-        return f"{figures['generations']} generations, ended after {figures['ended']}; {score(figures['score'])}"
+        told, ended = f"{figures['generations']} generations", figures["ended"]
+        return f"{told if ended == told else f'{told}, ended after {ended}'}; {score(figures['score'])}"
     return ""
 
 
@@ -41,12 +44,13 @@ def score(told: Mapping[str, Any] | None) -> str:
     """A run's best mean in reality."""
     if told is None:
         return "not evaluated"
-    return f"{told['mean']:.0f} ± {told['error']:.0f} ({told['episodes']})" + ("" if told["confirmed"] else "?")
+    provisional = "" if told["confirmed"] else ", provisional"
+    return f"{told['mean']:.0f} ± {told['error']:.0f} on {told['episodes']} tracks{provisional}"
 
 
 def rounds(layout: Layout, ledger: Ledger) -> list[dict[str, Any]]:
-    """A row a round that was begun, for programs."""
-    return [_round(layout, ledger, number) for number in sorted({each.round for each in ledger.entries})]
+    """A row a round that was begun, for programs; round 0 is none."""
+    return [_round(layout, ledger, number) for number in sorted({each.round for each in ledger.entries if each.round})]
 
 
 def rows(told: list[dict[str, Any]]) -> list[dict[str, object]]:
@@ -56,7 +60,7 @@ def rows(told: list[dict[str, Any]]) -> list[dict[str, object]]:
             "round": each["round"], "drives": each["drives"], "frames": each["frames"],
             "nats": each["quality"].get("nats_per_dimension"), "reward AUC": each["quality"].get("reward_auc"),
             KNOWS: _figure(each["gate"], KNOWS), LOSES: _figure(each["gate"], LOSES),
-            "model": _kept(each["gate"]), "best evaluation": each["score"] and score(each["score"]),
+            "model": _kept(each["gate"]), "score": each["score"] and score(each["score"]),
         }
         for each in told
     ]  # fmt: skip
@@ -81,7 +85,7 @@ def _round(layout: Layout, ledger: Ledger, number: int) -> dict[str, Any]:
         "gate": gate or None,
         "evolved_in": ledger.kept(number) if run else None,
         "score": run.get("score"),
-        "controller": str(layout.run(number) / "controller.npz") if run else None,
+        "controller": str(layout.optimum(number)) if run else None,
     }
 
 

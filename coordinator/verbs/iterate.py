@@ -6,12 +6,14 @@ import argparse
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dreamfleet.common.config import add_flags, given, load
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files import is_file
 from dreamfleet.common.listing import add_json, answer, print_rows
 from dreamfleet.common.site import offer
+from dreamfleet.common.variants import Variant
 from dreamfleet.coordinator.config import DEFAULT_BUNDLE, LimitsConfig, RunConfig
 from dreamfleet.coordinator.iteration.config import IterateConfig
 
@@ -26,6 +28,7 @@ SUMMARY = "make world models and evolve in their dreams in turn, each learning f
 EXTRAS = ("train", "views")
 PACKAGES = ("gymnasium", "matplotlib", "onnx", "onnxruntime", "safetensors", "torch")
 OURS = {"run_name": "run", "resume": None, "init": None}  # of the rounds' runs, beside those of the next line
+NOT_COMMON = ("preset", "schedule", "bundle", "searched")  # to the rounds' runs, of all settings
 OURS |= dict.fromkeys(("bundle", "seed", "runs_dir", "listen", "connect", "config", "subspace"))
 
 
@@ -64,23 +67,30 @@ def run(args: argparse.Namespace) -> int:
 def _open(args: argparse.Namespace, layout: Layout, stop: Stop) -> Iteration:
     from dreamfleet.coordinator.iteration.iteration import Iteration
     from dreamfleet.coordinator.iteration.ledger import Ledger
-    from dreamfleet.coordinator.iteration.plan import Phase
+    from dreamfleet.coordinator.iteration.phases import find_init
+    from dreamfleet.coordinator.iteration.plan import INIT, Phase
 
     begun = Ledger.load(layout.ledger)
     config = load(IterateConfig, "iterate", base=begun.settings if begun else None, **args.sources)
+    if is_file(Path(config.init)):
+        config = replace(config, init=str(Path(config.init).resolve()))
+    # Until an iteration has what it goes on from, nothing was made, and all may change.
+    new = begun is None or (not begun.entries and bool(config.init))
     more = _flags_before(args)
-    settings = _run_settings(args, [*more, *config.flags_of_run(1)], new=begun is None)
-    _run_settings(args, [*more, *config.flags_of_run(2)], new=begun is None)  # what is wrong with them is said now
-    if config.go_on and "feedback=last" in settings["variant"]:
-        raise UsageError(
-            "--go-on fits a controller to the next model, and one with feedback=last cannot be: leave one out"
-        )
-    ledger = begun.take(config, settings, layout.root) if begun else Ledger.begin(config, settings)
+    first, limits = _run_config(args, [*more, *config.flags_of_run(1)])
+    later, _ = _run_config(args, [*more, *config.flags_of_run(2)])  # what is wrong with them is said now
+    settings = {**asdict(first), **asdict(limits), **dict.fromkeys(NOT_COMMON)}
+    if new:
+        for run in (first, later):
+            _check_run(config, run, layout)
+    ledger = Ledger.begin(config, settings) if begun is None or new else begun.take(config, settings, layout.root)
     if config.local == 0 and not args.listen:
         raise UsageError("nobody would score: give --local slots here, or --listen for workers of other hosts")
     iteration = Iteration(layout, config, ledger, lambda: _crew(args, config, more, settings["task"]), stop)
     if args.redo:
-        iteration.redo(Phase.of(args.redo))
+        if (phase := Phase.of(args.redo)).name == INIT:
+            find_init(config.init, layout.runs)  # before all that came of it goes
+        iteration.redo(phase)
     iteration.begin()
     iteration.ledger.save(layout.ledger)
     return iteration
@@ -94,9 +104,30 @@ def _flags_before(args: argparse.Namespace) -> tuple[str, ...]:
     return (*file, *(() if named else ("--preset", "dream")))
 
 
-def _run_settings(args: argparse.Namespace, flags: list[str], *, new: bool) -> dict[str, Any]:
-    """What the rounds' runs have in common, as their flags, the environment and the file say; checked if it is new."""
+def _check_run(config: IterateConfig, run: RunConfig, layout: Layout) -> None:
+    """Whether a round's run could be begun: in the shipped world model, or in what the iteration goes on from."""
     from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.coordinator.iteration.phases import find_init
+    from dreamfleet.coordinator.start import find_start
+
+    run = replace(run, recorded=0.0)  # no bundle need hold such states yet
+    if not config.init:
+        settings = run.settings(find_bundle(DEFAULT_BUNDLE))
+    else:
+        if is_file(Path(config.init)) and Path(config.init).is_relative_to(layout.root.resolve()):
+            raise UsageError(f"--init {config.init} lies in the iteration's own folder: copy it elsewhere first")
+        start, (_, bundle) = find_start(config.init, layout.runs), find_init(config.init, layout.runs)
+        settings = (start.under(run) if config.go_on else run).settings(bundle)
+        if config.go_on:
+            start.check(settings)
+    if config.go_on and Variant.of(settings.task.options).feedback == "last":
+        raise UsageError(
+            "--go-on fits a controller to the next model, and one with feedback=last cannot be: leave one out"
+        )
+
+
+def _run_config(args: argparse.Namespace, flags: list[str]) -> tuple[RunConfig, LimitsConfig]:
+    """What the rounds' runs are, and when they end, as their flags, the environment and the file say."""
     from dreamfleet.common.cli import parser_of
     from dreamfleet.coordinator.verbs import coordinator
 
@@ -110,9 +141,7 @@ def _run_settings(args: argparse.Namespace, flags: list[str], *, new: bool) -> d
     )  # fmt: skip
     if limits == LimitsConfig():
         raise UsageError("a round's run would never end: give --run-flags a limit, such as --generations 32")
-    if new:
-        replace(config, recorded=0.0).settings(find_bundle(DEFAULT_BUNDLE))  # which holds no recorded states
-    return {**asdict(config), **asdict(limits), "preset": None, "schedule": None, "bundle": None, "searched": None}
+    return config, limits
 
 
 def _crew(args: argparse.Namespace, config: IterateConfig, more: tuple[str, ...], task: str) -> Crew:
@@ -147,12 +176,14 @@ def _tell(args: argparse.Namespace, layout: Layout, ledger: Ledger) -> None:
     from dreamfleet.coordinator.iteration import summary
 
     told = summary.rounds(layout, ledger)
-    best, model = summary.best(told), told[ledger.kept(told[-1]["round"]) - 1]
+    best, model = summary.best(told), str(layout.bundle(ledger.kept(told[-1]["round"])))
     if args.json:
-        answer(args, "", data=layout.root, rounds=told, best=best and best["round"], model=model["bundle"])
+        answer(args, "", data=layout.root, rounds=told, best=best and best["round"], model=model)
         return
     rows = summary.rows(told)
     print_rows(rows, right=tuple(rows[0])[1:])
-    print(f"world model: {model['bundle']}")
+    print(f"world model: {model}")
+    if init := ledger.settings.get("init"):
+        print(f"it began with {init}, which was not judged on these tracks: `dreamfleet compare` tells which is better")
     if best is not None:
         print(f"best controller: round {best['round']}'s, {summary.score(best['score'])}: {best['controller']}")

@@ -117,7 +117,7 @@ def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(rando
     [
         (
             {"variant": ("pedal=one",)},
-            "car-racing knows no option pedal: known are pedals, pedal_shift, decide_every, ",
+            "car-racing knows no option pedal: known are actions, pedals, pedal_shift, decide_every, ",
         ),
         ({"variant": ("pedals=three",)}, "pedals must be two or one, not 'three'"),
         ({"variant": ("pedals",)}, "--variant 'pedals': write KEY=VALUE, such as pedals=one"),

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import time
@@ -16,6 +17,7 @@ from dreamfleet.common.controller import Controller
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.stopping import never
 from dreamfleet.common.subspace import Subspace
+from dreamfleet.common.variants import Variant
 from dreamfleet.coordinator.iteration.commands import Commands
 from dreamfleet.coordinator.iteration.config import IterateConfig
 from dreamfleet.coordinator.iteration.layout import Layout
@@ -28,8 +30,10 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 from tests.support.drives import write_drives
 from tests.support.processes import processes_in
+from tests.support.variants import controller_of
 
 pytestmark = pytest.mark.timeout(600)
+EYES = VAEConfig(latent=4, channels=(2, 2, 2, 2))
 SECONDS = 300  # that an iteration may take
 RUN = (
     "--generations 2 --population 4 --episodes 1 --horizon 10 --evaluate-every 1 --evaluation-episodes 1"
@@ -237,6 +241,86 @@ def test_a_later_round_searches_what_its_model_foretells(processes):
         found = Subspace.load(layout.subspace(2)) if "searches all parameters" not in err else None
         assert run.settings.subspace == (found.sha256 if found else "")
         assert str(layout.start(2)) in run.fact("start")
+
+
+@pytest.fixture(scope="module")
+def pilot(tmp_path_factory):
+    """A controller beside its world model, which nobody trained."""
+    folder = tmp_path_factory.mktemp("pilot")
+    bundle = write_random_bundle(folder / "bundle.zip", 5, EYES, MDNRNNConfig(latent=4, hidden=4))
+    shape = bundle.controller_shape
+    parameters = np.random.default_rng(5).normal(size=shape.size).astype(np.float32)
+    Controller(shape, parameters, "car-racing", bundle.sha256).save(folder / "pilot.npz")
+    return folder / "pilot.npz"
+
+
+def test_an_iteration_goes_on_from_a_controller_and_its_world_model(processes, pilot):
+    layout = Layout(processes.folder / "data")
+    flags = ("--rounds", 1, "--init", pilot, "--vae", "keep", "--go-on")
+    mdnrnn = "--updates 3 --batch 2 --latent 4 --hidden 4 --validate-every 1 --done --lost 4"
+    words_of_it = words(layout.root, *flags, "--mdnrnn-flags", mdnrnn, "--json")
+    code, out, err = processes.call(*words_of_it, timeout=SECONDS)
+    assert code == 0, err
+    ledger, begun = Ledger.load(layout.ledger), Bundle.open(pilot.with_name("bundle.zip"))
+    first = ("collect", "drive", "vae", "encode", "mdnrnn", "bundle", "gate", "evolve")
+    assert list(ledger.finished) == [Phase(0, "init"), *(Phase(1, name) for name in first)]
+    assert Controller.load(layout.optimum(0)).sha256 == Controller.load(pilot).sha256
+    made = Bundle.open(layout.bundle(1))
+    assert made.read("encoder.onnx") == begun.read("encoder.onnx")
+    assert made.manifest.models["mdnrnn"]["lost"] == 4
+    assert made.manifest.provenance["episodes"] == 5, "random drives, and the controller's own"
+    with open_run(layout.runs, layout.run_name(1)) as run:
+        assert str(layout.start(1)) in run.fact("start")
+    assert json.loads(out)["model"] == str(layout.bundle(ledger.kept(1)))
+
+    away = pilot.rename(pilot.with_name("away.npz"))
+    code, _, err = processes.call("iterate", "--data", layout.root, "--redo", "0/init")
+    assert "no controller" in err
+    assert layout.bundle(1).exists(), "nothing goes before it is known to be there"
+    away.rename(pilot)
+    undone = processes.call("iterate", "--data", layout.root, "--redo", "0/init", "--rounds", 1, timeout=SECONDS)
+    assert undone[0] == 0, undone[2]
+    assert hashes(layout)["rounds/01/round-1.zip"] == made.sha256
+
+
+def test_until_it_has_what_it_goes_on_from_flags_may_be_mended(processes, pilot):
+    root = processes.folder / "data"
+    wrong = ("--mdnrnn-flags", "--latent 4 --hidden 5", "--vae-flags", "--latent 4 --channels 2 2 2 2")
+    code, _, err = processes.call("iterate", "--data", root, "--init", pilot, *wrong)
+    assert (code, "of another model: hidden 4, not 5" in err) == (1, True), err
+    code, _, err = processes.call("iterate", "--data", root, "--mdnrnn-flags", "--latent 4 --hidden 4 --nonsense 3")
+    assert "begun with" not in err
+    assert "nonsense" in err
+    inside = root / "pilot.npz"
+    for name in ("pilot.npz", "bundle.zip"):
+        shutil.copyfile(pilot.with_name(name), root / name)
+    code, _, err = processes.call("iterate", "--data", root, "--init", inside)
+    assert (code, "lies in the iteration's own folder" in err) == (2, True), err
+
+
+def test_a_controller_that_cannot_be_fitted_is_refused_at_once(processes, pilot):
+    bundle = Bundle.open(pilot.with_name("bundle.zip")).under(None, Variant(feedback="last"))
+    (processes.folder / "bundle.zip").write_bytes(pilot.with_name("bundle.zip").read_bytes())
+    controller_of(bundle).save(processes.folder / "seeing.npz")
+    flags = ("--init", processes.folder / "seeing.npz", "--go-on")
+    code, _, err = processes.call("iterate", "--data", processes.folder / "data", *flags)
+    assert (code, "--go-on fits a controller" in err) == (2, True), err
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--init", "absent.npz"), "no controller 'absent.npz'"),
+        (("--init", "tiny", "--go-on", "--run-flags", "--generations 1 --features z"), "has 867 parameters"),
+        (("--init", "tiny", "--mdnrnn-flags", "--hidden 8"), "0/init: .*of another model: hidden 256, not 8"),
+        (("--init", "tiny", "--preset", "article", "--vae", "whole"), "0/init: .*of another model: channels"),
+    ],
+)
+def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(processes, flags, said):
+    code, _, err = processes.call("iterate", "--data", processes.folder / "data", *flags)
+    assert code in (1, 2), err
+    assert re.search(said, err.replace("\n", " ")), err
+    assert not list((processes.folder / "data").glob("episodes/*.npz"))
 
 
 @pytest.mark.parametrize(

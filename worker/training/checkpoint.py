@@ -37,19 +37,27 @@ def save_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
         file.write(save({name: tensor.contiguous() for name, tensor in tensors.items()}, about))
 
 
-def load_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam | None) -> dict[str, Any] | None:
-    """Put a checkpoint back and return its progress; `None` if there is none yet."""
+def load_checkpoint(
+    path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam | None, free: frozenset[str] = frozenset()
+) -> dict[str, Any] | None:
+    """Put a checkpoint back and return its progress; `None` if there is none yet.
+
+    Of the configuration, what is `free` may be more than the checkpoint's model has: rows that it adds to a tensor
+    begin as the new model has them, the tensor's moments at zero.
+    """
     if not path.exists():
         return None
-    _check_config(path, model.config)
+    check_config(path, model.config, free)
     try:
         with safe_open(path, "pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
             progress: dict[str, Any] = json.loads(file.metadata()["progress"])
-        weights = {name: tensor for name, tensor in tensors.items() if name.startswith("model.")}
-        model.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
+        weights, moments = _named(tensors, "model."), _named(tensors, "adam.")
+        if free and load_config(path, type(model.config)) != model.config:
+            moments = _without(moments, _add_rows(weights, model))
+        model.load_state_dict(weights)
         if optimiser is not None:
-            _restore_adam(optimiser, {name: tensor for name, tensor in tensors.items() if name.startswith("adam.")})
+            _restore_adam(optimiser, moments)
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, RecursionError, SafetensorError) as error:
         raise DatasetError(
             f"checkpoint {path} does not fit or is damaged ({error}); delete it or give --new to begin anew"
@@ -85,10 +93,31 @@ def _about(path: Path) -> Mapping[str, str]:
         raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
 
 
-def _check_config(path: Path, config: Any) -> None:
-    """`DatasetError` names what a checkpoint's model has otherwise."""
+def _named(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+def _add_rows(weights: dict[str, torch.Tensor], model: torch.nn.Module) -> set[int]:
+    """Give tensors that are shorter than the model's its own last rows; which of its parameters they are."""
+    own, grown = model.state_dict(), set()
+    for index, (name, _) in enumerate(model.named_parameters()):
+        if name in weights and len(weights[name]) < len(own[name]):
+            weights[name] = torch.cat([weights[name], own[name].cpu()[len(weights[name]) :]])
+            grown.add(index)
+    return grown
+
+
+def _without(moments: Mapping[str, torch.Tensor], parameters: set[int]) -> dict[str, torch.Tensor]:
+    return {name: tensor for name, tensor in moments.items() if int(name.partition(".")[0]) not in parameters}
+
+
+def check_config(path: Path, config: Any, free: frozenset[str] = frozenset()) -> None:
+    """`DatasetError` names what a checkpoint's model has otherwise; what is `free` may have come newly."""
     stored, wanted = asdict(load_config(path, type(config))), asdict(config)
-    differing = [f"{name} {stored[name]}, not {value}" for name, value in wanted.items() if stored[name] != value]
+    if any(stored[name] for name in free):  # what is there stays what it is
+        free = frozenset()
+    differing = [f"{name} {stored[name]}, not {value}" for name, value in wanted.items()
+                 if stored[name] != value and not (name in free and value)]  # fmt: skip
     if differing:
         raise DatasetError(
             f"checkpoint {path} is of another model: {'; '.join(differing)}; give it the same flags, or --new to begin "
@@ -111,6 +140,6 @@ def load_weights(path: Path) -> dict[str, NDArray[np.float32]]:
 def _restore_adam(optimiser: torch.optim.Adam, tensors: dict[str, torch.Tensor]) -> None:
     state: dict[int, dict[str, torch.Tensor]] = {}
     for name, tensor in tensors.items():
-        _, index, key = name.split(".")
+        index, key = name.split(".")
         state.setdefault(int(index), {})[key] = tensor
     optimiser.load_state_dict({**optimiser.state_dict(), "state": state})

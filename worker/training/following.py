@@ -16,8 +16,9 @@ def follow(model: MDNRNN, rollouts: Rollouts) -> tuple[Tensor, list[Tensor]]:
     state = rollouts.mu.new_zeros(len(rollouts.mu), config.state)
     states, hidden = [], []
     for step in range(rollouts.mu.shape[1]):
-        if config.previous_reward and step:
-            state = remember(model, state, labels[:, step - 1])
+        if config.previous_reward:
+            first = torch.full_like(labels[:, 0], config.first_reward)
+            state = remember(model, state, labels[:, step - 1] if step else first)
         states.append(state)
         last, state = model.advance(torch.cat([rollouts.mu[:, step], rollouts.action[:, step]], dim=1), state)
         hidden.append(last)

@@ -182,10 +182,15 @@ def bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles]:
     """The values of the first layer `(outputs,)` below and above which nothing is told apart.
 
     An action that is cut off at a bound, such as a brake below 0, is the same however far behind it a value lies.
+    Values that are compared, of choices, are told apart wherever they lie.
     """
     outputs = controller.shape.layers[0][0]
     lowest, highest = np.full(outputs, -BOUND), np.full(outputs, BOUND)
-    actions = controller.variant.actions if not controller.variant.plain else find_task(own.manifest.task).world.actions
+    actions = (
+        controller.variant.controls if not controller.variant.plain else find_task(own.manifest.task).world.actions
+    )
+    if isinstance(actions, Continuous) and actions.choices and not controller.shape.hidden:
+        return lowest * np.inf, highest * np.inf
     if controller.shape.hidden or not isinstance(actions, Continuous) or actions.outputs_of:
         return lowest, highest
     for output, (scale, shift, low, high) in enumerate(
@@ -201,6 +206,17 @@ def bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles]:
             else:
                 highest[output] = min(highest[output], rest + RESTING)
     return lowest, highest
+
+
+def outputs_of(controller: Controller, own: Bundle) -> tuple[str, ...]:
+    """The outputs of a controller's first layer for people: actions where each has one of its own."""
+    names, count = find_task(own.manifest.task).world.action_names, controller.shape.layers[0][0]
+    plain = controller.variant.plain or not (
+        controller.variant.controls.outputs_of or controller.variant.controls.choices
+    )
+    if plain and not controller.shape.hidden and len(names) == count:
+        return names
+    return tuple(f"output {number + 1}" for number in range(count))
 
 
 def _sees(controller: Controller, own: Bundle) -> str:

@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
+from dreamfleet.common.config import option
 from dreamfleet.common.errors import UsageError
+
+
+def required(text: str) -> Any:
+    """A field without a default, and the text that `--help` shows."""
+    return field(metadata={"help": text})
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """One model's training: Adam at `rate`, `updates` of `batch` pictures or episodes."""
 
-    updates: int
-    batch: int
-    rate: float
-    clip: float = 1.0  # norm of the gradients at most; 0: any
-    seed: int = 0
-    decay: float = 1.0  # of the rate, an epoch: as many updates as show every recorded frame or drive once
-    patience: int = 0  # validations without a better held-out loss before training ends; 0: never
-    validate_every: int = 200  # updates
-    keep_every: int = field(
-        default=0,
-        metadata={
-            "help": "updates after which a checkpoint stays beside the last one, as vae.000400.safetensors; 0: none"
-        },
+    updates: int = required("updates in all, those that are made already among them")
+    batch: int = required("pictures, or drives, of an update")
+    rate: float = required("Adam's learning rate")
+    clip: float = option(1.0, "norm of the gradients at most; 0: any")
+    seed: int = option(0, "makes the training: first weights, batches and chance follow from it")
+    decay: float = option(1.0, "of the rate, an epoch: as many updates as show every recorded frame or drive once")
+    patience: int = option(0, "validations without a better held-out loss before training ends; 0: never")
+    validate_every: int = option(200, "updates after which held-out drives are looked at, and a checkpoint is written")
+    keep_every: int = option(
+        0, "updates after which a checkpoint stays beside the last one, as vae.000400.safetensors; 0: none"
     )
 
     def __post_init__(self) -> None:

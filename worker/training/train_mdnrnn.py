@@ -15,14 +15,14 @@ from dreamfleet.common.stopping import Stop, never
 from dreamfleet.worker.training.checkpoint import load_progress
 from dreamfleet.worker.training.curve import append_curve
 from dreamfleet.worker.training.dataset import episodes, load, split
-from dreamfleet.worker.training.encode import ENCODED, encoder_of
+from dreamfleet.worker.training.encode import ENCODED, encoder_of, mirrored_too
 from dreamfleet.worker.training.foresight import foresight
 from dreamfleet.worker.training.rollouts import Rollouts, ends, inputs_of, load_rollouts
 from dreamfleet.worker.training.schedule import Schedule
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.training.train_vae import Report
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss, reward_labels, reward_loss
-from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
+from dreamfleet.worker.worldmodel.mdnrnn_config import HEADS_TO_COME, REWARDED, MDNRNNConfig
 
 N = TypeVar("N", float, Tensor)
 CHECKPOINT, CURVE = "mdnrnn.safetensors", "mdnrnn.jsonl"
@@ -38,13 +38,14 @@ def train_mdnrnn(
     A stop changes nothing: all follows from the seed and the update alone. `StoppedError` if `stop` asks for one.
     """
     train, held_out = split(episodes(folder, ENCODED))
-    vae = encoder_of(folder)
+    vae, mirrors = encoder_of(folder), mirrored_too(folder)
     latents = load(train[0], "mu")["mu"].shape[1]
     if layers.latent != latents:
         raise DatasetError(f"the encoded rollouts have {latents} latents, this MDN-RNN {layers.latent}: give --latent")
     torch.manual_seed(config.seed)
     model = MDNRNN(layers).to(device)
-    schedule, curve = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from, new), folder / CURVE
+    schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from, new, HEADS_TO_COME)
+    curve = folder / CURVE
     if schedule.progress.setdefault("vae", vae) != vae:
         raise DatasetError(f"{folder / CHECKPOINT} was trained on latents of another VAE; --new begins anew")
     report(schedule.update, "")
@@ -55,7 +56,8 @@ def train_mdnrnn(
         noise = torch.Generator().manual_seed(config.seed * 1_000_003 + update)
         torch.manual_seed(config.seed * 1_000_003 + update)  # of the dropout
         chosen = random.choice(len(train), size=min(config.batch, len(train)), replace=False)
-        rollouts = load_rollouts([train[index] for index in chosen], random.random(len(chosen)) < 0.5)
+        flipped = (random.random(len(chosen)) < 0.5) & mirrors
+        rollouts = load_rollouts([train[index] for index in chosen], flipped)
         model.train()
         values = backward(model, rollouts, noise, device)
         schedule.step(sum(values.values()))

@@ -72,10 +72,10 @@ def judge(name: str, controller: Controller, bundle: Bundle | None, seeds: tuple
         for drive in evaluate(controller, bundle, seeds, jobs):
             drives.append(drive)
             bar.move(len(drives), f"mean {sum(each.score for each in drives) / len(drives):.1f}")
-    seconds, (world, host) = perf_counter() - began, judged_in(controller, bundle)
+    seconds, (world, host, threshold) = perf_counter() - began, judged_in(controller, bundle)
     return Judgement(
         name, controller.sha256, controller.task, world, bundle.sha256 if bundle else "", host,
-        package_version("dreamfleet") or "", seconds, Evaluated.of(drives).drives,
+        package_version("dreamfleet") or "", seconds, Evaluated.of(drives).drives, threshold=threshold,
     )  # fmt: skip
 
 

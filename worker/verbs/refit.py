@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.bundle import find_bundle
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.common.shelf import bundle_for, find_controller
-    from dreamfleet.worker.training.refit import last_drives, refit
+    from dreamfleet.worker.training.refit import last_drives, outputs_of, refit
 
     controller, beside = find_controller(args.controller, args.runs_dir)
     own = bundle_for(controller, args.bundle, beside)
@@ -54,8 +54,11 @@ def run(args: argparse.Namespace) -> int:
     with told(args.out):
         fitted.controller.save(args.out)
     r_squared = [None if math.isnan(each) else round(each, 4) for each in fitted.r_squared]
-    spoken = ", ".join("-" if each is None else f"{each:.2f}" for each in r_squared)
-    text = f"{args.out}: fitted on {fitted.steps} steps of {fitted.drives} drives; R² on held-out ones {spoken}"
+    spoken = ", ".join(f"{name} {'not told' if each is None else f'{each:.2f}'}"
+                       for name, each in zip(outputs_of(fitted.controller, own), r_squared, strict=False))  # fmt: skip
+    text = f"{args.out}: fitted on {fitted.steps} steps of {fitted.drives} drives; R² on held-out ones: {spoken}"
+    if None in r_squared:
+        text += " (too few drives, or it never moves)"
     if not fitted.drives:
         text = f"{args.out}: the same parameters, since both models see and remember alike"
     answer(args, text, controller=args.out, sha256=fitted.controller.sha256, bundle=fitted.controller.bundle,

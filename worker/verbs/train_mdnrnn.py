@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import TYPE_CHECKING
+
+from dreamfleet.common.listing import answer
 
 if TYPE_CHECKING:
     from dreamfleet.common.stopping import Stop
@@ -23,21 +26,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
+    from dreamfleet.worker.training.encode import unencoded
     from dreamfleet.worker.training.flags import changed
+    from dreamfleet.worker.training.origin import agreed_preset
     from dreamfleet.worker.training.presets import find_preset
     from dreamfleet.worker.training.schedule import device_of, summary
     from dreamfleet.worker.training.telling import show
     from dreamfleet.worker.training.train_mdnrnn import CHECKPOINT, train_mdnrnn
     from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
+    from dreamfleet.worker.worldmodel.mdnrnn_config import HEADS_TO_COME
 
-    preset = find_preset(args.preset)
+    preset = find_preset(agreed_preset(args.data, args.preset))
     config, layers = changed(preset.mdnrnn, args), changed(preset.mdnrnn_layers, args)
     if args.summary:
-        print(summary(MDNRNN(layers)))
+        text = summary(MDNRNN(layers), args.continue_from, HEADS_TO_COME)
+        answer(args, text, summary=text.splitlines())
         return 0
 
     def train(report: Report, stop: Stop) -> dict[str, float]:
         device, other = device_of(args.device), args.continue_from
         return train_mdnrnn(args.data, config, report, layers, device, other, stop, args.new)
 
+    if waiting := unencoded(args.data):
+        note = f"note: {waiting} drives are not encoded, and not learnt from: `dreamfleet encode --data {args.data}`"
+        print(note, file=sys.stderr)
     return show(args, "MDN-RNN", config.updates, args.data / CHECKPOINT, train)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
+from dreamfleet.common.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.fields import OPTIONAL
-from dreamfleet.worker.worldmodel.factors import check_factors, factor
+from dreamfleet.worker.worldmodel.factors import check_factors, factor, later
 
 Reward = Literal["none", "positive", "notebook", "value"]
+MOST_REWARD = 1000
 
 
 @dataclass(frozen=True)
@@ -21,21 +22,22 @@ class MDNRNNConfig:
     behind which no reward follows for so many steps either: a dream of such a model ends where the road is lost.
     """
 
-    latent: int = 32
+    latent: int = option(32, "latents of a picture, as the VAE has them")
     actions: int = 3
-    hidden: int = 256
-    mixtures: int = 5
-    reward: Reward = "positive"
-    done: bool = False
-    previous_reward: bool = False  # what the reward head told of the step before is an input
-    dropout: float = 0.0  # of the LSTM's output before the heads
-    window: int = 0  # inputs that attention looks at, the current one among them; 0: none
-    attention_units: int = 64
-    lost: int = field(
-        default=0, metadata={**OPTIONAL, "help": "steps without reward that the done head foretells as an end; 0: none"}
+    hidden: int = option(256, "units of the LSTM")
+    mixtures: int = option(5, "Gaussians a latent dimension")
+    reward: Reward = option(  # noqa: RUF009 - a name for literals
+        "positive", "what the reward head tells: none, that a reward is positive, the notebook's label, or the value"
     )
+    done: bool = option(default=False, text="a head that tells of the episode's end")
+    previous_reward: bool = option(default=False, text="what the reward head told of the step before is an input")
+    dropout: float = option(0.0, "share of the LSTM's outputs that the heads do not see while it learns and dreams")
+    window: int = option(0, "inputs that attention looks at, the current one among them; 0: none")
+    attention_units: int = option(64, "units of the attention's score")
+    lost: int = later(0, "steps without reward that the done head foretells as an end; 0: none")
     z_factor: float = factor("weighs the likelihood of the next latents")
     reward_factor: float = factor("weighs the reward head's loss")
+    first_reward: float = later(0.0, "what a drive's first step has as the previous reward's label")
 
     def __post_init__(self) -> None:
         if min(self.latent, self.actions, self.hidden, self.mixtures, self.attention_units) < 1 or self.window < 0:
@@ -49,6 +51,10 @@ class MDNRNNConfig:
         check_factors(self, "z_factor", "reward_factor")
         if self.reward_factor != 1 and self.reward == "none":
             raise UsageError("--reward-factor weighs the loss of a reward head: give --reward another kind than none")
+        if self.first_reward and not self.previous_reward:
+            raise UsageError("--first-reward is what the first step has as its --previous-reward: give that too")
+        if not abs(self.first_reward) <= MOST_REWARD:
+            raise UsageError(f"--first-reward must be from -{MOST_REWARD} to {MOST_REWARD}, not {self.first_reward}")
 
     @property
     def inputs(self) -> int:
@@ -81,8 +87,11 @@ class MDNRNNConfig:
         return 2 * self.hidden + self.previous_reward + self.window * (self.latent + self.actions)
 
 
+# What a trained model may be given behind its other heads as it learns on, and what that foretells.
+HEADS_TO_COME = frozenset({"done", "lost"})
 REWARDED = MDNRNNConfig()
 PAPER = MDNRNNConfig(reward="none")
 ARTICLE = MDNRNNConfig(previous_reward=True)
-NOTEBOOK = MDNRNNConfig(reward="notebook", previous_reward=True)
-ATTENTIVE = MDNRNNConfig(window=8)
+# Before its first action the notebook's drives have a reward of -0.1, of which its label is 1.
+NOTEBOOK = MDNRNNConfig(reward="notebook", previous_reward=True, first_reward=1.0)
+ATTENTIVE = MDNRNNConfig(window=8, hidden=236)  # 421,277 parameters, REWARDED has 422,625

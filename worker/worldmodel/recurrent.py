@@ -94,7 +94,7 @@ def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
     hidden = recurrent.advance(latent, action)
     if config.dropout:
         hidden = graph.node("Mul", hidden, graph.take("mask", kind, config.hidden))
-    order = _by_mixture(config)
+    order = by_mixture(config)
     # Half precision: the bundle holds the LSTM twice already, and its size has a limit.
     kernel, bias = graph.weight(rnn["heads.weight"][order].T), graph.constant(rnn["heads.bias"][order])
     heads = graph.node("Gemm", hidden, kernel, bias)
@@ -116,7 +116,7 @@ def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
     return graph.build()
 
 
-def _by_mixture(config: MDNRNNConfig) -> NDArray[Any]:
+def by_mixture(config: MDNRNNConfig) -> NDArray[Any]:
     """The heads' rows by (kind, mixture, latent) instead of (kind, latent, mixture): mixtures are then slices."""
     width = config.mixtures * config.latent
     rows = np.arange(3 * width).reshape(3, config.latent, config.mixtures).transpose(0, 2, 1).ravel()

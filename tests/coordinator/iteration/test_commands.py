@@ -58,6 +58,23 @@ def test_later_training_goes_on_from_the_model_that_counts(vae, decoder_only):
     assert "--decoder-only" not in later.train(3, "mdnrnn")
 
 
+def test_with_init_the_first_round_goes_on_as_later_ones_do():
+    told = commands(entry(0, "init", sha256="ab", controller="tiny"), init="tiny", vae="keep", mdnrnn_flags="--done")
+    assert said(told.unbundle()) == "unbundle data/rounds/00/bundle.zip --data data/rounds/00 --json"
+    train = said(told.train(1, "mdnrnn"))
+    assert "--seed 0 --done --json --updates 600 --continue-from data/rounds/00/mdnrnn.safetensors" in train
+    vae, mdnrnn = (said(words) for words in told.tried_on())
+    assert mdnrnn == f"{train} --summary"
+    assert "--continue-from data/rounds/00/vae.safetensors --summary" in vae, "one that stays sees the drives too"
+    assert "--episodes 80" in said(told.drive([Path("0.npz")]))
+    assert said(told.refit(1, Path("moved.npz"))).startswith("refit data/rounds/00/controller.npz --to data/rounds/01/")
+    old = said(told.gate(1)["old"]["probe"])
+    assert old.startswith("inspect data/rounds/00/bundle.zip --probe --controller data/rounds/00/controller.npz")
+    assert "--bundle data/rounds/00/bundle.zip" in said(told.begin_run(1, (), ())), "no gate has passed another"
+    run = IterateConfig(init="tiny", run_flags="--generations 3", later_run_flags="--temperature 1")
+    assert run.flags_of_run(1) == ("--generations", "3", "--temperature", "1")
+
+
 def test_both_models_are_measured_on_the_same_drives_and_tracks():
     gate = commands(*ROUND_2, entry(2, "bundle")).gate(2)
     old, new = (said(gate[side]["probe"]) for side in ("old", "new"))

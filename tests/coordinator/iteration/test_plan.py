@@ -16,6 +16,13 @@ def test_the_first_round_drives_at_random_and_is_held_to_nothing():
     assert names(plan, 1) == "collect vae encode mdnrnn bundle evolve"
 
 
+def test_an_iteration_that_goes_on_from_a_controller_lets_it_drive_and_holds_the_first_round_to_its_model():
+    plan = Plan(IterateConfig(init="tiny", rounds=1), collects=True)
+    assert plan.next([]) == (0, "init")
+    assert names(plan, 1) == "collect drive vae encode mdnrnn bundle gate evolve"
+    assert plan.next([Phase.of("0/init")]) == (1, "collect")
+
+
 def test_later_rounds_drive_what_evolved_before_and_pass_a_gate():
     assert names(Plan(IterateConfig()), 2) == "drive vae encode mdnrnn bundle gate evolve"
     assert names(Plan(IterateConfig(more_drives=5), collects=True), 3) == (
@@ -48,6 +55,12 @@ def test_a_round_whose_evolution_is_finished_gets_no_gate_behind_it():
     before = Plan(IterateConfig(rounds=2, gate_drives=0, gate_losses=0))
     finished = [*before.phases(1), *before.phases(2)]
     assert Plan(IterateConfig(rounds=2)).next(finished) is None
+
+
+@pytest.mark.parametrize("text", ["0/vae", "1/init", "0", "-1/init", "x/init"])
+def test_only_what_it_goes_on_from_is_of_round_0(text):
+    with pytest.raises(UsageError, match="is no phase"):
+        Phase.of(text)
 
 
 def test_a_phase_done_again_takes_all_behind_it_along_and_what_was_begun():

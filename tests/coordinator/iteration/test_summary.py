@@ -32,7 +32,7 @@ SECOND = (
 
 def test_a_row_a_round_tells_drives_model_gate_and_score():
     one, two = summary.rows(rounds(*FIRST, *SECOND))
-    assert list(one.values()) == [1, 620, 153_000, 0.96, 0.93, None, None, "kept", "812 ± 15 (32)"]
+    assert list(one.values()) == [1, 620, 153_000, 0.96, 0.93, None, None, "kept", "812 ± 15 on 32 tracks"]
     assert list(two.values()) == [2, 700, 170_000, 0.96, 0.93, "0.80 ± 0.01", None, "refused", None]
 
 
@@ -40,7 +40,7 @@ def test_a_round_says_whose_model_it_evolved_in():
     told = rounds(*FIRST, *SECOND, entry(2, "evolve", score={**SCORE, "mean": 900.0, "confirmed": False}))
     assert [each["evolved_in"] for each in told] == [1, 1]
     assert summary.best(told)["round"] == 2
-    assert summary.score(told[1]["score"]) == "900 ± 15 (32)?"
+    assert summary.score(told[1]["score"]) == "900 ± 15 on 32 tracks, provisional"
 
 
 def test_rounds_without_a_score_have_no_best_one():

@@ -67,6 +67,8 @@ def test_what_lies_behind_an_actions_bound_is_kept_near_it(bundles):
     for other in (controller(bundles[0], hidden=5), controller(bundles[0], variant=Variant(pedals="one"))):
         lowest, highest = bounds(other, bundles[0])
         assert (set(lowest), set(highest)) == ({-2.5}, {2.5})
+    choices = bounds(controller(bundles[0], variant=Variant(actions="discrete")), bundles[0])
+    assert np.isinf(choices).all(), "values that are compared mean something wherever they lie"
 
 
 @pytest.mark.parametrize("features", ["z", "zh"])

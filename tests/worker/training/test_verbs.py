@@ -68,6 +68,8 @@ def test_a_set_goes_on_with_drives_of_controllers(tmp_path, capsys):
     [
         (("--noise", "0.1"), "give --controller"),
         (("--spells", "0.1"), "give --controller"),
+        (("--driver", "network", "--controller", "tiny"), "leave it or --controller out"),
+        (("--driver", "ghost"), "one of random, held, .*network, not 'ghost'"),
         (("--from-run", "r", "--controller", "tiny"), "leave --controller out"),
     ],
 )
