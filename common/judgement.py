@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,11 +12,12 @@ from dreamfleet.common.bounds import LARGEST_FITNESS
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.evaluated import Drive, Evaluated
-from dreamfleet.common.fields import known
+from dreamfleet.common.fields import OPTIONAL, known
 from dreamfleet.common.files import read_text
 from dreamfleet.common.messages import Length, Seconds
 
 MARKS = (800, 900)  # scores of CarRacing that people ask about
+ENOUGH = 100  # drives for a world to be called solved, as gymnasium's threshold has been understood
 MOST_BYTES, MOST_DRIVES = 64 << 20, 10**5
 Drives = Annotated[tuple[Drive, ...], Length(1, MOST_DRIVES)]
 
@@ -35,6 +36,8 @@ class Judgement:
     seconds: Seconds
     drives: Drives
     judge: str = "gymnasium"
+    #: mean score at which gymnasium has the world for solved; `None`: it says none
+    threshold: float | None = field(default=None, metadata=OPTIONAL)
 
     @cached_property
     def evaluated(self) -> Evaluated:
@@ -48,8 +51,21 @@ class Judgement:
     @property
     def told(self) -> str:
         """In words, for people: the score, how it was driven, and what by."""
-        lines = (_score(self.evaluated), _manner(self.evaluated), self._origin)
+        lines = (_score(self.evaluated), _manner(self.evaluated), self._solved, self._origin)
         return "\n".join(filter(None, lines))
+
+    @property
+    def _solved(self) -> str:
+        """Whether that is gymnasium's mark, or how far from it; empty where the world has none."""
+        if self.threshold is None:
+            return ""
+        beyond, count = self.evaluated.mean - self.threshold, len(self.drives)
+        if beyond >= 0 and count >= ENOUGH:
+            return f"solved: gymnasium's threshold is a mean of {self.threshold:g}"
+        few = "" if count >= ENOUGH else f", on fewer than {ENOUGH} seeds"
+        return (
+            f"{abs(beyond):.1f} {'above' if beyond >= 0 else 'below'} gymnasium's threshold of {self.threshold:g}{few}"
+        )
 
     @property
     def _origin(self) -> str:

@@ -53,6 +53,20 @@ def test_people_are_told_how_it_drove_and_what_with():
     assert origin.startswith(f"2,000 environment steps in 12 s; controller {'cd' * 6}, world model {'ab' * 6}; ")
 
 
+@pytest.mark.parametrize(
+    ("mean", "count", "says"),
+    [
+        (900, 100, "solved: gymnasium's threshold is a mean of 900"),
+        (896, 100, "4.0 below gymnasium's threshold of 900"),
+        (905, 99, "5.0 above gymnasium's threshold of 900, on fewer than 100 seeds"),
+        (800, 2, "100.0 below gymnasium's threshold of 900, on fewer than 100 seeds"),
+    ],
+)
+def test_people_are_told_whether_the_world_is_solved(mean, count, says):
+    assert scored(*[mean] * count, threshold=900.0).told.splitlines()[1] == says
+    assert "threshold" not in scored(*[mean] * count).told, "where gymnasium names none"
+
+
 def test_a_report_is_read_as_it_was_written_and_tells_its_figures(tmp_path):
     path = tmp_path / "report.json"
     path.write_text(JUDGEMENT.to_json())
@@ -61,6 +75,14 @@ def test_a_report_is_read_as_it_was_written_and_tells_its_figures(tmp_path):
     assert {"mean", "std", "scores", "seeds", "task", "bundle", "judge"} < plain.keys(), "as ever"
     assert (plain["n"], plain["above_900"], plain["finished"], plain["controller"]) == (3, 1 / 3, 1, "cd" * 32)
     assert plain["drives"][1]["steps"] == 500
+
+
+def test_a_report_that_was_written_before_a_field_existed_is_read(tmp_path):
+    plain = json.loads(JUDGEMENT.to_json())
+    del plain["threshold"]
+    path = tmp_path / "older.json"
+    path.write_text(json.dumps(plain))
+    assert read_judgement(path) == JUDGEMENT
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"drives": []}', JUDGEMENT.to_json().replace("910.0", '"910"')])

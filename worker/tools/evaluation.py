@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from functools import cache
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -36,12 +36,16 @@ def evaluate(controller: Controller, bundle: Bundle | None, seeds: tuple[int, ..
         yield from (judge.drive(controller.parameters, seed) for seed in seeds)
         judge.close()
         return
+    path = bundle.path if bundle else None
+    yield from drive_in_processes(partial(_drive, spec, path, controller.parameters), seeds, jobs)
+
+
+def drive_in_processes(drive: Callable[[int], Drive], seeds: tuple[int, ...], jobs: int) -> Iterator[Drive]:
+    """What `drive`, which must be picklable, makes of each seed, in `jobs` processes; yields each as it ends."""
     pool = ProcessPoolExecutor(min(jobs, len(seeds)), get_context("spawn"), _start_process)
     try:
-        path = bundle.path if bundle else None
-        drives = [pool.submit(_drive, spec, path, controller.parameters, seed) for seed in seeds]
-        for drive in as_completed(drives):
-            yield drive.result()
+        for each in as_completed([pool.submit(drive, seed) for seed in seeds]):
+            yield each.result()
     except BrokenProcessPool as error:
         raise DreamfleetError(
             'a process that drove has crashed; in a script of your own call this under `if __name__ == "__main__":` or '
@@ -59,11 +63,12 @@ def spec_for(controller: Controller, bundle: Bundle | None) -> TaskSpec:
     )  # fmt: skip
 
 
-def judged_in(controller: Controller, bundle: Bundle | None) -> tuple[str, str]:
-    """The task of the world that a controller is judged in, and the fingerprint of this host for it."""
+def judged_in(controller: Controller, bundle: Bundle | None) -> tuple[str, str, float | None]:
+    """The task of the world that a controller is judged in, this host's fingerprint for it, and its threshold."""
     assignment = Assignment(spec_for(controller, bundle), bundle)
     task = find_task(controller.task)
-    return task.reality(assignment).name, fingerprint(task.world_of(assignment).packages)
+    reality, packages = task.reality(assignment), task.world_of(assignment).packages
+    return reality.name, fingerprint(packages), reality.world_of(assignment).threshold
 
 
 def _start_process() -> None:

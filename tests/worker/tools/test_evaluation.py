@@ -95,7 +95,7 @@ def test_what_it_writes_is_what_it_prints_and_drives_again_to_the_bit(processes,
     assert json.loads(said) == json.loads(out.read_text())
     recorded = read_judgement(out)
     assert (recorded.controller, recorded.bundle) == (controller().sha256, random_bundle.sha256)
-    assert (recorded.world, recorded.fingerprint) == judged_in(controller(), random_bundle)
+    assert (recorded.world, recorded.fingerprint, recorded.threshold) == judged_in(controller(), random_bundle)
     assert [each.finished for each in recorded.drives] == [None] * 3
     code, said, err = processes.call("reproduce", out, "--episodes", 2, "--jobs", 1)
     assert (code, "the same 2 scores to the bit" in said) == (0, True), err
