@@ -1,4 +1,4 @@
-"""Where a controller named on the command line lies, and its world model: files, a run's own, or what ships."""
+"""Where what is named on the command line lies: controllers, world models and subspaces; files, runs, or what ships."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ from pathlib import Path
 
 from dreamfleet.common.bundle import Bundle, BundleStore, default_cache, find_bundle, pretrained
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.files import is_file, is_there
 from dreamfleet.common.runs import BUNDLE, CONTROLLER, JOURNAL
+from dreamfleet.common.subspace import Subspace
+
+SUBSPACES = "subspaces"  # the folder of those that ship, each named as its world model
 
 
 def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]:
@@ -48,3 +51,18 @@ def bundle_for(controller: Controller, named: str | None, beside: Path | None = 
             )
         bundle = found
     return bundle.fitting(controller)
+
+
+def find_subspace(name: str) -> Subspace:
+    """The subspace that ships under this name, or the one in a file of it; `UsageError` if there is none."""
+    folder = pretrained() / SUBSPACES
+    shipped = folder / f"{name}.npz"
+    if is_file(shipped):
+        return Subspace.load(shipped)
+    if not is_there(Path(name)):
+        names = ", ".join(sorted(each.stem for each in folder.glob("*.npz"))) or "none"
+        raise UsageError(
+            f"no subspace {name!r}: name a file of `dreamfleet subspace`, one that ships ({names}), or none for all "
+            "parameters"
+        )
+    return Subspace.load(Path(name))

@@ -68,8 +68,8 @@ class RunConfig:
     covariance: Literal["diagonal", "full"] = option("diagonal", "the model of CMA-ES; an option of cma")
     subspace: str | None = option(
         None,
-        "a file of `dreamfleet subspace`: the search changes what controllers make of these few features alone, from "
-        "where it begins; none: everything",
+        "a file of `dreamfleet subspace`, or one that ships: the search changes what controllers make of these few "
+        "features alone, from where it begins; none: everything",
     )
     racing: bool = option(False, "let only the better half of the candidates drive the second half of the episodes")
     horizon: int = option(1000, "steps of a scored episode at most")

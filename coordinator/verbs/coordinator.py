@@ -8,7 +8,6 @@ import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.config import Table, add_flags, given, load
@@ -104,14 +103,14 @@ def _scheduled(args: argparse.Namespace, config: RunConfig) -> RunConfig:
 
 
 def _searched(config: RunConfig) -> RunConfig:
-    """The configuration with the subspace that its file holds."""
-    from dreamfleet.common.subspace import Subspace
+    """The configuration with the subspace that it names."""
+    from dreamfleet.common.shelf import find_subspace
 
     if config.subspace is None:
         return config
     if not config.subspace:
         raise UsageError(f"--subspace is empty: name a file of `dreamfleet subspace`, or {NO_SUBSPACE}")
-    return replace(config, searched=None if config.subspace == NO_SUBSPACE else Subspace.load(Path(config.subspace)))
+    return replace(config, searched=None if config.subspace == NO_SUBSPACE else find_subspace(config.subspace))
 
 
 def _resume(args: argparse.Namespace) -> int:
@@ -190,12 +189,12 @@ def _tell_frozen(args: argparse.Namespace, stored: RunFolder) -> None:
 
 def _tell_subspace(name: str | None, stored: RunFolder) -> None:
     """The run has its own, whole; the file of another one may be gone."""
-    from dreamfleet.common.subspace import Subspace
+    from dreamfleet.common.shelf import find_subspace
 
     if name is None:
         return
     try:
-        said = "" if name == NO_SUBSPACE else Subspace.load(Path(name)).sha256
+        said = "" if name == NO_SUBSPACE else find_subspace(name).sha256
     except UsageError:
         said = None
     if said != stored.settings.subspace:

@@ -23,6 +23,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--episodes", type=int, default=DRIVES, help=f"drives at most, the folder's last ones (default {DRIVES})"
     )
+    parser.add_argument(
+        "--views", type=int, default=0,
+        help="beside it so many directions that foretell what the model itself will see and remember (default 0)",
+    )  # fmt: skip
     add_json(parser)
 
 
@@ -31,6 +35,8 @@ def run(args: argparse.Namespace) -> int:
     pin_thread_pools()  # of NumPy, which is not loaded yet
     if args.episodes < 5:
         raise UsageError(f"--episodes must be at least 5, not {args.episodes}: every fifth is held out")
+    if args.views < 0:
+        raise UsageError(f"--views must not be negative, not {args.views}")
     check_out(args.out)
     from dreamfleet.common.bundle import find_bundle
     from dreamfleet.common.progress import progress_bar
@@ -39,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     bundle, paths = find_bundle(args.bundle), last_drives(args.data, args.episodes)
     with progress_bar("subspace", len(paths), "drives") as bar:
-        found = find_subspace(bundle, paths, bar.move)
+        found = find_subspace(bundle, paths, bar.move, args.views)
     subspace, r_squared = found.subspace, [round(each, 4) for each in found.r_squared]
     with told(args.out):
         subspace.save(args.out, {"drives": found.drives, "steps": found.steps, "r_squared": r_squared})

@@ -88,6 +88,32 @@ def test_its_features_foretell_held_out_drives_and_have_one_size(bundle, drives)
     assert np.corrcoef(told, np.concatenate(steering))[0, 1] > 0.8
 
 
+def test_views_are_directions_that_tell_where_the_model_itself_will_be(bundle, drives):
+    plain, wide = (find_subspace(bundle, drives[:15], ignore, views) for views in (0, 3))
+    count = len(plain.subspace.names)
+    assert wide.subspace.names[:count] == plain.subspace.names
+    views = len(wide.subspace.names) - count
+    assert 1 <= views <= 3, "as many as are foretold"
+    assert wide.subspace.names[count:] == tuple(f"view {number} 15-16" for number in range(1, views + 1))
+    np.testing.assert_array_equal(wide.subspace.weights[:count], plain.subspace.weights)
+    looking, now, then = Onlooker(bundle), [], []
+    for path in drives[15:]:
+        with np.load(path) as arrays:
+            drive = Drive(arrays["picture"], arrays["action"], arrays["reward"])
+        seen = looking.features([drive], looking.see([drive]))[0]
+        now.append(seen[20:80] @ wide.subspace.weights[count:].T + wide.subspace.offsets[count:])
+        then.append(seen[35:95])
+    told, later = np.concatenate(now), np.concatenate(then)
+    np.testing.assert_allclose(told.std(axis=0), 1, atol=0.3)
+    for column, r_squared in zip(told.T, wide.r_squared[count:], strict=True):
+        design = np.column_stack([later, np.ones(len(later))])
+        missed = column - design @ np.linalg.lstsq(design, column, rcond=None)[0]
+        assert 1 - missed.var() / column.var() >= r_squared - 0.2, "what was seen later tells it, too"
+    assert all(0.05 <= each <= 1 for each in wide.r_squared)
+    everything = find_subspace(bundle, drives[:15], ignore, 1000)
+    assert len(everything.subspace.names) <= count + 10, "no more than [z, h] has"
+
+
 def test_what_foretells_nothing_is_said(bundle, drives, tmp_path):
     with pytest.raises(UsageError, match="5 drives of 0 steps that count are too few"):
         find_subspace(bundle, [write_drive(tmp_path / "short", number, steps=30) for number in range(5)], ignore)
@@ -123,6 +149,8 @@ def test_the_verb_writes_one_and_tells_what_it_foretells(bundle, drives, folder,
     assert Subspace.load(tmp_path / "few.npz").sha256 == subspace.sha256, "equal drives make equal subspaces"
     with pytest.raises(UsageError, match="at least 5"):
         call(*flags, "--episodes", 4)
+    with pytest.raises(UsageError, match="--views must not be negative"):
+        call(*flags, "--views", -1)
     with pytest.raises(UsageError, match="is a folder"):
         call(bundle.path, "--data", folder / "data", "--out", tmp_path)
     with pytest.raises(DatasetError):
