@@ -1,0 +1,31 @@
+"""What is named on the command line: what ships before files."""
+
+import numpy as np
+import pytest
+
+from dreamfleet.common import shelf
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.shelf import find_subspace
+from dreamfleet.common.subspace import Subspace
+
+
+@pytest.fixture
+def subspace():
+    return Subspace(np.ones((2, 5), np.float32), np.zeros(2, np.float32), ("a", "b"), "ab" * 32)
+
+
+def test_a_subspace_is_one_that_ships_or_a_file(subspace, tmp_path, monkeypatch):
+    monkeypatch.setattr(shelf, "pretrained", lambda: tmp_path / "ships")
+    (tmp_path / "ships" / shelf.SUBSPACES).mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match=r"no subspace 'tiny': .* one that ships \(none\)"):
+        find_subspace("tiny")
+    subspace.save(tmp_path / "ships" / shelf.SUBSPACES / "tiny.npz", {})
+    assert find_subspace("tiny").sha256 == subspace.sha256
+    with pytest.raises(UsageError, match=r"no subspace 'few\.npz': .* one that ships \(tiny\), or none"):
+        find_subspace("few.npz")
+    subspace.save(tmp_path / "few.npz", {})
+    assert find_subspace("few.npz").sha256 == subspace.sha256
+    (tmp_path / "broken.npz").write_text("rubbish")
+    with pytest.raises(UsageError, match=r"broken\.npz is no subspace"):
+        find_subspace("broken.npz")
