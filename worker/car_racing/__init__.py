@@ -1,6 +1,7 @@
-"""CarRacing with gymnasium's own physics and a native picture of it, equal to the bit.
+"""CarRacing with gymnasium's own physics: with a native picture, equal to the bit, and seen through a frozen encoder.
 
-Importing this registers `dreamfleet/CarRacing-v3`, as gymnasium's packages of environments do.
+Importing this registers `dreamfleet/CarRacing-v3` and `dreamfleet/CarRacingLatent-v0`, as gymnasium's packages of
+environments do.
 
 >>> import gymnasium, dreamfleet.worker.car_racing
 >>> environment = gymnasium.make("dreamfleet/CarRacing-v3")
@@ -11,10 +12,17 @@ from __future__ import annotations
 import gymnasium
 
 ENVIRONMENT = "dreamfleet/CarRacing-v3"
+LATENT = "dreamfleet/CarRacingLatent-v0"
 
 gymnasium.register(
     id=ENVIRONMENT,
     entry_point="dreamfleet.worker.car_racing.environment:CarRacing",
     max_episode_steps=1000,
     reward_threshold=900,
+)
+gymnasium.register(
+    id=LATENT,
+    entry_point="dreamfleet.worker.car_racing.latent:CarRacingLatent",
+    reward_threshold=900,
+    kwargs={"bundle": "tiny"},
 )

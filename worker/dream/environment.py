@@ -1,4 +1,7 @@
-"""The dream as gymnasium environments, one and many: they observe latents, and are rendered by the decoder."""
+"""The dream as gymnasium environments, one and many: they observe latents, and are rendered by the decoder.
+
+`car_racing.latent` is the reality that observes the same.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from dreamfleet.common.actions import Actions, Discrete
-from dreamfleet.common.bundle import Bundle, find_bundle
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.worker.dream.noise import Noise, side_by_side
 from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.worldmodel.inference import Decoder
+from dreamfleet.worker.worldmodel.observation import Observation, open_bundle
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
@@ -28,19 +32,10 @@ def action_space(actions: Actions) -> Any:
     return spaces.Box(np.array(actions.low, np.float32), np.array(actions.high, np.float32))
 
 
-def latent_space(size: int) -> Any:
-    """Any latent: a Gaussian has no bounds."""
-    most = float(np.finfo(np.float32).max)
-    return spaces.Box(-most, most, (size,), np.float32)
-
-
-def open_bundle(bundle: Bundle | str) -> Bundle:
-    """A bundle, or the one of that name or file."""
-    return find_bundle(bundle) if isinstance(bundle, str) else bundle
-
-
 class CarRacingDream(gymnasium.Env[Floats, Floats]):
     """One dream: observes the latent `(latent,)`, takes CarRacing's actions `(3,)`.
+
+    With `features` `zh` the MDN-RNN's hidden state stands behind the latent, `(latent + hidden,)`.
 
     An episode is a pure function of its seed and actions. It ends where the model's done head says so, and is
     truncated after `horizon` steps. `recorded` is the share of dreams that begin where recorded drives were.
@@ -50,14 +45,15 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
 
     def __init__(
         self, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int = 1000,
-        render_mode: str | None = None, recorded: float = 0.0,
+        render_mode: str | None = None, recorded: float = 0.0, features: str = "z",
     ) -> None:  # fmt: skip
         self._bundle = open_bundle(bundle)
         self._world = DreamWorld(self._bundle, temperature, recorded=recorded)
         self._horizon = horizon
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
-        self.observation_space = latent_space(self._world.chance.latent)
+        self._observation = Observation(self._bundle, features)
+        self.observation_space = self._observation.space
         self.action_space = action_space(self._world.world.actions)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
@@ -69,7 +65,7 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         self._latent = begun.latent[None]
         self._state = self._world.begin(1, begun.memory)
         self._steps = 0
-        return self._latent[0], {"memory": begun.memory.copy()}
+        return self._observed(), {"memory": begun.memory.copy()}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Dream one step under `action` `(3,)`."""
@@ -80,11 +76,15 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         self._latent, self._state = moment.latent, moment.state
         self._steps += 1
         truncated = self._steps >= self._horizon
-        return self._latent[0], float(moment.reward[0]), bool(moment.done[0]), truncated, {}
+        return self._observed(), float(moment.reward[0]), bool(moment.done[0]), truncated, {}
 
     def render(self) -> NDArray[np.uint8] | None:
         """The picture `(side, side, 3)` that the decoder makes of the latent."""
         return None if self._decoder is None else self._decoder.decode(self._latent)[0]
+
+    def _observed(self) -> Floats:
+        seen: Floats = self._observation.of(self._latent, self._state)[0]
+        return seen
 
 
 class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
@@ -97,7 +97,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
 
     def __init__(
         self, num_envs: int, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int = 1000,
-        render_mode: str | None = None, recorded: float = 0.0,
+        render_mode: str | None = None, recorded: float = 0.0, features: str = "z",
     ) -> None:  # fmt: skip
         self._bundle = open_bundle(bundle)
         self._world = DreamWorld(self._bundle, temperature, recorded=recorded)
@@ -105,7 +105,8 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
-        self.single_observation_space = latent_space(self._world.chance.latent)
+        self._observation = Observation(self._bundle, features)
+        self.single_observation_space = self._observation.space
         self.single_action_space = action_space(self._world.world.actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -126,7 +127,7 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self._over = np.zeros(self.num_envs, dtype=bool)
         for index, each in enumerate(seeds):
             self._begin(index, each)
-        return self._latent.copy(), self._told(np.ones(self.num_envs, dtype=bool))
+        return self._observed(), self._told(np.ones(self.num_envs, dtype=bool))
 
     def step(
         self, actions: Floats
@@ -143,11 +144,14 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
             self._begin(int(index), None)
             reward[index], done[index], truncated[index] = 0.0, False, False
         self._over = done | truncated
-        return self._latent.copy(), reward, done, truncated, self._told(begun) if begun.any() else {}
+        return self._observed(), reward, done, truncated, self._told(begun) if begun.any() else {}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Each dream's picture `(side, side, 3)`."""
         return None if self._decoder is None else tuple(self._decoder.decode(self._latent))
+
+    def _observed(self) -> Floats:
+        return self._observation.of(self._latent, self._state)
 
     def _told(self, begun: Flags) -> dict[str, Any]:
         """What `info` says of dreams that have just begun, as gymnasium's vector environments say it."""

@@ -15,7 +15,7 @@ from dreamfleet.worker.inspection.likeness import compare as alike
 from dreamfleet.worker.inspection.losses import Compared, LossConfig, compare, gather
 from dreamfleet.worker.inspection.witness import WitnessConfig, WitnessedDrive, witness
 from dreamfleet.worker.scoring.hand import Hand, controllers_hand, drivers_hands
-from dreamfleet.worker.scoring.mind import Mind
+from dreamfleet.worker.worldmodel.mind import Mind
 
 Told = Callable[[int], None]
 

@@ -20,9 +20,9 @@ from dreamfleet.worker.scoring.disturbance import Disturbance
 from dreamfleet.worker.scoring.disturbed import Disturbed
 from dreamfleet.worker.scoring.episode import Begin, Course, play
 from dreamfleet.worker.scoring.hand import Hand
-from dreamfleet.worker.scoring.mind import Mind
 from dreamfleet.worker.tasks.api import Assignment, Collected, Task, Truthful
 from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.worldmodel.mind import Mind
 
 Floats = NDArray[np.float32]
 Truth = dict[str, NDArray[np.float64]]

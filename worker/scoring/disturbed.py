@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dreamfleet.worker.scoring.disturbance import Disturbance
 from dreamfleet.worker.scoring.hand import Hand
-from dreamfleet.worker.scoring.mind import Mind
 from dreamfleet.worker.scoring.spells import Spells
+from dreamfleet.worker.worldmodel.mind import Mind
 
 Floats = NDArray[np.float32]
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError, UsageError
-from dreamfleet.worker.scoring.mind import Mind
 from dreamfleet.worker.tasks.api import Collected
 from dreamfleet.worker.tasks.policy import Driver
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.inference import Controllers
+from dreamfleet.worker.worldmodel.mind import Mind
 
 Floats = NDArray[np.float32]
 

@@ -11,9 +11,9 @@ from dreamfleet.common.errors import ControllerError
 from dreamfleet.worker.scoring.disturbance import Disturbance
 from dreamfleet.worker.scoring.disturbed import Disturbed
 from dreamfleet.worker.scoring.hand import ControllersHand
-from dreamfleet.worker.scoring.mind import Mind
 from dreamfleet.worker.scoring.spells import Spells
 from dreamfleet.worker.training.world import WORLD, find_world
+from dreamfleet.worker.worldmodel.mind import Mind
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,14 @@ from gymnasium.utils.env_checker import check_env
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.dream import ENVIRONMENT
 from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreams
+from dreamfleet.worker.worldmodel.inference import DreamStep
 
 ACTION = np.array([0.1, 0.5, 0.0], np.float32)
 
 
-def test_gymnasium_accepts_it(random_bundle):
-    made = gymnasium.make(ENVIRONMENT, bundle=random_bundle, render_mode="rgb_array")
+@pytest.mark.parametrize("features", ["z", "zh"])
+def test_gymnasium_accepts_it(random_bundle, features):
+    made = gymnasium.make(ENVIRONMENT, bundle=random_bundle, render_mode="rgb_array", features=features)
     check_env(made.unwrapped)
     made.reset(seed=1)
     assert made.render().shape == (64, 64, 3)
@@ -33,12 +35,25 @@ def test_a_dream_is_a_function_of_seed_and_actions(random_bundle):
     assert np.array_equal(first, dream(3))
 
 
-def test_many_dreams_are_the_single_ones(random_bundle):
+def test_the_hidden_state_behind_the_latent_is_what_a_controller_remembers(random_bundle):
+    environment, memory = CarRacingDream(random_bundle, features="zh"), DreamStep(random_bundle)
+    size, state = random_bundle.manifest.latent, memory.zero_state(1)
+    seen, _ = environment.reset(seed=3)
+    for _ in range(4):
+        assert np.array_equal(seen[size:], state[0, : memory.hidden_size])
+        state = memory.advance(seen[None, :size], ACTION[None], state)
+        seen, *_ = environment.step(ACTION)
+    assert seen[size:].any()
+
+
+@pytest.mark.parametrize("features", ["z", "zh"])
+def test_many_dreams_are_the_single_ones(random_bundle, features):
     many = gymnasium.make_vec(
-        ENVIRONMENT, num_envs=3, bundle=random_bundle, vectorization_mode="vector_entry_point", horizon=4
-    )
+        ENVIRONMENT, num_envs=3, bundle=random_bundle, vectorization_mode="vector_entry_point", horizon=4,
+        features=features,
+    )  # fmt: skip
     assert isinstance(many.unwrapped, CarRacingDreams)
-    single = [CarRacingDream(random_bundle, horizon=4) for _ in range(3)]
+    single = [CarRacingDream(random_bundle, horizon=4, features=features) for _ in range(3)]
     latents, _ = many.reset(seed=10)
     assert np.array_equal(latents, np.stack([each.reset(seed=10 + index)[0] for index, each in enumerate(single)]))
     for _ in range(4):

@@ -14,7 +14,7 @@ from dreamfleet.worker.inspection.losses import CALM, LossConfig, compare, gathe
 from dreamfleet.worker.inspection.tables import knowledge_rows, loss_rows
 from dreamfleet.worker.inspection.witness import OFF, WitnessConfig, witness
 from dreamfleet.worker.scoring.hand import ControllersHand
-from dreamfleet.worker.scoring.mind import Mind
+from dreamfleet.worker.worldmodel.mind import Mind
 
 CONFIG, DRIVEN = LossConfig(losses=6, before=(20, 0), dreams=2), WitnessConfig()
 

@@ -7,7 +7,7 @@ from dreamfleet.common.variants import Variant
 from dreamfleet.worker.inspection.imagination import Beginning, Imagination
 from dreamfleet.worker.inspection.measuring import Driving
 from dreamfleet.worker.inspection.witness import WitnessConfig, witness
-from dreamfleet.worker.scoring.mind import Mind
+from dreamfleet.worker.worldmodel.mind import Mind
 from tests.support.bundles import write_random_bundle
 from tests.support.variants import controller_of
 

@@ -11,10 +11,10 @@ from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.worker.inspection.witness import OFF, WitnessConfig, first_stays, witness
 from dreamfleet.worker.scoring.episode import Course, play
 from dreamfleet.worker.scoring.hand import ControllersHand, controllers_hand, drivers_hands
-from dreamfleet.worker.scoring.mind import Mind
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.mind import Mind
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 

@@ -9,8 +9,8 @@ from dreamfleet.common.shelf import find_controller
 from dreamfleet.worker.scoring.disturbance import Disturbance, pushed
 from dreamfleet.worker.scoring.disturbed import Disturbed
 from dreamfleet.worker.scoring.hand import ControllersHand
-from dreamfleet.worker.scoring.mind import Mind
 from dreamfleet.worker.scoring.spells import Spells
+from dreamfleet.worker.worldmodel.mind import Mind
 
 
 def test_noise_is_as_large_as_is_said_and_touches_no_action_at_its_bound():

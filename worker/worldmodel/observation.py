@@ -1,0 +1,41 @@
+"""What an agent of one's own observes of a world model: the same in its dream and in reality."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from dreamfleet.common.bundle import Bundle, find_bundle
+from dreamfleet.common.errors import UsageError
+
+Floats = NDArray[np.float32]
+FEATURES = ("z", "zh")
+
+
+class Observation:
+    """`z`: the latent. `zh`: behind it the MDN-RNN's hidden state, which alone tells of movement."""
+
+    def __init__(self, bundle: Bundle, features: str) -> None:
+        """`UsageError` for features that are neither."""
+        if features not in FEATURES:
+            raise UsageError(f"an agent's features are {' or '.join(FEATURES)}, not {features!r}")
+        self._hidden = bundle.manifest.hidden if features == "zh" else 0
+        self.size = bundle.shape_of(features).features
+
+    @property
+    def space(self) -> Any:
+        """Any numbers `(size,)`: a Gaussian has no bounds."""
+        most = float(np.finfo(np.float32).max)
+        return spaces.Box(-most, most, (self.size,), np.float32)
+
+    def of(self, latent: Floats, state: Floats) -> Floats:
+        """The observations `(N, size)`, a copy, of `latent` `(N, latent)` and the model's `state` `(N, state)`."""
+        return np.concatenate([latent, state[:, : self._hidden]], axis=1)
+
+
+def open_bundle(bundle: Bundle | str) -> Bundle:
+    """A bundle, or the one of that name or file."""
+    return find_bundle(bundle) if isinstance(bundle, str) else bundle
