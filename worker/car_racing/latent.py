@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.worker.car_racing.check import make_car_racing
-from dreamfleet.worker.car_racing.task import CarRacing, judge_seeing
+from dreamfleet.worker.car_racing.task import WORLD, CarRacing, judge_seeing
 from dreamfleet.worker.worldmodel.mind import Mind
 from dreamfleet.worker.worldmodel.observation import Observation, open_bundle
 
@@ -20,12 +20,12 @@ Floats = NDArray[np.float32]
 class CarRacingLatent(gymnasium.Env[Floats, Floats]):
     """Gymnasium's own CarRacing, observed and driven as `CarRacingDream` is: latent `(latent,)`, actions `(3,)`.
 
-    The latent is the encoder's mean of the picture and `features` `zh` adds the MDN-RNN's hidden state, both as
-    controllers see them, to the bit. Rewards, ends and `info` are gymnasium's, and an episode is a whole one. With
-    `native` the picture is drawn natively where that is exact, which is faster and changes nothing else.
+    The latent is the encoder's mean; `features` `zh` puts the MDN-RNN's hidden state behind it. Both are what
+    controllers see, to the bit. Rewards, ends and `info` are gymnasium's, and an episode is a whole one. With `native`
+    the picture is drawn natively where that is exact, which is faster and changes nothing else.
     """
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 50}  # noqa: RUF012 - gymnasium's name
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": WORLD.frames_per_second}  # noqa: RUF012
 
     def __init__(
         self, bundle: Bundle | str = "tiny", features: str = "z", render_mode: str | None = None, *,
