@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dreamfleet.common.agent import TrainedAgent, is_agent
 from dreamfleet.common.bundle import Bundle, BundleStore, default_cache, find_bundle, pretrained
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
@@ -15,10 +16,21 @@ SUBSPACES = "subspaces"  # the folder of those that ship, each named as its worl
 
 
 def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]:
-    """The controller, and the bundle that lies beside it if one does."""
+    """The controller, and the bundle that lies beside it if one does; `ControllerError` for a trained agent."""
+    found, beside = find_agent(name, runs_dir)
+    if isinstance(found, TrainedAgent):
+        raise ControllerError(
+            f"{name} is a trained agent, which `evaluate`, `record` and `reproduce` take: a controller's parameters "
+            "are needed here"
+        )
+    return found, beside
+
+
+def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Path | None]:
+    """Who is to drive, a controller or a trained agent, and the bundle that lies beside it if one does."""
     path, run, shipped = Path(name), runs_dir / name, pretrained() / f"{name}.npz"
     if is_file(path):
-        return Controller.load(path), path.parent / BUNDLE
+        return TrainedAgent.load(path) if is_agent(path) else Controller.load(path), path.parent / BUNDLE
     if is_file(run / CONTROLLER):
         return Controller.load(run / CONTROLLER), run / BUNDLE
     if is_file(shipped):
@@ -32,12 +44,12 @@ def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]
     raise ControllerError(f"no controller {name!r}: give a file, a run, or one that ships: {names}")
 
 
-def bundle_for(controller: Controller, named: str | None, beside: Path | None = None) -> Bundle | None:
+def bundle_for(controller: Controller | TrainedAgent, named: str | None, beside: Path | None = None) -> Bundle | None:
     """The world model that a controller was evolved with: as named, beside the controller, cached or shipped.
 
-    `None` for a task that needs none.
+    `None` for a task that needs none, and for a trained agent.
     """
-    if not controller.bundle:
+    if isinstance(controller, TrainedAgent) or not controller.bundle:
         return None
     if named is not None:
         bundle = find_bundle(named)

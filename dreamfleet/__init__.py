@@ -26,7 +26,14 @@ if TYPE_CHECKING:
     from dreamfleet.common.tasks import Description
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Task, World
-    from dreamfleet.worker.tools.face import evaluate, find_controller, make_environment, make_policy, open_run
+    from dreamfleet.worker.tools.face import (
+        evaluate,
+        find_agent,
+        find_controller,
+        make_environment,
+        make_policy,
+        open_run,
+    )
 
 _HOMES = {
     "Bundle": "common.bundle",
@@ -43,6 +50,7 @@ _HOMES = {
     "TaskSpec": "common.messages",
     "World": "worker.tasks.api",
     "evaluate": "worker.tools.face",
+    "find_agent": "worker.tools.face",
     "find_bundle": "common.bundle",
     "find_controller": "worker.tools.face",
     "make_environment": "worker.tools.face",
@@ -64,6 +72,7 @@ __all__ = [
     "TaskSpec",
     "World",
     "evaluate",
+    "find_agent",
     "find_bundle",
     "find_controller",
     "make_environment",

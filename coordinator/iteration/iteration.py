@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import time
 from collections.abc import Callable, Iterator
@@ -11,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.errors import DatasetError, DreamfleetError, StoppedError, UsageError
+from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.processes import spoken
 from dreamfleet.common.stopping import Stop
 from dreamfleet.coordinator.iteration import artefacts
@@ -25,22 +24,6 @@ from dreamfleet.coordinator.iteration.plan import Phase, Plan
 from dreamfleet.coordinator.iteration.process import ask, run
 
 log = logging.getLogger("dreamfleet.coordinator.iterate")
-
-
-@contextmanager
-def held(layout: Layout) -> Iterator[None]:
-    """Hold the folder, which is made if it is not there; `UsageError` while another iteration works in it."""
-    try:
-        layout.root.mkdir(parents=True, exist_ok=True)
-        file = layout.lock.open("w")
-    except OSError as error:
-        raise DatasetError(f"cannot write in {layout.root}: {error.strerror}; choose another --data") from error
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UsageError(f"another iteration works in {layout.root}: stop it first") from None
-        yield
 
 
 class Iteration:

@@ -49,15 +49,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Go on until all rounds are finished, and tell what came of them."""
+    from dreamfleet.common.holding import held
     from dreamfleet.common.stopping import heeding_signals
-    from dreamfleet.coordinator.iteration.iteration import held
     from dreamfleet.coordinator.iteration.layout import Layout
 
     for package in PACKAGES:
         if find_spec(package) is None:  # said now rather than after hours
             raise ModuleNotFoundError(name=package)
     layout = Layout(args.data)
-    with held(layout), heeding_signals() as stop:
+    with held(layout.lock, "iteration"), heeding_signals() as stop:
         iteration = _open(args, layout, stop)
         _go_on(iteration)
     _tell(args, layout, iteration.ledger)

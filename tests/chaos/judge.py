@@ -50,8 +50,8 @@ def evolve(processes, seed):
 
 def drive(controller):
     """Scores on the fresh tracks, in this process."""
+    from dreamfleet.worker.scoring.agents import spec_for
     from dreamfleet.worker.scoring.scorer import Scorer
-    from dreamfleet.worker.tools.evaluation import spec_for
 
     bundle = find_bundle(SETTINGS["bundle"])
     scorer = Scorer(spec_for(controller, bundle), bundle)

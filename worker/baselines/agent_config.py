@@ -7,7 +7,10 @@ from itertools import pairwise
 from typing import Any, Literal
 
 from dreamfleet.common.actions import FIVE_CHOICES
+from dreamfleet.common.agent import MOST_HELD
 from dreamfleet.common.errors import UsageError
+
+MOST_PARAMETERS = 50_000_000  # a network that is exported is read within bounds
 
 # Steering, gas, brake of each choice, in gymnasium's order: nothing, right, left, gas, brake.
 CHOICES: dict[str, tuple[tuple[float, ...], ...]] = {
@@ -52,6 +55,13 @@ class AgentConfig:
             raise UsageError("--channels, --kernels, --strides, --hidden and --frame-skip must be at least 1")
         if min(self.sides) < 1:
             raise UsageError(f"--kernels and --strides leave nothing of {self.picture} pixels: make them smaller")
+        if self.frame_skip > MOST_HELD:
+            raise UsageError(f"--frame-skip must be at most {MOST_HELD}, not {self.frame_skip}")
+        if self.parameters > MOST_PARAMETERS:
+            raise UsageError(
+                f"these layers have {self.parameters:,} parameters, {MOST_PARAMETERS:,} at most are learnt: make "
+                "--channels, --kernels or --hidden smaller"
+            )
 
     @property
     def sides(self) -> tuple[int, ...]:
@@ -70,6 +80,13 @@ class AgentConfig:
     def planes(self) -> tuple[tuple[int, int], ...]:
         """Channels before and after each convolution."""
         return tuple(pairwise((3, *self.channels)))
+
+    @property
+    def parameters(self) -> int:
+        """Of convolutions and LSTM, which are nearly all, without biases."""
+        layers = zip(self.planes, self.kernels, strict=True)
+        looking = sum(before * after * kernel**2 for (before, after), kernel in layers)
+        return int(looking + 4 * self.hidden * (self.flat + self.hidden))
 
     @property
     def table(self) -> tuple[tuple[float, ...], ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +13,7 @@ AT_LEAST_ONE = (
     "episodes", "steps", "batch", "trace", "n_step", "epsilon_episodes", "learn_every", "target_every", "replay",
     "report_every",
 )  # fmt: skip
+MOST = 2**63 - 1  # of whole numbers: what torch and NumPy take
 NOT_NEGATIVE = ("random_episodes", "patience", "burn_in", "clip", "seed")
 
 
@@ -42,16 +44,21 @@ class LearningConfig:
     seed: int = said(0, "makes the training")
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, float) and not math.isfinite(value):
+                raise UsageError(f"{_flag(name)} must be a number, not {value}")
+            if isinstance(value, int) and value > MOST:
+                raise UsageError(f"{_flag(name)} must be at most {MOST}, not {value}")
         for name in AT_LEAST_ONE:
             if getattr(self, name) < 1:
                 raise UsageError(f"{_flag(name)} must be at least 1, not {getattr(self, name)}")
         for name in NOT_NEGATIVE:
-            if not getattr(self, name) >= 0:  # true of NaN too
+            if getattr(self, name) < 0:
                 raise UsageError(f"{_flag(name)} must not be negative, not {getattr(self, name)}")
         for name in ("gamma", "epsilon_first", "epsilon_last"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"{_flag(name)} must be from 0 to 1, not {getattr(self, name)}")
-        if not self.rate > 0:
+        if self.rate <= 0:
             raise UsageError(f"--rate must be positive, not {self.rate}")
 
 

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.actions import FIVE_CHOICES, STEERING_GAS_BRAKE
+from dreamfleet.worker.car_racing.choosing import ChoosingPolicy
 
 if TYPE_CHECKING:
     from dreamfleet.worker.baselines.network import Memory, QNetwork
 
 Floats = NDArray[np.float32]
-NOTHING = np.zeros(0, np.float32)  # the parameters of who has none
 
 
 class RandomPolicy:
@@ -32,41 +32,27 @@ class RandomPolicy:
         return self._random.uniform(STEERING_GAS_BRAKE.low, STEERING_GAS_BRAKE.high).astype(np.float32)
 
 
-class QPolicy:
-    """The choice of most worth, or with a chance of `epsilon` any; held for the agent's `frame_skip` steps.
+class QPolicy(ChoosingPolicy):
+    """The choice of most worth, or with a chance of `epsilon` any: as it learns, on torch.
 
     The memory goes through time with each decision, also where chance decides; where it always does, nobody looks.
     """
 
     def __init__(self, network: QNetwork, epsilon: float = 0.0, random: np.random.Generator | None = None) -> None:
         """`random` is needed where `epsilon` is not 0."""
+        super().__init__(network.config.table, network.config.frame_skip)
         self._network, self._epsilon, self._random = network, epsilon, random
-        self._table = np.array(network.config.table, np.float32)
         self._memory: Memory | None = None
-        self._held = 0
-        self.choice = 0
 
-    @property
-    def decided(self) -> bool:
-        """Whether the last action was a new decision, and not one that was held."""
-        return self._held == 1
+    def forget(self) -> None:
+        """Nothing is remembered."""
+        self._memory = None
 
-    def begin(self, _parameters: Floats) -> None:
-        """Begin an episode: nothing is remembered."""
-        self._memory, self._held = None, 0
-
-    def act(self, observation: NDArray[np.uint8]) -> Floats:
-        """Steering, gas and brake `(3,)` for one picture."""
-        if self._held in (0, self._network.config.frame_skip):
-            self.choice, self._held = self._choose(observation), 0
-        self._held += 1
-        action: Floats = self._table[self.choice]
-        return action
-
-    def _choose(self, picture: NDArray[np.uint8]) -> int:
+    def choose(self, picture: NDArray[np.uint8]) -> int:
+        """The best, or any."""
         best = self._best(picture) if self._epsilon < 1 else 0
         if self._random is not None and self._random.random() < self._epsilon:
-            return int(self._random.integers(len(self._table)))
+            return int(self._random.integers(len(self._network.config.table)))
         return best
 
     def _best(self, picture: NDArray[np.uint8]) -> int:

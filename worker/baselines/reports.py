@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
-from typing import Any
 
-Record = dict[str, Any]
-"""Of an episode: `score`, environment `steps`, `decisions`, `epsilon`, mean `loss` (`None` where nothing is learnt)."""
+from dreamfleet.worker.baselines.progress import Driven
 
 
 @dataclass(frozen=True)
@@ -26,18 +24,18 @@ class Report:
         return f"episode {self.episode}: mean {self.mean:.1f}, best {self.most:.1f}, epsilon {self.epsilon:.2f}, {loss}"
 
 
-def reports(records: Sequence[Record], every: int) -> list[Report]:
+def reports(records: Sequence[Driven], every: int) -> list[Report]:
     """A report for each whole group of `every` episodes."""
     ends = range(every, len(records) + 1, every)
     return [_report(records[end - every : end], end) for end in ends]
 
 
-def reached(records: Sequence[Record], every: int, goal: float) -> bool:
+def reached(records: Sequence[Driven], every: int, goal: float) -> bool:
     """Whether the episodes of a report had a mean score of `goal`."""
     return any(each.mean >= goal for each in reports(records, every))
 
 
-def _report(records: Sequence[Record], episode: int) -> Report:
-    scores = [each["score"] for each in records]
-    losses = [each["loss"] for each in records if each["loss"] is not None]
-    return Report(episode, fmean(scores), max(scores), records[-1]["epsilon"], fmean(losses) if losses else None)
+def _report(records: Sequence[Driven], episode: int) -> Report:
+    scores = [each.score for each in records]
+    losses = [each.loss for each in records if each.loss is not None]
+    return Report(episode, fmean(scores), max(scores), records[-1].epsilon, fmean(losses) if losses else None)

@@ -15,6 +15,7 @@ import torch
 
 from dreamfleet.common.errors import StoppedError
 from dreamfleet.common.files import write_aside
+from dreamfleet.common.holding import held
 from dreamfleet.common.seeds import training_seed
 from dreamfleet.common.stopping import Stop, never
 from dreamfleet.worker.baselines.agent_config import AgentConfig
@@ -23,9 +24,11 @@ from dreamfleet.worker.baselines.kept import drop_kept, keep, read_kept
 from dreamfleet.worker.baselines.learner import Learner
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 from dreamfleet.worker.baselines.network import Networks
-from dreamfleet.worker.baselines.policies import NOTHING, QPolicy
-from dreamfleet.worker.baselines.reports import Record, Report, reached, reports
+from dreamfleet.worker.baselines.policies import QPolicy
+from dreamfleet.worker.baselines.progress import Driven, Progress, progress_of
+from dreamfleet.worker.baselines.reports import Report, reached, reports
 from dreamfleet.worker.baselines.traces import Episode, Replay, oldest_kept
+from dreamfleet.worker.car_racing.agents import NOTHING
 from dreamfleet.worker.car_racing.check import make_car_racing
 from dreamfleet.worker.scoring.episode import Course, Moment, play
 from dreamfleet.worker.training.checkpoint import load_checkpoint, save_checkpoint
@@ -34,7 +37,7 @@ from dreamfleet.worker.training.room import told_where_full
 from dreamfleet.worker.training.schedule import keep_triton_from_mesa, same_command
 from dreamfleet.worker.training.world import preprocessing_to
 
-CHECKPOINT, CURVE = "drqn.safetensors", "drqn.jsonl"
+CHECKPOINT, CURVE, LOCK = "drqn.safetensors", "drqn.jsonl", "drqn.lock"
 
 Hear = Callable[[int, Report | None], None]
 """Told the episodes that are driven, and a report where one is due."""
@@ -51,9 +54,10 @@ def train_drqn(
     """Train, or go on, to `config.episodes` or the goal; returns the figures of the training.
 
     A checkpoint follows each episode, and everything in an episode follows from the seed, its number and the checkpoint
-    before it: whoever is stopped or killed drives the episode again, to the same bits. `StoppedError` if `stop` asks.
+    before it: whoever is stopped or killed drives the episode again, to the same bits. `StoppedError` if `stop` asks,
+    `UsageError` while another process trains in the folder: the two would drop each other's episodes.
     """
-    with on_one_thread():
+    with held(folder / LOCK, "training"), on_one_thread():
         training = Training(folder, layers, config, device, new)
         hear(training.episodes, None)
         try:
@@ -77,13 +81,14 @@ class Training:
         self._networks = Networks(layers).to(device)
         keep_triton_from_mesa()
         self._optimiser = torch.optim.Adam(self._networks.online.parameters(), lr=config.rate)
-        self._records: list[Record] = []
+        self._records: list[Driven] = []
         self._oldest = 0  # the first episode that replay holds
         self._replay = Replay(config)
-        found = None if new else load_checkpoint(self._path, self._networks, self._optimiser)
-        self._learner = Learner(self._networks, self._optimiser, config, found["update"] if found else 0)
+        plain = None if new else load_checkpoint(self._path, self._networks, self._optimiser)
+        found = None if plain is None else progress_of(self._path, plain)
+        self._learner = Learner(self._networks, self._optimiser, config, found.update if found else 0)
         if found is not None:
-            self._go_on(found["episodes"], found["oldest"])
+            self._go_on(found)
         else:
             self.save()
             shutil.rmtree(folder / "replay", ignore_errors=True)
@@ -110,7 +115,7 @@ class Training:
     def figures(self) -> dict[str, float]:
         """Of the whole training: episodes, updates, mean of the last report's episodes, best report."""
         every = self._config.report_every
-        means = [each.mean for each in reports(self._records, every)] or [self._records[-1]["score"]]
+        means = [each.mean for each in reports(self._records, every)] or [self._records[-1].score]
         goal = reached(self._records, every, self._config.goal)
         return {"episodes": self.episodes, "updates": self._learner.updates, "mean_score": round(means[-1], 2),
                 "best_mean_score": round(max(means), 2), "goal_reached": goal}  # fmt: skip
@@ -124,7 +129,7 @@ class Training:
         policy.begin(NOTHING)
         drive, losses = Drive(), []
         course = Course(training_seed(config.seed, number, 0), config.steps, config.patience)
-        before = sum(each["decisions"] for each in self._records)
+        before = sum(each.decisions for each in self._records)
         for moment in play(self._environment, policy, course):
             if stop():
                 self._leave()
@@ -135,16 +140,14 @@ class Training:
         episode = drive.episode
         keep(self._folder, number, episode)
         self._replay.add(episode)
-        self._records.append({
-            "score": drive.score, "steps": drive.steps, "decisions": len(episode), "epsilon": epsilon,
-            "loss": fmean(losses) if losses else None,
-        })  # fmt: skip
+        loss = fmean(losses) if losses else None
+        self._records.append(Driven(drive.score, drive.steps, len(episode), epsilon, loss))
 
     def save(self) -> None:
         """Write the checkpoint, then the curve that follows from it; drop the episodes that nothing needs any more."""
         self._oldest = max(self._oldest, self._first_to_keep)
-        progress = {"update": self._learner.updates, "oldest": self._oldest, "episodes": self._records}
-        save_checkpoint(self._path, self._networks, self._optimiser, progress)
+        progress = Progress(self._learner.updates, self._oldest, tuple(self._records), asdict(self._config))
+        save_checkpoint(self._path, self._networks, self._optimiser, asdict(progress))
         self._draw()
         drop_kept(self._folder, self._oldest)
 
@@ -158,14 +161,14 @@ class Training:
 
     @property
     def _first_to_keep(self) -> int:
-        return oldest_kept([each["decisions"] for each in self._records], self._config.replay)
+        return oldest_kept([each.decisions for each in self._records], self._config.replay)
 
-    def _go_on(self, records: list[Record], oldest: int) -> None:
-        self._records = records
-        self._oldest = max(oldest, self._first_to_keep)
+    def _go_on(self, found: Progress) -> None:
+        self._records = list(found.episodes)
+        self._oldest = max(found.oldest, self._first_to_keep)
         for group in self._optimiser.param_groups:
             group["lr"] = self._config.rate
-        for number in range(self._oldest, len(records)):
+        for number in range(self._oldest, self.episodes):
             self._replay.add(read_kept(self._folder, number, self._layers.picture))
         self._draw()
 

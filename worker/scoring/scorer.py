@@ -12,16 +12,16 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.messages import Kind, TaskSpec
 from dreamfleet.common.variants import Variant
-from dreamfleet.worker.scoring.episode import Course, Moment, score
+from dreamfleet.worker.scoring.episode import Course, score
 from dreamfleet.worker.scoring.rollout import Rollout
-from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Score, Truthful
+from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Score, World
 from dreamfleet.worker.tasks.registry import find_task
 
 DRIVER = "controller"  # as a kept rollout names who drove
 
 
 class Scorer:
-    """Scores a slot's jobs; a `judge` does so in the environment that reported scores come from.
+    """Scores a slot's jobs.
 
     >>> from dreamfleet.common.bundle import find_bundle
     >>> bundle = find_bundle("tiny")
@@ -29,28 +29,21 @@ class Scorer:
     >>> scorer.score("score", np.zeros(867, np.float32), seed=2**20)  # doctest: +SKIP
     """
 
-    def __init__(self, spec: TaskSpec, bundle: Bundle | None = None, *, judge: bool = False) -> None:
+    def __init__(self, spec: TaskSpec, bundle: Bundle | None = None) -> None:
         task = find_task(spec.task)
         fitting = None if bundle is None else bundle.under(spec.controller, Variant.of(spec.options))
         assignment = Assignment(spec, fitting)
-        self.world = task.world_of(assignment)
-        if self.world.version != spec.version:
-            raise UsageError(
-                f"the run scores in version {spec.version} of task {spec.task}, here is version {self.world.version}: "
-                "install the package version that the run was begun with"
-            )
+        self.world = checked_world(assignment)
         self.spec = spec
         self._batch_for: Callable[[TaskSpec], Batch] | None = None
-        if isinstance(task, Batched) and not judge:
+        if isinstance(task, Batched):
             make = task.make_batch
             # One is kept: a run's terms change now and then, and making a batch takes milliseconds.
             self._batch_for = lru_cache(maxsize=1)(lambda each: make(Assignment(each, assignment.bundle)))
             self._batch_for(spec)  # so that what is wrong with it shows at once
-        self._environment = task.make_judge(assignment) if judge else task.make_environment(assignment)
+        self._environment = task.make_environment(assignment)
         self._policy = task.make_policy(assignment)
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
-        reality = task.reality(assignment)
-        self._truthful = reality if isinstance(reality, Truthful) else None
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,
@@ -90,16 +83,6 @@ class Scorer:
         course = self.course("collect", seed, spec)
         return score(self._environment, self._policy, parameters, course, on_step, rollout), rollout
 
-    def judge(self, parameters: NDArray[np.float32], seed: int, see: Callable[[Moment], None]) -> Score:
-        """A whole episode, as an evaluation drives it; `see` is shown each of its moments."""
-        return score(self._environment, self._policy, parameters, self.course("evaluate", seed), see=see)
-
-    @property
-    def truth(self) -> Callable[[], dict[str, float]] | None:
-        """Tells the true state behind the last observation; `None` in a world that keeps it to itself."""
-        truthful = self._truthful
-        return None if truthful is None else lambda: truthful.truth(self._environment)
-
     @property
     def drawn_by(self) -> str:
         """Who draws the environment's picture; `-` where a task does not say."""
@@ -118,3 +101,14 @@ class Scorer:
     def close(self) -> None:
         """Release the environment."""
         self._environment.close()
+
+
+def checked_world(assignment: Assignment) -> World:
+    """The world that is scored in; `UsageError` where the task is of another version here."""
+    spec, world = assignment.spec, find_task(assignment.spec.task).world_of(assignment)
+    if world.version != spec.version:
+        raise UsageError(
+            f"the run scores in version {spec.version} of task {spec.task}, here is version {world.version}: "
+            "install the package version that the run was begun with"
+        )
+    return world

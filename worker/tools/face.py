@@ -9,13 +9,14 @@ from typing import Any
 import gymnasium
 
 from dreamfleet.common import runs, shelf
+from dreamfleet.common.agent import TrainedAgent
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.evaluated import Evaluated
 from dreamfleet.common.seeds import TEST
-from dreamfleet.worker.tasks.api import Assignment, Policy
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.scoring.agents import Agent, agent_of
+from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tools import evaluation
 
 
@@ -25,32 +26,37 @@ def find_controller(name: str, runs_dir: Path | str | None = None) -> Controller
     return controller
 
 
+def find_agent(path: Path | str) -> TrainedAgent:
+    """What `dreamfleet baseline export` wrote; it goes wherever a controller is driven here."""
+    return TrainedAgent.load(Path(path))
+
+
 def open_run(name: str, runs_dir: Path | str | None = None) -> runs.RunFolder:
     """A run's journal, read-only; to be closed, or used in a `with`. `JournalError` names those that exist."""
     return runs.open_run(_folder(runs_dir), name)
 
 
 def make_environment(
-    controller: Controller, bundle: Bundle | None = None, render_mode: str | None = None
+    controller: Controller | TrainedAgent, bundle: Bundle | None = None, render_mode: str | None = None
 ) -> gymnasium.Env[Any, Any]:
     """The environment that a controller is judged in, observing what its policy takes."""
-    assignment = _assignment(controller, bundle)
-    return find_task(controller.task).make_judge(assignment, render_mode)
+    return _agent(controller, bundle).make_judge(render_mode)
 
 
-def make_policy(controller: Controller, bundle: Bundle | None = None) -> Policy:
+def make_policy(controller: Controller | TrainedAgent, bundle: Bundle | None = None) -> Policy:
     """The policy of a controller, its first episode begun: `act(observation)` gives an action of its environment.
 
     Of a policy with a `reward` method, tell it each action's reward; some world models look at it.
     """
-    policy = find_task(controller.task).make_policy(_assignment(controller, bundle))
-    policy.begin(controller.parameters)
+    agent = _agent(controller, bundle)
+    policy = agent.make_policies()(0)
+    policy.begin(agent.parameters)
     return policy
 
 
 def evaluate(
-    controller: Controller, bundle: Bundle | None = None, episodes: int = 100, first_seed: int = TEST.start,
-    jobs: int | None = None,
+    controller: Controller | TrainedAgent, bundle: Bundle | None = None, episodes: int = 100,
+    first_seed: int = TEST.start, jobs: int | None = None,
 ) -> Evaluated:  # fmt: skip
     """Whole episodes, one a seed, in `jobs` processes (one a core), as `dreamfleet evaluate` drives them.
 
@@ -59,14 +65,11 @@ def evaluate(
     if episodes < 1 or first_seed < 0 or (jobs is not None and jobs < 1):
         raise UsageError("episodes and jobs must be at least 1, first_seed at least 0")
     seeds = tuple(range(first_seed, first_seed + episodes))
-    world_model = bundle or shelf.bundle_for(controller, None)
-    return Evaluated.of(evaluation.evaluate(controller, world_model, seeds, jobs or os.cpu_count() or 1))
+    return Evaluated.of(evaluation.evaluate(_agent(controller, bundle), seeds, jobs or os.cpu_count() or 1))
 
 
-def _assignment(controller: Controller, bundle: Bundle | None) -> Assignment:
-    found = bundle or shelf.bundle_for(controller, None)
-    fitting = None if found is None else found.fitting(controller)
-    return Assignment(evaluation.spec_for(controller, fitting), fitting)
+def _agent(controller: Controller | TrainedAgent, bundle: Bundle | None) -> Agent:
+    return agent_of(controller, bundle or shelf.bundle_for(controller, None))
 
 
 def _folder(runs_dir: Path | str | None) -> Path:

@@ -5,33 +5,32 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from statistics import fmean
 
-import numpy as np
-from numpy.typing import NDArray
-
-from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.evaluated import Drive
-from dreamfleet.common.messages import TaskSpec
-from dreamfleet.worker.scoring.episode import Moment
-from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.scoring.agents import Agent
+from dreamfleet.worker.scoring.episode import Course, Moment, score
 from dreamfleet.worker.tasks.api import Score, World
 
 SPEED, BRAKE = "speed", "brake"  # of a world's truth, and of its actions
 
 
 class Judge:
-    """Drives controllers in their task's judge, one episode after the other."""
+    """Drives an agent in the environment that reported scores come from, one episode after the other."""
 
-    def __init__(self, spec: TaskSpec, bundle: Bundle | None = None) -> None:
-        self._scorer = Scorer(spec, bundle, judge=True)
+    def __init__(self, agent: Agent) -> None:
+        self._world, self._parameters = agent.world, agent.parameters
+        self._environment, self._policies = agent.make_judge(), agent.make_policies()
+        self._truth = agent.truth
 
-    def drive(self, parameters: NDArray[np.float32], seed: int) -> Drive:
+    def drive(self, seed: int) -> Drive:
         """One whole episode; the truth is only looked at, so that a score is the same whoever looks."""
-        watch = Watch(self._scorer.world, self._scorer.truth)
-        return watch.drive(seed, self._scorer.judge(parameters, seed, watch.see))
+        truth, course = self._truth, Course(seed, self._world.horizon)
+        watch = Watch(self._world, None if truth is None else lambda: truth(self._environment))
+        driven = score(self._environment, self._policies(seed), self._parameters, course, see=watch.see)
+        return watch.drive(seed, driven)
 
     def close(self) -> None:
         """Release the environment."""
-        self._scorer.close()
+        self._environment.close()
 
 
 class Watch:

@@ -13,46 +13,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.stopping import Stop, never
 from dreamfleet.worker.dream.daydream import Daydream, DaydreamConfig, can_dream
+from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import Course, play
-from dreamfleet.worker.tasks.api import Assignment, World
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.api import World
 from dreamfleet.worker.tools.canvas import AWAKE, DREAMING, Canvas, Dreamt, Layout, Mind, Moment, plain_layout
-from dreamfleet.worker.tools.evaluation import spec_for
 from dreamfleet.worker.worldmodel.inference import Decoder
 
 
 def record(
-    controller: Controller, bundle: Bundle | None, seed: int, steps: int, out: Path,
-    dreaming: DaydreamConfig | None = None, on_step: Callable[[int], None] = lambda _steps: None,
-    stop: Stop = never,
+    agent: Agent, seed: int, steps: int, out: Path, dreaming: DaydreamConfig | None = None,
+    on_step: Callable[[int], None] = lambda _steps: None, stop: Stop = never,
 ) -> float:  # fmt: skip
-    """Drive one episode in the task's judge into an mp4; returns its score.
+    """Drive one episode in the agent's judge into an mp4; returns its score.
 
-    A bundle shows what it sees and decodes beside the drive; one that can dream does so too. If `stop` asks for it, the
-    video ends early, with a step at least.
+    Of an agent with a world model it shows what that sees and decodes beside the drive, and dreams if it can. If `stop`
+    asks for it, the video ends early, with a step at least.
     """
-    task, assignment = find_task(controller.task), Assignment(spec_for(controller, bundle), bundle)
-    environment = task.make_judge(assignment, "rgb_array")
-    policy: Any = task.make_policy(assignment)
-    policy.begin(controller.parameters)
-    config = dreaming or DaydreamConfig(seed=seed)
-    mind = None if bundle is None else Thoughts(assignment.world_model, policy, controller, config)
-    world, course = task.world_of(assignment), Course(seed, steps)
-    return record_policy(policy, environment, world, course, out, mind, on_step, stop)
-
-
-def record_policy(
-    policy: Any, environment: gymnasium.Env[Any, Any], world: World, course: Course, out: Path,
-    thoughts: Thoughts | None = None, on_step: Callable[[int], None] = lambda _steps: None, stop: Stop = never,
-) -> float:  # fmt: skip
-    """Drive one episode of any policy that has begun into an mp4, close its environment, and return the score."""
+    environment = agent.make_judge("rgb_array")
+    policy: Any = agent.make_policies()(seed)
+    policy.begin(agent.parameters)
+    config, bundle = dreaming or DaydreamConfig(seed=seed), agent.bundle
+    thoughts = None if bundle is None else Thoughts(bundle, policy, agent.parameters, config)
     score = 0.0
-    with Film(out, environment, world, course.seed) as film:
-        for moment in play(environment, Filmed(policy, film, thoughts), course):
+    with Film(out, environment, agent.world, seed) as film:
+        for moment in play(environment, Filmed(policy, film, thoughts), Course(seed, steps)):
             score += moment.reward
             on_step(moment.step)
             if stop():
@@ -64,9 +51,9 @@ def record_policy(
 class Thoughts:
     """What a world model sees, decodes and dreams while its controller drives."""
 
-    def __init__(self, bundle: Bundle, policy: Any, controller: Controller, dreaming: DaydreamConfig) -> None:
+    def __init__(self, bundle: Bundle, policy: Any, parameters: NDArray[np.float32], dreaming: DaydreamConfig) -> None:
         self._policy, self._decoder = policy, Decoder(bundle)
-        self._daydream = Daydream(bundle, controller.parameters, dreaming) if can_dream(bundle) else None
+        self._daydream = Daydream(bundle, parameters, dreaming) if can_dream(bundle) else None
         self.layout = DREAMING if self._daydream else AWAKE
 
     def after(self, step: int, seen: NDArray[np.uint8], state: Any) -> Mind:

@@ -6,15 +6,11 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.saving import check_out, saving
 from dreamfleet.common.seeds import TEST, VALIDATION
 from dreamfleet.common.threads import pin_thread_pools
-
-if TYPE_CHECKING:
-    from dreamfleet.common.evaluated import Drive
 
 SUMMARY = "judge a baseline on unseen tracks as controllers are judged, in gymnasium's own unmodified environment"
 EXTRAS = ("worker",)
@@ -46,17 +42,11 @@ def run(args: argparse.Namespace) -> int:
     seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
     if not any(seeds[0] in each and seeds[-1] in each for each in (TEST, VALIDATION)):
         print("note: some of these tracks are neither test nor validation tracks", file=sys.stderr)
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.baselines.agents import find_agent
-    from dreamfleet.worker.baselines.judging import judge_agent
+    from dreamfleet.worker.baselines.agents import find_baseline
+    from dreamfleet.worker.verbs.evaluate import judge
 
-    agent = find_agent(args.agent, args.data)
-
-    def move(drives: list[Drive]) -> None:
-        bar.move(len(drives), f"mean {sum(each.score for each in drives) / len(drives):.1f}")
-
-    with progress_bar("evaluate", len(seeds), "tracks") as bar:
-        judgement = judge_agent(agent, args.agent, args.data, seeds, args.jobs, move)
+    name = args.agent if args.data is None else f"{args.agent} {args.data}"
+    judgement = judge(name, find_baseline(args.agent, args.data), seeds, args.jobs)
     print(judgement.to_json() if args.json else judgement.told, flush=True)
     if args.out:
         with saving(args.out) as file:

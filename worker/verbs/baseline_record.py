@@ -27,12 +27,12 @@ def run(args: argparse.Namespace) -> int:
     """Record and print the scores."""
     videos = videos_of(args)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from dreamfleet.worker.baselines.agents import find_agent
-    from dreamfleet.worker.baselines.recording import record_agent
+    from dreamfleet.worker.baselines.agents import find_baseline
+    from dreamfleet.worker.tools.recording import record
 
-    agent = find_agent(args.agent, args.data)
+    agent = find_baseline(args.agent, args.data)
 
     def film(seed: int, video: Path, move: Callable[[int], None], stop: Stop) -> float:
-        return record_agent(agent, seed, args.steps, video, move, stop)
+        return record(agent, seed, args.steps, video, on_step=move, stop=stop)
 
     return record_videos(args, videos, film)

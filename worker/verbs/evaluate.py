@@ -6,7 +6,6 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.errors import UsageError
@@ -16,10 +15,9 @@ from dreamfleet.common.site import offer
 from dreamfleet.common.threads import pin_thread_pools
 
 if TYPE_CHECKING:
-    from dreamfleet.common.bundle import Bundle
-    from dreamfleet.common.controller import Controller
     from dreamfleet.common.evaluated import Drive
     from dreamfleet.common.judgement import Judgement
+    from dreamfleet.worker.scoring.agents import Agent
 
 SUMMARY = "judge a controller on unseen tracks, in gymnasium's own unmodified environment"
 EXTRAS = ("worker",)
@@ -27,7 +25,7 @@ EXTRAS = ("worker",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--controller", help="a file, a run, or one that ships")
+    parser.add_argument("--controller", help="a file, a run, one that ships, or a trained agent's file")
     parser.add_argument("--run", dest="run_name", metavar="RUN", help="judge what this live run reports instead")
     offer(parser, "connect", texts={"connect": "ask the live run here (give --run too where there are several)"})
     parser.add_argument("--episodes", type=int, default=100, help="tracks (default 100)")
@@ -46,11 +44,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
     if args.out:
         check_out(args.out)
-    name, controller, bundle = _choose(args)
+    name, agent = _choose(args)
     seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
     if seeds[0] not in TEST or seeds[-1] not in TEST:
         print(f"note: test tracks are {TEST.start} to {TEST.stop - 1}; some of these are not", file=sys.stderr)
-    judgement = judge(name, controller, bundle, seeds, args.jobs)
+    judgement = judge(name, agent, seeds, args.jobs)
     print(judgement.to_json() if args.json else judgement.told, flush=True)
     if args.out:
         with saving(args.out) as file:
@@ -58,42 +56,34 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def judge(name: str, controller: Controller, bundle: Bundle | None, seeds: tuple[int, ...], jobs: int) -> Judgement:
+def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> Judgement:
     """Drive one whole episode a seed, with a progress bar."""
-    from dreamfleet.common.evaluated import Evaluated
-    from dreamfleet.common.fingerprint import package_version
-    from dreamfleet.common.judgement import Judgement
     from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.tools.evaluation import evaluate, judged_in
+    from dreamfleet.worker.tools.evaluation import judgement
 
-    drives: list[Drive] = []
-    began = perf_counter()
+    def move(drives: list[Drive]) -> None:
+        bar.move(len(drives), f"mean {sum(each.score for each in drives) / len(drives):.1f}")
+
     with progress_bar("evaluate", len(seeds), "tracks") as bar:
-        for drive in evaluate(controller, bundle, seeds, jobs):
-            drives.append(drive)
-            bar.move(len(drives), f"mean {sum(each.score for each in drives) / len(drives):.1f}")
-    seconds, (world, host, threshold) = perf_counter() - began, judged_in(controller, bundle)
-    return Judgement(
-        name, controller.sha256, controller.task, world, bundle.sha256 if bundle else "", host,
-        package_version("dreamfleet") or "", seconds, Evaluated.of(drives).drives, threshold=threshold,
-    )  # fmt: skip
+        return judgement(name, agent, seeds, jobs, move)
 
 
-def _choose(args: argparse.Namespace) -> tuple[str, Controller, Bundle | None]:
-    """What to judge, by name, and its world model: from here, or from a live run."""
+def _choose(args: argparse.Namespace) -> tuple[str, Agent]:
+    """Whom to judge, by name: from here, or from a live run."""
     from dreamfleet.common.client import Client
-    from dreamfleet.common.shelf import bundle_for, find_controller
+    from dreamfleet.common.shelf import bundle_for, find_agent
+    from dreamfleet.worker.scoring.agents import agent_of
     from dreamfleet.worker.service.bundle_fetch import fetch_for
 
     live = bool(args.run_name) or "connect" in args.given
     if live and not args.controller:
         with Client(args.connect) as client:
             run = args.run_name or client.status().run
-            controller = client.controller(run)
+            reported = client.controller(run)
             if args.bundle is None:
-                return run, controller, fetch_for(controller, client.session, run)
-        return run, controller, bundle_for(controller, args.bundle)
+                return run, agent_of(reported, fetch_for(reported, client.session, run))
+        return run, agent_of(reported, bundle_for(reported, args.bundle))
     if live or not args.controller:
         raise UsageError("give either --controller, or --run (and --connect) to judge what a live run reports")
-    controller, beside = find_controller(args.controller, args.runs_dir)
-    return args.controller, controller, bundle_for(controller, args.bundle, beside)
+    controller, beside = find_agent(args.controller, args.runs_dir)
+    return args.controller, agent_of(controller, bundle_for(controller, args.bundle, beside))

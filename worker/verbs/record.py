@@ -18,7 +18,7 @@ EXTRAS = ("worker", "views")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--controller", required=True, help="a file, a run, or one that ships")
+    parser.add_argument("--controller", required=True, help="a file, a run, one that ships, or a trained agent's file")
     offer_videos(parser)
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--temperature", type=float, default=1.0, help="of the dream beside the drive (default 1.0)")
@@ -29,15 +29,16 @@ def run(args: argparse.Namespace) -> int:
     """Record and print the scores."""
     videos = videos_of(args)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from dreamfleet.common.shelf import bundle_for, find_controller
+    from dreamfleet.common.shelf import bundle_for, find_agent
     from dreamfleet.worker.dream.daydream import DaydreamConfig
+    from dreamfleet.worker.scoring.agents import agent_of
     from dreamfleet.worker.tools.recording import record
 
     daydream = DaydreamConfig(args.temperature)
-    controller, beside = find_controller(args.controller, args.runs_dir)
-    bundle = bundle_for(controller, args.bundle, beside)
+    controller, beside = find_agent(args.controller, args.runs_dir)
+    agent = agent_of(controller, bundle_for(controller, args.bundle, beside))
 
     def film(seed: int, video: Path, move: Callable[[int], None], stop: Stop) -> float:
-        return record(controller, bundle, seed, args.steps, video, replace(daydream, seed=seed), move, stop)
+        return record(agent, seed, args.steps, video, replace(daydream, seed=seed), move, stop)
 
     return record_videos(args, videos, film)

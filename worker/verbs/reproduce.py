@@ -47,17 +47,18 @@ def run(args: argparse.Namespace) -> int:
 def _again(args: argparse.Namespace, path: Path, recorded: Judgement) -> Reproduction:
     """Drive one report's controller again."""
     from dreamfleet.common.reproduction import Reproduction
-    from dreamfleet.common.shelf import bundle_for, find_controller
+    from dreamfleet.common.shelf import bundle_for, find_agent
+    from dreamfleet.worker.scoring.agents import agent_of
     from dreamfleet.worker.verbs.evaluate import judge
 
-    controller, beside = find_controller(recorded.name, args.runs_dir)
+    controller, beside = find_agent(recorded.name, args.runs_dir)
     if controller.sha256 != recorded.controller:
         raise ControllerError(
             f"{path} records the controller {recorded.controller[:12]}, and {recorded.name} is "
             f"{controller.sha256[:12]}: take the one that was recorded, or record this one with `dreamfleet evaluate`"
         )
     seeds = recorded.evaluated.seeds[: args.episodes]
-    again = judge(recorded.name, controller, bundle_for(controller, None, beside), seeds, args.jobs)
+    again = judge(recorded.name, agent_of(controller, bundle_for(controller, None, beside)), seeds, args.jobs)
     return Reproduction(recorded, again)
 
 

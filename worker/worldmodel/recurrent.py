@@ -35,7 +35,7 @@ class Recurrent:
             _, kept = graph.split(self._window, self._step, (self._config.window - 1) * self._step)
             self._window = graph.join(kept, step)
             inputs.append(self._attend())
-        self._lstm(graph.join(*inputs, self.hidden))
+        self.hidden, self._cell = lstm(graph, inputs, self.hidden, self._cell, self._rnn)
         return self.hidden
 
     def next_state(self, previous: str = "") -> str:
@@ -54,19 +54,24 @@ class Recurrent:
         weighted = graph.node("Mul", self.attention, seen)
         return str(graph.node("ReduceSum", weighted, graph.shape(1), keepdims=0))
 
-    def _lstm(self, inputs: str) -> None:
-        """A matrix product a gate: of one for all, the cuts would copy more than the products save (5 % of a step)."""
-        graph, rnn, size = self._graph, self._rnn, self._config.hidden
-        kernel = np.concatenate([rnn["lstm.weight_ih_l0"], rnn["lstm.weight_hh_l0"]], axis=1)
-        bias = rnn["lstm.bias_ih_l0"] + rnn["lstm.bias_hh_l0"]
-        rows = [slice(gate * size, (gate + 1) * size) for gate in range(4)]
-        enter, forget, candidate, leave = (
-            graph.node(kind, graph.linear(inputs, kernel[gate].T, bias[gate]))
-            for kind, gate in zip(("Sigmoid", "Sigmoid", "Tanh", "Sigmoid"), rows, strict=True)
-        )
-        kept = graph.node("Mul", forget, self._cell)
-        self._cell = graph.node("Add", kept, graph.node("Mul", enter, candidate))
-        self.hidden = graph.node("Mul", leave, graph.node("Tanh", self._cell))
+
+def lstm(graph: GraphBuilder, inputs: Sequence[str], hidden: str, cell: str, weights: Weights) -> tuple[str, str]:
+    """A step of an LSTM, whose `weights` are named as torch names them: its next hidden and cell state.
+
+    A matrix product a gate: of one for all, the cuts would copy more than the products save (5 % of a step).
+    """
+    size = weights["lstm.weight_hh_l0"].shape[1]
+    kernel = np.concatenate([weights["lstm.weight_ih_l0"], weights["lstm.weight_hh_l0"]], axis=1)
+    bias = weights["lstm.bias_ih_l0"] + weights["lstm.bias_hh_l0"]
+    rows = [slice(gate * size, (gate + 1) * size) for gate in range(4)]
+    joined = graph.join(*inputs, hidden)
+    enter, forget, candidate, leave = (
+        graph.node(kind, graph.linear(joined, kernel[gate].T, bias[gate]))
+        for kind, gate in zip(("Sigmoid", "Sigmoid", "Tanh", "Sigmoid"), rows, strict=True)
+    )
+    kept = graph.node("Mul", forget, cell)
+    cell = graph.node("Add", kept, graph.node("Mul", enter, candidate))
+    return graph.node("Mul", leave, graph.node("Tanh", cell)), cell
 
 
 def graph_step(graph: GraphBuilder, latent: str, action: str, config: MDNRNNConfig) -> str:

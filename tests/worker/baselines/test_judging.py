@@ -10,13 +10,14 @@ import torch
 
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.judgement import read_judgement
-from dreamfleet.worker.baselines import judging
 from dreamfleet.worker.baselines.agent_config import AgentConfig
-from dreamfleet.worker.baselines.agents import find_agent
+from dreamfleet.worker.baselines.agents import find_baseline
 from dreamfleet.worker.baselines.names import DISCRETE, DRQN, NAMES, RANDOM
 from dreamfleet.worker.baselines.network import Networks
-from dreamfleet.worker.baselines.recording import record_agent
 from dreamfleet.worker.baselines.train import CHECKPOINT
+from dreamfleet.worker.scoring.episode import Course
+from dreamfleet.worker.tools import judge
+from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.verbs import baseline_evaluate, baseline_record
 from dreamfleet.worker.worldmodel.vae import VAE
@@ -28,7 +29,7 @@ LAYERS = AgentConfig(channels=(2,), kernels=(8,), strides=(8,), hidden=4, frame_
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setattr(judging, "ENVIRONMENTS_OWN", STEPS)
+    monkeypatch.setattr(judge, "Course", lambda seed, _horizon: Course(seed, STEPS))
 
 
 def keep(folder, model):
@@ -61,21 +62,21 @@ def test_a_judgement_is_a_controllers_and_the_same_again(name, trained, tmp_path
     assert (found.world, found.bundle, found.evaluated.seeds) == ("car-racing", "", (SEED, SEED + 1))
     assert {each.steps for each in found.drives} == {STEPS}
     assert all(each.speed is not None and each.braking is not None for each in found.drives)
-    assert ("torch" in found.fingerprint) == (name == DRQN)
     assert call(baseline_evaluate, *words) == 0
     assert read_judgement(out).drives == found.drives
 
 
 def test_chance_is_the_episodes_and_within_the_world():
     for name in (RANDOM, DISCRETE):
-        drawn = [[find_agent(name, None).policy(seed).act(None).tolist() for seed in (1, 2, 3)] for _ in range(2)]
+        policies = find_baseline(name, None).make_policies()
+        drawn = [[policies(seed).act(None).tolist() for seed in (1, 2, 3)] for _ in range(2)]
         assert drawn[0] == drawn[1]
         assert len({*map(tuple, drawn[0])}) > 1
-    policy = find_agent(RANDOM, None).policy(0)
+    policy = find_baseline(RANDOM, None).make_policies()(0)
     actions = np.array([policy.act(None) for _ in range(1000)])
     assert actions.min(axis=0) == pytest.approx([-1, 0, 0], abs=0.02)
     assert actions.max(axis=0) == pytest.approx([1, 1, 1], abs=0.02)
-    policy = find_agent(DISCRETE, None).policy(0)
+    policy = find_baseline(DISCRETE, None).make_policies()(0)
     assert len({tuple(policy.act(None)) for _ in range(200)}) == 5
 
 
@@ -83,27 +84,22 @@ def test_a_video_has_a_frame_a_step_and_the_drives_score(trained, tmp_path, caps
     out = tmp_path / "drive.mp4"
     assert call(baseline_record, DRQN, "--data", trained, "--seed", SEED, "--steps", STEPS, "--out", out, "--json") == 0
     score = json.loads(capsys.readouterr().out)["score"]
-    assert score == judging.AgentJudge(find_agent(DRQN, trained)).drive(SEED).score
-    assert score == record_agent(find_agent(DRQN, trained), SEED, STEPS, out)
+    assert score == judge.Judge(find_baseline(DRQN, trained)).drive(SEED).score
+    assert score == record(find_baseline(DRQN, trained), SEED, STEPS, out)
     with av.open(str(out)) as container:
         assert len(list(container.decode(container.streams.video[0]))) == STEPS
 
 
-def test_an_agent_that_learnt_on_meanwhile_is_not_judged_as_another(trained):
-    with pytest.raises(DatasetError, match="has learnt on while it was judged"):
-        judging._drive(DRQN, trained, "of the weights before", SEED)
-
-
 def test_what_is_no_agent_is_one_line(trained, tmp_path):
     with pytest.raises(UsageError, match=r"no agent at .*: train one with `dreamfleet baseline train drqn"):
-        find_agent(DRQN, tmp_path / "absent")
+        find_baseline(DRQN, tmp_path / "absent")
     with pytest.raises(UsageError, match="drqn needs --data"):
-        find_agent(DRQN, None)
+        find_baseline(DRQN, None)
     with pytest.raises(UsageError, match="random learns nothing: leave --data out"):
-        find_agent(RANDOM, trained)
+        find_baseline(RANDOM, trained)
     with pytest.raises(DatasetError, match=r"drqn\.safetensors is damaged"):
-        find_agent(DRQN, keep(tmp_path / "vae", VAE(VAEConfig(latent=4, channels=(2, 2, 4, 4)))))
+        find_baseline(DRQN, keep(tmp_path / "vae", VAE(VAEConfig(latent=4, channels=(2, 2, 4, 4)))))
     path = trained / CHECKPOINT
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(DatasetError, match=r"drqn\.safetensors is damaged"):
-        find_agent(DRQN, trained)
+        find_baseline(DRQN, trained)

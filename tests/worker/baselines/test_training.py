@@ -15,10 +15,11 @@ from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.kept import kept_episode
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 from dreamfleet.worker.baselines.network import Networks
-from dreamfleet.worker.baselines.policies import NOTHING, QPolicy
+from dreamfleet.worker.baselines.policies import QPolicy
 from dreamfleet.worker.baselines.presets import LEARNING, NOTEBOOK
 from dreamfleet.worker.baselines.train import CHECKPOINT, CURVE, train_drqn
-from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
+from dreamfleet.worker.car_racing.agents import NOTHING
+from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights, save_checkpoint
 from dreamfleet.worker.verbs import baseline_train
 
 LAYERS = AgentConfig(channels=(2,), kernels=(8,), strides=(8,), hidden=4, frame_skip=3)
@@ -156,6 +157,28 @@ def test_a_damaged_or_missing_file_is_one_line(whole, tmp_path):
         train_drqn(tmp_path, LAYERS, longer)
 
 
+def test_a_checkpoint_that_tells_nonsense_is_one_line(whole, tmp_path):
+    networks = Networks(LAYERS)
+    told = load_progress(whole[0] / CHECKPOINT)
+    episodes = told["episodes"]
+    for wrong in (
+        {"update": 1}, {**told, "oldest": -5}, {**told, "oldest": 6}, {**told, "episodes": 5}, [],
+        {**told, "episodes": [{}]}, {**told, "episodes": [{**episodes[0], "score": None}]}, {**told, "update": float("nan")},
+    ):  # fmt: skip
+        save_checkpoint(tmp_path / CHECKPOINT, networks, torch.optim.Adam(networks.parameters()), wrong)
+        with pytest.raises(DatasetError, match=r"drqn\.safetensors is damaged"):
+            train_drqn(tmp_path, LAYERS, SHORT)
+
+
+def test_a_second_training_in_a_folder_is_refused_while_the_first_one_runs(tmp_path):
+    def begin_another(done, _report):
+        if done == 1:
+            with pytest.raises(UsageError, match=rf"another training works in {tmp_path}: stop it first"):
+                train_drqn(tmp_path, LAYERS, SHORT)
+
+    train_drqn(tmp_path, LAYERS, replace(SHORT, episodes=1), begin_another)
+
+
 def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(whole, tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 
@@ -179,6 +202,8 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(whole, tmp_path):
         ({"kernels": (3, 3)}, "the same number of layers"),
         ({"kernels": (65,)}, "leave nothing of 64 pixels"),
         ({"frame_skip": 0}, "must be at least 1"),
+        ({"frame_skip": 10**9}, "--frame-skip must be at most 1000000"),
+        ({"hidden": 10**9}, "parameters, 50,000,000 at most are learnt"),
     ],
 )
 def test_an_impossible_agent_is_refused(change, said):
@@ -187,7 +212,17 @@ def test_an_impossible_agent_is_refused(change, said):
 
 
 @pytest.mark.parametrize(
-    "change", [{"batch": 0}, {"burn_in": -1}, {"gamma": 1.5}, {"rate": 0.0}, {"clip": float("nan")}]
+    "change",
+    [
+        {"batch": 0},
+        {"burn_in": -1},
+        {"gamma": 1.5},
+        {"rate": 0.0},
+        {"clip": float("nan")},
+        {"goal": float("nan")},
+        {"rate": float("inf")},
+        {"seed": 10**20},
+    ],
 )
 def test_impossible_learning_is_refused(change):
     with pytest.raises(UsageError, match="--" + next(iter(change)).replace("_", "-")):

@@ -9,7 +9,7 @@ from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.variants import Variant
 from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
-from dreamfleet.worker.scoring.episode import play
+from dreamfleet.worker.scoring.episode import play, score
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
@@ -115,6 +115,15 @@ def varied(bundle, task="car-racing", horizon=5, **named):
     return spec, np.random.default_rng(1).normal(0, 0.1, shape.size).astype(np.float32)
 
 
+def judged(spec, bundle, vector, course):
+    """The score of a course in the task's judge."""
+    task, assignment = find_task(spec.task), Assignment(spec, bundle)
+    judge = task.make_judge(assignment)
+    found = score(judge, task.make_policy(assignment), vector, course)
+    judge.close()
+    return found
+
+
 @pytest.mark.parametrize("name", VARIANTS)
 def test_a_job_is_scored_under_the_variant_that_its_run_names(random_bundle, name):
     spec, vector = varied(random_bundle, **vars(VARIANTS[name]))
@@ -122,9 +131,7 @@ def test_a_job_is_scored_under_the_variant_that_its_run_names(random_bundle, nam
     scores = [scorer.score("score", vector, 3) for _ in range(2)]
     assert scores[0] == scores[1]
     scorer.close()
-    judge = Scorer(spec, random_bundle, judge=True)
-    assert judge.score("score", vector, 3) == scores[0]
-    judge.close()
+    assert judged(spec, random_bundle, vector, scorer.course("score", 3)) == scores[0]
 
 
 def test_only_candidates_pay_for_time(random_bundle):
@@ -148,10 +155,8 @@ def test_only_candidates_pay_for_steps_off_the_road(random_bundle):
     assert 2 <= free.fitness - paid.fitness <= 200
     for kind in ("evaluate", "collect"):
         assert scorers[1].course(kind, 3).stray_cost == 0
-    assert scorers[1].judge(vector, 3, lambda _: None) == scorers[0].judge(vector, 3, lambda _: None)
-    judge = Scorer(dear, random_bundle, judge=True)
-    assert judge.score("score", vector, 3) == paid
-    for each in (*scorers, judge):
+    assert judged(dear, random_bundle, vector, scorers[1].course("score", 3)) == paid
+    for each in scorers:
         each.close()
 
 

@@ -6,12 +6,14 @@ import pytest
 
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, ControllerError, DreamfleetError, UsageError
+from dreamfleet.common.fingerprint import fingerprint
 from dreamfleet.common.judgement import read_judgement
 from dreamfleet.common.shelf import bundle_for
 from dreamfleet.worker.scoring import episode
+from dreamfleet.worker.scoring.agents import agent_of
 from dreamfleet.worker.scoring.episode import Course
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.tools.evaluation import evaluate, judged_in
+from dreamfleet.worker.tools.evaluation import evaluate
 from tests.support import tasks
 
 SEEDS = (10_000, 10_001, 10_002)
@@ -36,7 +38,7 @@ def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
         for seed in SEEDS
     }
     for jobs in (1, 2):
-        drives = list(evaluate(controller(tasks.JUDGED), random_bundle, SEEDS, jobs))
+        drives = list(evaluate(agent_of(controller(tasks.JUDGED), random_bundle), SEEDS, jobs))
         assert {each.seed: each.score for each in drives} == alone
         assert {each.steps for each in drives} == {10}
 
@@ -51,7 +53,7 @@ def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
 )
 def test_what_goes_wrong_in_a_process_ends_the_evaluation_and_says_why(controller, random_bundle, task, error, says):
     with pytest.raises(error, match=says):
-        list(evaluate(controller(task), random_bundle, SEEDS, 2))
+        list(evaluate(agent_of(controller(task), random_bundle), SEEDS, 2))
 
 
 def test_a_world_model_is_found_beside_its_controller_or_by_name(controller, random_bundle):
@@ -95,7 +97,8 @@ def test_what_it_writes_is_what_it_prints_and_drives_again_to_the_bit(processes,
     assert json.loads(said) == json.loads(out.read_text())
     recorded = read_judgement(out)
     assert (recorded.controller, recorded.bundle) == (controller().sha256, random_bundle.sha256)
-    assert (recorded.world, recorded.fingerprint, recorded.threshold) == judged_in(controller(), random_bundle)
+    assert (recorded.task, recorded.world, recorded.threshold) == (tasks.TOY, tasks.TOY, None)
+    assert recorded.fingerprint == fingerprint(find_task(tasks.TOY).world.packages)
     assert [each.finished for each in recorded.drives] == [None] * 3
     code, said, err = processes.call("reproduce", out, "--episodes", 2, "--jobs", 1)
     assert (code, "the same 2 scores to the bit" in said) == (0, True), err

@@ -1,5 +1,7 @@
 """A judge tells how an episode was driven, and drives it as it would unwatched."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -7,12 +9,12 @@ import pytest
 from dreamfleet.common.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.evaluated import Drive
-from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.shelf import find_controller
-from dreamfleet.worker.scoring.episode import Course, Moment
-from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.scoring.agents import agent_of
+from dreamfleet.worker.scoring.episode import Course, Moment, score
 from dreamfleet.worker.tasks.api import Score, World
 from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tools import judge as judging
 from dreamfleet.worker.tools.judge import Judge, Watch
 
 STEPS = 12
@@ -24,20 +26,16 @@ def tiny():
     return find_bundle("tiny")
 
 
-@pytest.fixture
-def short(monkeypatch):
-    """Whole episodes are a few steps long."""
-    monkeypatch.setattr(Scorer, "course", lambda _self, _kind, seed, _spec=None: Course(seed, STEPS))
-
-
 @pytest.mark.parametrize("task", ["car-racing", "dream"])
-def test_it_tells_speed_and_brake_of_a_drive_that_is_the_same_unwatched(tiny, short, tmp_path, task):
-    parameters = find_controller("tiny", tmp_path)[0].parameters.copy()
+def test_it_tells_speed_and_brake_of_a_drive_that_is_the_same_unwatched(tiny, monkeypatch, tmp_path, task):
+    monkeypatch.setattr(judging, "Course", lambda seed, _horizon: Course(seed, STEPS))
+    controller = find_controller("tiny", tmp_path)[0]
+    parameters = controller.parameters.copy()
     parameters[2 * 288 : 3 * 288], parameters[-1] = 0.0, 5.0  # the brake's weights and bias: it is always on
-    spec = TaskSpec(task, tiny.sha256, 1000, 0)
-    judge, unwatched = Judge(spec, tiny), Scorer(spec, tiny, judge=True)
-    drive = judge.drive(parameters, SEED)
-    alone = unwatched.score("evaluate", parameters, SEED)
+    agent = agent_of(replace(controller, parameters=parameters, task=task), tiny)
+    judge, unwatched = Judge(agent), agent.make_judge()
+    drive = judge.drive(SEED)
+    alone = score(unwatched, agent.make_policies()(SEED), parameters, Course(SEED, STEPS))
     judge.close()
     unwatched.close()
     assert (drive.seed, drive.score, drive.steps) == (SEED, alone.fitness, STEPS)

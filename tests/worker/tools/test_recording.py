@@ -8,6 +8,7 @@ from dreamfleet.common.bundle import DREAM, write_bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.worker.scoring import episode
+from dreamfleet.worker.scoring.agents import agent_of
 from dreamfleet.worker.scoring.episode import Course
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
@@ -25,8 +26,8 @@ def controller(random_bundle):
 
 
 def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_bundle, tmp_path):
-    told = []
-    score = record(controller, random_bundle, SEED, STEPS, tmp_path / "new" / "drive.mp4", on_step=told.append)
+    told, agent = [], agent_of(controller, random_bundle)
+    score = record(agent, SEED, STEPS, tmp_path / "new" / "drive.mp4", on_step=told.append)
     task, assignment = find_task("car-racing"), Assignment.of("car-racing", random_bundle)
     judge = task.make_judge(assignment)
     driven = episode.score(judge, task.make_policy(assignment), controller.parameters, Course(SEED, STEPS))
@@ -44,7 +45,7 @@ def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_
 def test_a_recording_that_is_told_to_stop_can_be_played_as_far_as_it_came(controller, random_bundle, tmp_path, after):
     told = [0]
     record(
-        controller, random_bundle, SEED, STEPS, tmp_path / "drive.mp4", on_step=told.append,
+        agent_of(controller, random_bundle), SEED, STEPS, tmp_path / "drive.mp4", on_step=told.append,
         stop=lambda: told[-1] >= after,
     )  # fmt: skip
     assert told[-1] == max(after, 1)
@@ -54,7 +55,7 @@ def test_a_recording_that_is_told_to_stop_can_be_played_as_far_as_it_came(contro
 
 def test_a_controller_that_was_evolved_in_the_dream_is_recorded_in_reality(controller, random_bundle, tmp_path):
     dreamer = Controller(controller.shape, controller.parameters, "dream", controller.bundle)
-    scores = [record(each, random_bundle, SEED, 3, tmp_path / "drive.mp4") for each in (controller, dreamer)]
+    scores = [record(agent_of(each, random_bundle), SEED, 3, tmp_path / "drive.mp4") for each in (controller, dreamer)]
     assert scores[0] == scores[1]
 
 
@@ -62,7 +63,7 @@ def test_a_bundle_that_cannot_dream_is_recorded_with_two_pictures(controller, ra
     manifest = random_bundle.manifest
     parts = {name: random_bundle.read(name) for name in manifest.parts if name != DREAM}
     awake = write_bundle(tmp_path / "awake.zip", replace(manifest, parts={}), parts)
-    record(controller, awake, SEED, 2, tmp_path / "drive.mp4")
+    record(agent_of(controller, awake), SEED, 2, tmp_path / "drive.mp4")
     with av.open(str(tmp_path / "drive.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.width, stream.height) == AWAKE.size
@@ -71,7 +72,7 @@ def test_a_bundle_that_cannot_dream_is_recorded_with_two_pictures(controller, ra
 def test_another_task_or_an_impossible_place_is_refused(controller, random_bundle, tmp_path):
     moon = Controller(controller.shape, controller.parameters, "moon", controller.bundle)
     with pytest.raises(UsageError, match="unknown task"):
-        record(moon, random_bundle, SEED, STEPS, tmp_path / "drive.mp4")
+        record(agent_of(moon, random_bundle), SEED, STEPS, tmp_path / "drive.mp4")
     (tmp_path / "file").write_text("")
     with pytest.raises(DreamfleetError, match="choose another --out"):
-        record(controller, random_bundle, SEED, STEPS, tmp_path / "file" / "drive.mp4")
+        record(agent_of(controller, random_bundle), SEED, STEPS, tmp_path / "file" / "drive.mp4")

@@ -10,6 +10,8 @@ from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.worker.car_racing.preprocessing import RAW
 from dreamfleet.worker.driving.scene import Dream
+from dreamfleet.worker.scoring.agents import agent_of
+from dreamfleet.worker.scoring.episode import Course, score
 from dreamfleet.worker.scoring.rollout import write_episode
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tools.evaluation import evaluate
@@ -72,12 +74,14 @@ def test_the_bundle_says_what_it_sees(data, bundle):
 
 def test_environment_judge_and_video_score_alike_to_the_bit(bundle, parameters, tmp_path):
     fitness, spec = [], TaskSpec("car-racing", bundle.sha256, 70, 0)
-    for judge in (False, True):
-        scorer = Scorer(spec, bundle, judge=judge)
-        fitness.append(scorer.score("score", parameters, 20_000).fitness)
-        scorer.close()
-    controller = Controller(bundle.controller_shape, parameters, "car-racing", bundle.sha256)
-    fitness.append(record(controller, bundle, 20_000, 70, tmp_path / "drive.mp4"))
+    scorer = Scorer(spec, bundle)
+    fitness.append(scorer.score("score", parameters, 20_000).fitness)
+    scorer.close()
+    agent = agent_of(Controller(bundle.controller_shape, parameters, "car-racing", bundle.sha256), bundle)
+    judge = agent.make_judge()
+    fitness.append(score(judge, agent.make_policies()(20_000), parameters, Course(20_000, 70)).fitness)
+    judge.close()
+    fitness.append(record(agent, 20_000, 70, tmp_path / "drive.mp4"))
     assert fitness == fitness[:1] * 3
 
 
@@ -99,7 +103,7 @@ def test_it_dreams_is_driven_in_reality_and_collects_drives_that_its_data_set_ta
 
 def test_a_controller_of_it_is_evaluated(bundle, parameters):
     straight = Controller(bundle.controller_shape, np.zeros_like(parameters), "dream", bundle.sha256)
-    (drive,) = evaluate(straight, bundle, (10_000,), jobs=1)
+    (drive,) = evaluate(agent_of(straight, bundle), (10_000,), jobs=1)
     assert drive.seed == 10_000
     assert np.isfinite(drive.score)
 

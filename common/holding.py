@@ -1,0 +1,27 @@
+"""A folder in which one process at a time may work."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dreamfleet.common.errors import DatasetError, UsageError
+
+
+@contextmanager
+def held(lock: Path, who: str) -> Iterator[None]:
+    """Hold the folder of the file `lock`, made if it is not there; `UsageError` while another `who` works in it."""
+    folder = lock.parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = lock.open("w")
+    except OSError as error:
+        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UsageError(f"another {who} works in {folder}: stop it first") from None
+        yield

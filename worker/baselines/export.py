@@ -1,0 +1,73 @@
+"""What was trained, as an agent that drives without torch."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from onnx import TensorProto
+
+from dreamfleet.common.agent import AgentManifest, TrainedAgent
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.fingerprint import package_version
+from dreamfleet.worker.baselines.agent_config import AgentConfig
+from dreamfleet.worker.baselines.names import DRQN
+from dreamfleet.worker.baselines.network import Networks
+from dreamfleet.worker.baselines.progress import progress_of
+from dreamfleet.worker.baselines.train import CHECKPOINT
+from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
+from dreamfleet.worker.training.world import WORLD, preprocessing_to
+from dreamfleet.worker.worldmodel.graph import GraphBuilder
+from dreamfleet.worker.worldmodel.recurrent import Weights, lstm
+
+
+def export_agent(folder: Path) -> TrainedAgent:
+    """The agent of a training's last checkpoint; `UsageError` where there is none, `DatasetError` for a damaged one."""
+    path = folder / CHECKPOINT
+    if not path.exists():
+        raise UsageError(f"no agent at {path}: train one with `dreamfleet baseline train {DRQN} --data {folder}`")
+    config = load_config(path, AgentConfig)
+    networks = Networks(config)
+    progress = progress_of(path, load_checkpoint(path, networks, None))
+    weights = {name: tensor.numpy() for name, tensor in networks.online.state_dict().items()}
+    if not all(np.isfinite(each).all() for each in weights.values()):
+        raise DatasetError(f"{path} holds NaN or infinity: give --new to train anew, with a lower --rate")
+    driven = progress.episodes
+    provenance = {
+        "episodes": len(driven), "steps": sum(each.steps for each in driven),
+        "decisions": sum(each.decisions for each in driven), "updates": progress.update,
+        "layers": asdict(config), "learning": progress.learning,
+        "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
+    }  # fmt: skip
+    choices = tuple(tuple(map(float, each)) for each in config.table)
+    manifest = AgentManifest(
+        DRQN, WORLD, preprocessing_to(config.picture).name, choices, config.frame_skip, 2 * config.hidden, provenance
+    )
+    return TrainedAgent(manifest, export_network(weights, config))
+
+
+def export_network(weights: Weights, config: AgentConfig) -> bytes:
+    """One decision: `picture` (N, side, side, 3) uint8 and `state` (N, 2 x hidden) to `worth` (N, choices), Q(s, a).
+
+    The state is the LSTM's, hidden and cell, zero as an episode begins; `next_state` is that of the next decision.
+    """
+    graph, choices = GraphBuilder("agent"), len(config.table)
+    picture = graph.take("picture", TensorProto.UINT8, config.picture, config.picture, 3)
+    hidden, cell = graph.split(graph.take("state", TensorProto.FLOAT, 2 * config.hidden), config.hidden, config.hidden)
+    value = graph.node("Cast", graph.node("Transpose", picture, perm=[0, 3, 1, 2]), to=TensorProto.FLOAT)
+    value = graph.node("Div", value, graph.constant(np.array(255, np.float32)))
+    for layer, stride in enumerate(config.strides):
+        kernel, bias = (graph.constant(weights[f"look.{2 * layer}.{each}"]) for each in ("weight", "bias"))
+        value = graph.node("Relu", graph.node("Conv", value, kernel, bias, strides=[stride, stride]))
+    flat = graph.node("Reshape", value, graph.shape(-1, config.flat))
+    hidden, cell = lstm(graph, [flat], hidden, cell, weights)
+    worth, advantage = (
+        graph.linear(hidden, weights[f"{each}.weight"].T, weights[f"{each}.bias"]) for each in ("value", "advantage")
+    )
+    if config.heads == "softmax":
+        advantage = graph.node("Softmax", advantage, axis=1)
+    advantage = graph.node("Sub", advantage, graph.node("ReduceMean", advantage, axes=[1]))
+    graph.give(graph.node("Add", worth, advantage), "worth", TensorProto.FLOAT, choices)
+    graph.give(graph.join(hidden, cell), "next_state", TensorProto.FLOAT, 2 * config.hidden)
+    return graph.build()
