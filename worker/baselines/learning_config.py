@@ -14,6 +14,7 @@ AT_LEAST_ONE = (
     "report_every",
 )  # fmt: skip
 MOST = 2**63 - 1  # of whole numbers: what torch and NumPy take
+MOST_READ = 100_000  # pictures of an update: some 5 GB of 64 pixels, as numbers
 NOT_NEGATIVE = ("random_episodes", "patience", "burn_in", "clip", "seed")
 
 
@@ -58,6 +59,11 @@ class LearningConfig:
         for name in ("gamma", "epsilon_first", "epsilon_last"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"{_flag(name)} must be from 0 to 1, not {getattr(self, name)}")
+        if (read := self.batch * (self.burn_in + self.trace + self.n_step)) > MOST_READ:
+            raise UsageError(
+                f"an update would read {read:,} pictures, {MOST_READ:,} at most: make --batch, --trace, --burn-in or "
+                "--n-step smaller"
+            )
         if self.rate <= 0:
             raise UsageError(f"--rate must be positive, not {self.rate}")
 

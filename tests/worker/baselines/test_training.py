@@ -163,7 +163,8 @@ def test_a_checkpoint_that_tells_nonsense_is_one_line(whole, tmp_path):
     episodes = told["episodes"]
     for wrong in (
         {"update": 1}, {**told, "oldest": -5}, {**told, "oldest": 6}, {**told, "episodes": 5}, [],
-        {**told, "episodes": [{}]}, {**told, "episodes": [{**episodes[0], "score": None}]}, {**told, "update": float("nan")},
+        {**told, "episodes": [{}]}, {**told, "episodes": [{**episodes[0], "score": None}]},
+        {**told, "update": float("nan")},
     ):  # fmt: skip
         save_checkpoint(tmp_path / CHECKPOINT, networks, torch.optim.Adam(networks.parameters()), wrong)
         with pytest.raises(DatasetError, match=r"drqn\.safetensors is damaged"):
@@ -222,6 +223,8 @@ def test_an_impossible_agent_is_refused(change, said):
         {"goal": float("nan")},
         {"rate": float("inf")},
         {"seed": 10**20},
+        {"batch": 10**9},
+        {"n_step": 10**9},
     ],
 )
 def test_impossible_learning_is_refused(change):
