@@ -29,30 +29,32 @@ class Beginnings:
     """All that a bundle has, and the share of dreams that begins at recorded states.
 
     `initial` `(N, 2, latent)` are the mu and logvar of first pictures, `recorded` `(M, 2 * latent + memory)` those of
-    recorded moments, with what the model remembered there.
+    recorded moments, with what the model remembered there. `empty` `(memory,)` is what it remembers before it has seen
+    anything; zeros unless it is given.
     """
 
     initial: Floats
     recorded: Floats
     share: float = 0.0
+    empty: Floats | None = None
 
     @classmethod
-    def of(cls, bundle: Bundle, share: float, memory: int) -> Beginnings:
-        """A bundle's own, whose model remembers so many numbers; `UsageError` for a share that is none.
+    def of(cls, bundle: Bundle, share: float, empty: Floats) -> Beginnings:
+        """A bundle's own, by its model's `empty` memory; `UsageError` for a share that is none.
 
         `BundleError` where recorded states are asked for and there are none, or they are of another model.
         """
         check_share(share)
-        initial, latent = read_array(bundle.read(INITIAL)), bundle.manifest.latent
+        initial, width = read_array(bundle.read(INITIAL)), 2 * bundle.manifest.latent + len(empty)
         if not share:
-            return cls(initial, np.zeros((0, 2 * latent + memory), dtype=np.float32))
+            return cls(initial, np.zeros((0, width), dtype=np.float32), empty=empty)
         recorded = bundle.read_recorded()
-        if recorded.shape[1] != 2 * latent + memory:
+        if recorded.shape[1] != width:
             raise BundleError(
-                f"{bundle.path}: a state in {RECORDED} has {recorded.shape[1]} numbers, its model "
-                f"{2 * latent + memory}; build the bundle again"
+                f"{bundle.path}: a state in {RECORDED} has {recorded.shape[1]} numbers, its model {width}; build the "
+                "bundle again"
             )
-        return cls(initial, recorded, share)
+        return cls(initial, recorded, share, empty)
 
     def choose(self, seed: int, first: int) -> Beginning:
         """Where the dream of this seed begins: at a recorded state, or else at the `first` of the first pictures.
@@ -64,7 +66,8 @@ class Beginnings:
             if random.random() < self.share:
                 return self._recorded(int(random.integers(len(self.recorded))))
         mu, logvar = self.initial[first]
-        return Beginning(mu, logvar, np.zeros(self.recorded.shape[1] - 2 * len(mu), dtype=np.float32))
+        memory = np.zeros(self.recorded.shape[1] - 2 * len(mu), np.float32) if self.empty is None else self.empty
+        return Beginning(mu, logvar, memory)
 
     def _recorded(self, index: int) -> Beginning:
         latent = self.initial.shape[2]

@@ -52,7 +52,7 @@ class DreamWorld:
         self._temperature = temperature
         self.chance = self._step.chance
         self.memory_size = self._step.memory_size
-        self.beginnings = Beginnings.of(bundle, recorded, self.memory_size)
+        self.beginnings = Beginnings.of(bundle, recorded, self._step.zero_state(1)[0, : self.memory_size])
 
     def begin(self, rows: int, memory: Floats | None = None) -> Floats:
         """The state `(rows, state)` before a first step: empty, or the model's part is `memory` `(rows, memory)`.

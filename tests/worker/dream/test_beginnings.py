@@ -15,6 +15,7 @@ from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.tasks.api import Score
 from dreamfleet.worker.worldmodel.inference import Chance
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.mind import Mind
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import npy, states, write_random_bundle
 from tests.support.variants import VARIANTS
@@ -102,6 +103,7 @@ MEMORIES = {
     "plain": PLAIN,
     "ending": MDNRNNConfig(latent=3, hidden=4, done=True),
     "rewarded": MDNRNNConfig(latent=3, hidden=4, previous_reward=True),
+    "rewarded first": MDNRNNConfig(latent=3, hidden=4, previous_reward=True, first_reward=1.0),
     "dropout": MDNRNNConfig(latent=3, hidden=4, dropout=0.2),
     "attentive": MDNRNNConfig(latent=3, hidden=4, window=3, attention_units=4),
 }
@@ -128,6 +130,14 @@ def test_the_environment_dreams_the_same_bits_with_any_memory(tmp_path, memory, 
     dreams = dreams_of(bundle, 2, range(6))
     environment, policy = CarRacingDream(bundle, horizon=HORIZON, recorded=0.5), DreamPolicy(bundle)
     assert [dreamt(environment, policy, *dream) for dream in dreams] == Dreamer(bundle, spec(bundle)).score(dreams)
+
+
+@pytest.mark.parametrize(("memory", "told"), [("rewarded", 0), ("rewarded first", 1)])
+def test_an_empty_memory_holds_the_reward_that_training_began_with(tmp_path, memory, told):
+    bundle = write_random_bundle(tmp_path / "b.zip", vae=SMALL, rnn=MEMORIES[memory])
+    _, info = CarRacingDream(bundle).reset(seed=1)
+    assert info["memory"].tolist() == [*[0] * 8, told]
+    assert np.array_equal(info["memory"], Mind(bundle).state[0, :9]), "as in reality"
 
 
 def test_many_dreams_begin_and_begin_again_as_the_single_ones(bundle):
