@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common import shelf
+from dreamfleet.common.bundle import find_bundle, pretrained
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.shelf import find_subspace
 from dreamfleet.common.subspace import Subspace
@@ -12,6 +13,11 @@ from dreamfleet.common.subspace import Subspace
 @pytest.fixture
 def subspace():
     return Subspace(np.ones((2, 5), np.float32), np.zeros(2, np.float32), ("a", "b"), "ab" * 32)
+
+
+@pytest.mark.parametrize("path", sorted((pretrained() / shelf.SUBSPACES).glob("*.npz")), ids=lambda path: path.stem)
+def test_what_ships_is_of_the_world_model_of_its_name(path):
+    assert find_subspace(path.stem).bundle == find_bundle(path.stem).sha256
 
 
 def test_a_subspace_is_one_that_ships_or_a_file(subspace, tmp_path, monkeypatch):
