@@ -65,6 +65,11 @@ def bundle_for(controller: Controller | TrainedAgent, named: str | None, beside:
     return bundle.fitting(controller)
 
 
+def subspace_of(bundle: str) -> str | None:
+    """The name of the subspace that ships for the world model of this name; `None`: none does."""
+    return bundle if is_file(pretrained() / SUBSPACES / f"{bundle}.npz") else None
+
+
 def find_subspace(name: str) -> Subspace:
     """The subspace that ships under this name, or the one in a file of it; `UsageError` if there is none."""
     folder = pretrained() / SUBSPACES

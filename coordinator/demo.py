@@ -28,27 +28,34 @@ from dreamfleet.common.processes import Child, ask, call, spoken
 from dreamfleet.common.runs import CONTROLLER, open_run
 from dreamfleet.common.stored import best_of
 from dreamfleet.common.table import run_panel
+from dreamfleet.coordinator.config import NO_SUBSPACE
 
 REFRESH = 0.5
 START_SECONDS = 30.0
 PLOT, VIDEO = "fitness.png", "drive.mp4"
-EVALUATE_EVERY, EVALUATION_TRACKS = 5, 8  # generations between looks at reality, and tracks of each
+DREAM_LOOKS, REAL_LOOKS = (2, 8), (3, 16)  # generations between evaluations, and tracks of each
 CONFIRMATION_TRACKS = 16  # on which what a stage reports is confirmed
+FEW, ALL, ABLE = 0.3, 0.1, 0.06  # first step sizes: from zero in a subspace, of all parameters, and after a dream
 
 
 @dataclass(frozen=True)
 class DemoConfig:
     """How long and how large; the defaults suit two cores."""
 
-    dream_minutes: float = option(1.5, "dream for so long first; 0: not at all")
-    minutes: float = option(3.0, "then evolve in reality for so long; 0: not at all")
+    dream_minutes: float = option(0.5, "dream for so long first; 0: not at all")
+    minutes: float = option(4.0, "then evolve in reality for so long; 0: not at all")
     temperature: float = option(1.5, "of the dream")
-    population: int = option(32, "candidates a generation in reality")
-    episodes: int = option(2, "episodes a candidate in reality")
+    population: int = option(24, "candidates a generation in reality")
+    episodes: int = option(4, "episodes a candidate in reality")
     horizon: int = option(1000, "steps of an episode at most in reality")
     patience: int = option(100, "cut an episode after so many steps without reward in reality")
-    sigma0: float = option(0.1, "first step size; half of it after a dream")
+    sigma0: float | None = option(
+        None, f"first step size from zero (default {FEW} in a subspace, else {ALL}); after a dream it is {ABLE}"
+    )
     bundle: str = option("tiny", "the frozen world model: a shipped name or a file")
+    subspace: str | None = option(
+        None, "the few features that both searches keep to; none: all parameters (default the bundle's, if one ships)"
+    )
     seed: int = option(1, "makes the runs")
     tracks: int = option(16, "unseen tracks that the outcome is judged on")
     workers: int = option(0, "worker processes; 0: one a core")
@@ -203,27 +210,32 @@ def _drives(scores: Sequence[float]) -> str:
     return f"{_score(fmean(scores), error, len(scores))}, {min(scores):.0f} to {max(scores):.0f}"
 
 
+def _looks(every: int, tracks: int) -> dict[str, object]:
+    return {"evaluate-every": every, "evaluation-episodes": tracks, "confirm-episodes": CONFIRMATION_TRACKS}
+
+
 def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
     """The demonstration's runs, in order."""
+    from dreamfleet.common.shelf import subspace_of
+
     found = []
+    subspace = (subspace_of(config.bundle) or NO_SUBSPACE) if config.subspace is None else config.subspace
+    few = subspace != NO_SUBSPACE
+    search: dict[str, object] = {"subspace": subspace, "covariance": "full"} if few else {}
+    sigma0 = (FEW if few else ALL) if config.sigma0 is None else config.sigma0
     reality: dict[str, object] = {
-        "population": config.population, "episodes": config.episodes, "horizon": config.horizon,
-        "patience": config.patience, "sigma0": config.sigma0, "seed": config.seed, "minutes": config.minutes,
+        **search, "population": config.population, "episodes": config.episodes, "horizon": config.horizon,
+        "patience": config.patience, "sigma0": sigma0, "seed": config.seed, "minutes": config.minutes,
         "evaluate-every": 0,
     }  # fmt: skip
     if config.dream_minutes:
         dream = f"{name}-dream"
         flags = {
-            "preset": "dream", "temperature": config.temperature, "sigma0": config.sigma0, "seed": config.seed,
-            "minutes": config.dream_minutes, "evaluate-every": EVALUATE_EVERY, "evaluation-episodes": EVALUATION_TRACKS,
-            "confirm-episodes": CONFIRMATION_TRACKS,
+            **search, "preset": "dream", "temperature": config.temperature, "sigma0": sigma0, "seed": config.seed,
+            "minutes": config.dream_minutes, **_looks(*DREAM_LOOKS),
         }  # fmt: skip
         found.append(Stage(dream, f"evolving in the dream for {config.dream_minutes:g} minutes", flags))
-        reality |= {
-            "init": runs_dir / dream / CONTROLLER, "sigma0": config.sigma0 / 2,
-            "evaluate-every": EVALUATE_EVERY, "evaluation-episodes": EVALUATION_TRACKS,
-            "confirm-episodes": CONFIRMATION_TRACKS,
-        }  # fmt: skip
+        reality |= {"init": runs_dir / dream / CONTROLLER, "sigma0": ABLE, **_looks(*REAL_LOOKS)}
     if config.minutes:
         found.append(Stage(name, f"evolving in reality for {config.minutes:g} minutes", reality))
     return tuple(found)
