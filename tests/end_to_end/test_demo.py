@@ -1,10 +1,12 @@
 """The demonstration, seconds long."""
 
+from pathlib import Path
+
 import pytest
 
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.runs import open_run
-from dreamfleet.coordinator.demo import median_drive
+from dreamfleet.coordinator.demo import DemoConfig, median_drive, stages
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -15,6 +17,24 @@ pytestmark = pytest.mark.timeout(300)
 )
 def test_its_video_shows_the_median_track(drives, expected):
     assert median_drive(drives) == (expected, drives[expected])
+
+
+@pytest.mark.parametrize(
+    ("config", "subspace", "steps"),
+    [
+        (DemoConfig(), "tiny", [0.3, 0.06]),
+        (DemoConfig(subspace="none"), None, [0.1, 0.06]),
+        (DemoConfig(bundle="my.zip"), None, [0.1, 0.06]),
+        (DemoConfig(bundle="my.zip", subspace="few.npz"), "few.npz", [0.3, 0.06]),
+        (DemoConfig(dream_minutes=0), "tiny", [0.3]),
+        (DemoConfig(sigma0=0.2), "tiny", [0.2, 0.06]),
+    ],
+)
+def test_both_stages_search_in_the_features_that_ship_for_its_world_model(config, subspace, steps):
+    found = stages(config, "demo", Path("runs"))
+    assert [each.flags["sigma0"] for each in found] == steps
+    assert [each.flags.get("subspace") for each in found] == [subspace] * len(steps)
+    assert all(("covariance" in each.flags) == bool(subspace) for each in found), "full in few dimensions"
 
 
 def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
