@@ -23,12 +23,12 @@ class Effort:
     microseconds: Count = field(default=0, metadata=OPTIONAL)  # that slots worked
 
     @classmethod
-    def of(cls, task: str, kind: str, steps: float, microseconds: float) -> Effort:
-        """Of results of one kind in a run of this task."""
+    def of(cls, task: str, kind: str, steps: float, microseconds: float, *, driven: bool = False) -> Effort:
+        """Of results of one kind in a run of this task; `driven`: of candidates that did not dream there."""
         told = saturated(int(finite(steps))), saturated(int(finite(microseconds)))
         if kind == "evaluate":
             return cls(judged=told[0], microseconds=told[1])
-        if kind == "score" and task == DREAM:
+        if kind == "score" and task == DREAM and not driven:
             return cls(dreamt=told[0], microseconds=told[1])
         return cls(driven=told[0], microseconds=told[1])
 

@@ -77,14 +77,18 @@ class TaskSpec:
     # The task's own version: another one gives other fitnesses.
     version: Annotated[int, Between(1, 10**6)] = field(default=1, metadata=OPTIONAL)
     recorded: Share = field(default=0.0, metadata=OPTIONAL)  # of the dreams: begins where recorded drives were
+    driven: bool = field(default=False, metadata=OPTIONAL)  # of a dream: in the world that it dreams of, after all
 
     def option(self, name: str, default: Any = None) -> Any:
         """One of the task's own options."""
         return json.loads(self.options or "{}").get(name, default)
 
-    def at(self, temperature: float | None = None, horizon: int | None = None, patience: int | None = None) -> TaskSpec:
-        """The same at another temperature, horizon or patience; `None`: at its own."""
-        named = {"temperature": temperature, "horizon": horizon, "patience": patience}
+    def at(
+        self, temperature: float | None = None, horizon: int | None = None, patience: int | None = None,
+        driven: bool | None = None,
+    ) -> TaskSpec:  # fmt: skip
+        """The same at another temperature, horizon or patience, or driven instead of dreamt; `None`: at its own."""
+        named = {"temperature": temperature, "horizon": horizon, "patience": patience, "driven": driven}
         others: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
         return replace(self, **others) if others else self
 
@@ -137,11 +141,17 @@ class Job:
     temperature: Temperature | None = field(default=None, metadata=OPTIONAL)
     horizon: Horizon | None = field(default=None, metadata=OPTIONAL)
     patience: Patience | None = field(default=None, metadata=OPTIONAL)
+    driven: bool | None = field(default=None, metadata=OPTIONAL)
 
     @property
-    def terms(self) -> tuple[float | None, int | None, int | None]:
+    def terms(self) -> tuple[float | None, int | None, int | None, bool | None]:
         """What it names of its specification."""
-        return self.temperature, self.horizon, self.patience
+        return self.temperature, self.horizon, self.patience, self.driven
+
+    @property
+    def alone(self) -> bool:
+        """Whether a slot does it by itself, however many dreams it would dream at once."""
+        return self.kind != "score" or bool(self.driven)
 
     def spec(self, own: TaskSpec) -> TaskSpec:
         """What it is scored in; `own` is the run's specification."""

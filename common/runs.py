@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import NoneType
@@ -22,6 +22,7 @@ from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.seeds import CHOOSING
+from dreamfleet.common.stages import BegunStage, begun_stages
 from dreamfleet.common.stored import (
     RunSettings,
     StoredConfirmation,
@@ -150,10 +151,12 @@ class RunFolder:
 
     def efforts(self) -> list[GenerationEffort]:
         """What accepted results took, by generation; the drives that chose and confirmed the report stand apart."""
-        task = self.spec.task
-        rows = self._typed(self._all(_EFFORTS), "siiff")
-        return [GenerationEffort(generation, bool(confirming), Effort.of(task, kind, steps, microseconds))
-                for kind, generation, confirming, steps, microseconds in rows]  # fmt: skip
+        settings = self.settings
+        begun = begun_stages(settings, self.history(), self.evaluations())
+        rows = self._typed(self._all(efforts_query(begun)), "siiiff")
+        return [GenerationEffort(generation, bool(confirming), Effort.of(settings.task.task, kind, *made,
+                                                                         driven=bool(driven)))
+                for kind, generation, confirming, driven, *made in rows]  # fmt: skip
 
     def rollouts(self) -> list[Path]:
         """Every collected drive that was accepted, oldest first."""
@@ -212,11 +215,19 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "i": (int,), "f": (int, float), "F": (int, float, NoneType), "s": (str,), "b": (bytes,),
 }  # fmt: skip
 _RESULT = "kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint"
-SUMS = "total(steps), total(CAST(seconds * 1e6 AS INTEGER))"  # of results; a float, since old journals hold huge ones
-_EFFORTS = (
-    f"SELECT kind, generation, kind = 'evaluate' AND episode >= {CHOOSING}, {SUMS} FROM result GROUP BY 1, 2, 3 "  # noqa: S608
-    "ORDER BY 2, 3, 1"
-)
+
+
+def efforts_query(begun: Sequence[BegunStage]) -> str:
+    """What results took: kind, generation, whether they confirmed, whether they were driven, steps, microseconds.
+
+    Sums are floats, since old journals hold huge ones.
+    """
+    whens = " ".join(f"WHEN generation >= {each.since} THEN {each.stage.driven_episodes}" for each in reversed(begun))
+    return (
+        f"SELECT kind, generation, kind = 'evaluate' AND episode >= {CHOOSING}, "  # noqa: S608
+        f"kind = 'score' AND episode < CASE {whens} ELSE 0 END, total(steps), "
+        "total(CAST(seconds * 1e6 AS INTEGER)) FROM result GROUP BY 1, 2, 3, 4 ORDER BY 2, 3, 1, 4"
+    )
 
 
 def rollout_path(folder: Path, generation: int, episode: int) -> Path:

@@ -14,7 +14,7 @@ from itertools import groupby
 from typing import Any
 
 from dreamfleet.common.messages import TaskSpec
-from dreamfleet.common.stored import RunSettings, StageSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.stored import NAMED, RunSettings, StageSettings, StoredEvaluation, StoredGeneration
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class Stage:
     population: int
     sigma0: float
     racing: bool
+    driven: float  # share of a candidate's episodes in a dream
     search: int  # number of the stage that began the search which goes on in this one
     end: StageSettings
     whole: bool = True  # whether the search goes through all parameters, not in the run's subspace
@@ -52,8 +53,14 @@ class Stage:
         patience = f", patience {self.patience}" if self.patience else ""
         search = f"a new search with step size {self.sigma0:g}" if self.anew else "the search goes on"
         raced = ", racing" if self.racing else ""
+        driven = f", {self.driven:.0%} of them driven" if self.driven else ""
         search += "" if self.whole else " in the subspace"
-        return f"{self.horizon} steps{patience}, {self.population} x {self.episodes} episodes{raced}, {search}"
+        return f"{self.horizon} steps{patience}, {self.population} x {self.episodes} episodes{driven}{raced}, {search}"
+
+    @property
+    def driven_episodes(self) -> int:
+        """How many of a candidate's episodes in a dream are driven in the world that it dreams of: the first ones."""
+        return round(self.driven * self.episodes)
 
     def spec(self, own: TaskSpec) -> TaskSpec:
         """The run's `own` specification under this stage's horizon and patience."""
@@ -75,7 +82,8 @@ def stages_of(settings: RunSettings) -> tuple[Stage, ...]:
     found = [
         Stage(
             1, spec.horizon, spec.patience, settings.episodes, settings.population, settings.sigma0, settings.racing,
-            search=1, end=settings.stages[0].end if settings.stages else StageSettings(), whole=not settings.subspace,
+            settings.driven, search=1, end=settings.stages[0].end if settings.stages else StageSettings(),
+            whole=not settings.subspace,
         )
     ]  # fmt: skip
     for each in settings.stages[1:]:
@@ -84,8 +92,7 @@ def stages_of(settings: RunSettings) -> tuple[Stage, ...]:
 
 
 def _after(before: Stage, each: StageSettings) -> Stage:
-    named: dict[str, Any] = {name: getattr(before, name) for name in ("horizon", "patience", "episodes", "racing")}
-    named |= {"population": before.population, "sigma0": before.sigma0, **each.named}
+    named: dict[str, Any] = {name: getattr(before, name) for name in NAMED} | each.named
     whole = before.whole or each.whole
     anew = each.sigma0 is not None or named["population"] != before.population or whole != before.whole
     number = before.number + 1

@@ -41,6 +41,7 @@ class StageStatus:
     population: Count
     episodes: Count
     racing: bool
+    driven: float = field(default=0.0, metadata=OPTIONAL)  # share of a candidate's episodes in a dream
 
 
 @dataclass(frozen=True)

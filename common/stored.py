@@ -13,7 +13,7 @@ from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.fields import OPTIONAL, written
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
-from dreamfleet.common.messages import Between, Count, Horizon, Length, Packages, Patience, TaskSpec
+from dreamfleet.common.messages import Between, Count, Horizon, Length, Packages, Patience, Share, TaskSpec
 
 MOST_STAGES = 32  # of a schedule: a status carries them too
 Population = Annotated[int, Between(2, 10**5)]
@@ -35,6 +35,7 @@ class StageSettings:
     population: Population | None = field(default=None, metadata=OPTIONAL)
     sigma0: float | None = field(default=None, metadata=OPTIONAL)
     racing: bool | None = field(default=None, metadata=OPTIONAL)
+    driven: Share | None = field(default=None, metadata=OPTIONAL)
     whole: bool = field(default=False, metadata=OPTIONAL)  # from here on the search leaves the run's subspace
 
     @property
@@ -54,7 +55,7 @@ class StageSettings:
         return bool(self.generations or self.steps or self.score is not None)
 
 
-NAMED = ("horizon", "patience", "episodes", "population", "sigma0", "racing")
+NAMED = ("horizon", "patience", "episodes", "population", "sigma0", "racing", "driven")
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,8 @@ class RunSettings:
     optimiser_options: tuple[str, ...] = field(default=(), metadata=OPTIONAL)  # each as name=value
     # Fresh tracks on which the reported mean is driven as the run ends; 0: never, as in runs from before this.
     confirm_episodes: Annotated[int, Between(0, 10**4)] = field(default=0, metadata=OPTIONAL)
+    # Of a candidate's episodes in a dream: driven in the world that it dreams of, the first ones.
+    driven: Share = field(default=0.0, metadata=OPTIONAL)
     subspace: str = field(default="", metadata=OPTIONAL)  # SHA-256 of the one that the search keeps to; empty: none
     # Of a schedule; all of the above is the first one's, which names nothing itself. The last one has no end.
     stages: Annotated[tuple[StageSettings, ...], Length(0, MOST_STAGES)] = field(default=(), metadata=OPTIONAL)

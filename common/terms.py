@@ -19,13 +19,17 @@ from dreamfleet.common.stored import RunSettings, StoredEvaluation, StoredGenera
 class Terms:
     """Those of one generation."""
 
-    spec: TaskSpec  # what its candidates are scored in
+    spec: TaskSpec  # what its candidates are scored in, but for the episodes that a dream's stage drives
     begun: BegunStage
 
     @property
     def stage(self) -> Stage:
         """Its stage."""
         return self.begun.stage
+
+    def spec_of(self, episode: int) -> TaskSpec:
+        """What one episode of a candidate is scored in."""
+        return self.spec.at(driven=episode < self.stage.driven_episodes or None)
 
 
 class Agenda:

@@ -80,6 +80,11 @@ class RunConfig:
         "share of the dreams, 0 to 1, that begins where recorded drives were, with what the model remembered there; "
         "the bundle must hold such states",
     )
+    driven: float = option(
+        0.0,
+        "share of a candidate's episodes, 0 to 1, that is driven in the world that the others dream of; 1: all, as in "
+        "a schedule whose first stage dreams",
+    )
     heat: float = option(
         1.0, "multiply the temperature by this each time that the evaluated mean falls clearly behind; 1: never"
     )
@@ -124,10 +129,29 @@ class RunConfig:
             raise UsageError(f"--recorded must be from 0 to 1, not {self.recorded}")
         if self.recorded and self.task != DREAM:
             raise UsageError(f"--recorded is of task {DREAM}, not of {self.task}: leave it out, or say 0")
+        self._check_driven()
         if not 1 <= self.heat < float("inf"):
             raise UsageError(f"--heat must be a number of at least 1, not {self.heat}")
         if self.heat > 1 and (self.temperature is None or not self.evaluate_every):
             raise UsageError("--heat raises --temperature when evaluations fall: give it and --evaluate-every too")
+
+    def _check_driven(self) -> None:
+        if not 0 <= self.driven <= 1:
+            raise UsageError(f"--driven must be from 0 to 1, not {self.driven}")
+        if self.driven and self.task != DREAM:
+            raise UsageError(f"--driven is of task {DREAM}, not of {self.task}: leave it out, or say 0")
+        if not 0 < self.driven < 1:
+            return
+        if round(self.driven * self.episodes) in (0, self.episodes):
+            raise UsageError(
+                f"--driven {self.driven:g} of {self.episodes} episodes is none of them, or all: give another share, or "
+                "more --episodes"
+            )
+        if self.racing:
+            raise UsageError(
+                "--racing compares all candidates by the first half of their episodes, and of a mixture that would be "
+                "the driven ones: leave it out, or say --driven 0 or 1"
+            )
 
     @property
     def needs_no_bundle(self) -> bool:
@@ -161,6 +185,7 @@ class RunConfig:
             collect_every=self.collect_every,
             collect_episodes=self.collect_episodes,
             heat=self.heat,
+            driven=self.driven,
             optimiser=self.optimiser,
             optimiser_options=tuple(filter(None, self.optimiser_options)),
             subspace="" if self.searched is None else self.searched.sha256,

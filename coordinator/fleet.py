@@ -57,6 +57,7 @@ class Fleet:
         self.notes: list[str] = []  # what happened, for whoever writes it down and clears it
         self.hurry = False  # nothing but evaluations and collected rollouts is left to wait for
         self.paused = False
+        self.alone = False  # what is scored now, a slot does by itself, however wide the run's task is
 
     def withdraw(self, kind: Kind) -> None:
         """No longer want jobs of this kind; what runs already becomes obsolete."""
@@ -100,7 +101,7 @@ class Fleet:
         if beat.numbering != member.numbering:
             # It was late, or its worker has not heard of the welcome: what it had queued, it will then forget.
             beat = replace(beat, seen=0, queued=())
-        member.observe(beat, now)
+        member.observe(replace(beat, capacity=min(beat.capacity, beat.slots)) if self.alone else beat, now)
         running = {self.jobs.named(run.tag): run.steps for run in beat.running}
         shown = {self.jobs.named(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
         for digest, lease in list(member.leases.items()):

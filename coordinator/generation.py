@@ -28,20 +28,23 @@ class Generation:
 
     With `racing` every candidate drives the first half of the episodes, and after this barrier the better half of the
     candidates the others; of equals the one with the lower index goes on. `own` is the run's specification where
-    `spec`, at a raised temperature or in a later stage, is another.
+    `spec`, at a raised temperature or in a later stage, is another. Of a dream's episodes a candidate drives the first
+    `driven` in the world that it dreams of.
     """
 
     def __init__(
         self, number: int, spec: TaskSpec, vectors: Sequence[bytes], seeds: Sequence[int], *, racing: bool = False,
-        own: TaskSpec | None = None,
+        own: TaskSpec | None = None, driven: int = 0,
     ) -> None:  # fmt: skip
         self.number = number
         self.spec = spec
         self.is_one_point = len(set(vectors)) == 1 < len(vectors)  # as they travel: nothing can be learned from it
+        parts = (spec.at(driven=True), seeds[:driven], 0), (spec, seeds[driven:], driven)
         self.work = [
             work
             for candidate, vector in enumerate(vectors)
-            for work in make_work(spec, "score", number, candidate, vector, seeds, own)
+            for each, some, first in parts
+            for work in make_work(each, "score", number, candidate, vector, some, own or spec, first)
         ]
         # Equal vectors have equal digests: one job then fills the place of each of them.
         self._places: dict[bytes, list[tuple[int, int]]] = {}

@@ -115,5 +115,7 @@ class Generations:
         return generation
 
     def _generation(self, number: int, vectors: Sequence[bytes], seeds: Sequence[int], terms: Terms) -> Generation:
-        own = self._settings.task
-        return Generation(number, terms.spec, vectors, seeds, racing=terms.stage.racing, own=own)
+        own, stage = self._settings.task, terms.stage
+        return Generation(
+            number, terms.spec, vectors, seeds, racing=stage.racing, own=own, driven=stage.driven_episodes
+        )

@@ -35,7 +35,7 @@ def make_work(
 
     `own` is the run's specification where `spec` is another.
 
-    A job names its temperature, horizon and patience only where they are not the run's own.
+    A job names its temperature, horizon, patience and whether it is driven only where they are not the run's own.
     """
     identity = hashlib.sha256(vector).digest()
     own = own or spec
@@ -54,6 +54,7 @@ def make_work(
                 temperature=None if spec.temperature == own.temperature else spec.temperature,
                 horizon=None if spec.horizon == own.horizon else spec.horizon,
                 patience=None if spec.patience == own.patience else spec.patience,
+                driven=None if spec.driven == own.driven else spec.driven,
             ),
             vector,
         )

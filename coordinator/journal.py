@@ -24,7 +24,8 @@ from dreamfleet.common.effort import Effort
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.files import sync_folder, write_aside
 from dreamfleet.common.messages import Job, Result
-from dreamfleet.common.runs import BUNDLE, JOURNAL, SUMS, RunFolder
+from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, efforts_query
+from dreamfleet.common.stages import begun_stages
 from dreamfleet.common.stored import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.collection import Collection
@@ -222,15 +223,18 @@ class Journal:
             result.steps, result.seconds, worker, fingerprint, incarnation,
         )  # fmt: skip
         if self._effort is not None:
-            self._effort += Effort.of(job.task, job.kind, result.steps, int(result.seconds * 1e6))
+            made = result.steps, int(result.seconds * 1e6)
+            self._effort += Effort.of(job.task, job.kind, *made, driven=bool(job.driven))
 
     @property
     def effort(self) -> Effort:
         """What all results took: summed up once, then counted with each, so that it costs the same however many."""
         if self._effort is None:
-            task = RunSettings.from_json(self.fact("settings") or "").task.task
-            rows = self._read(f"SELECT kind, {SUMS} FROM result GROUP BY kind")  # noqa: S608
-            self._effort = sum((Effort.of(task, *row) for row in rows), Effort())
+            settings = RunSettings.from_json(self.fact("settings") or "")
+            rows = self._read(efforts_query(begun_stages(settings, *self.closed())))
+            task = settings.task.task
+            told = (Effort.of(task, kind, *made, driven=bool(driven)) for kind, _, _, driven, *made in rows)
+            self._effort = sum(told, Effort())
         return self._effort
 
     def drop_excessive(self, horizon: int) -> int:

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.saving import saving
-from dreamfleet.common.stages import begun_stages, in_turn
+from dreamfleet.common.stages import Stage, begun_stages, in_turn
 from dreamfleet.common.tasks import DREAM
 from dreamfleet.coordinator.learning import LearningCurve, Mark, Point
 
@@ -37,12 +37,13 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     axes.plot(number, mean, color="tab:blue", label="mean of the population")
     axes.plot(number, [each.best for each in history], color="tab:orange", linewidth=1, label="best candidate")
     stages = begun_stages(settings, history, evaluations)
+    apart = dreamt and not any(each.stage.driven for each in stages)  # else both are scores of one world
     for each in stages[1:]:
         label = "a stage begins" if each is stages[1] else None
         axes.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1, label=label)
     handles: tuple[Any, ...] = axes.get_legend_handles_labels()
     if evaluations:
-        real = axes.twinx() if dreamt else axes
+        real = axes.twinx() if apart else axes
         episodes = f"{settings.evaluation_episodes} whole episodes"
         real.errorbar(
             [each.generation for each in evaluations], [each.mean for each in evaluations],
@@ -50,20 +51,29 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
             label=f"evaluated mean{' in reality' if dreamt else ''}, {episodes} (± standard error)",
         )  # fmt: skip
         _draw_confirmed(real, run)
-        if dreamt:
+        if apart:
             real.set_ylabel(f"score in reality, {episodes}", color="tab:green")
             handles = tuple(a + b for a, b in zip(handles, real.get_legend_handles_labels(), strict=True))
         else:
             handles = axes.get_legend_handles_labels()
     size = in_turn(f"{each.stage.population} candidates x {each.stage.episodes} episodes" for each in stages)
-    horizon = in_turn(str(each.stage.horizon) for each in stages)
-    axes.set(xlabel="generation", ylabel=f"fitness over {horizon} {'dreamt ' * dreamt}steps")
+    steps = in_turn(_steps(each.stage, dreamt=dreamt) for each in stages)
+    axes.set(xlabel="generation", ylabel=f"fitness over {steps}")
     title = f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}"
     axes.set_title(title, fontsize=11)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     _save(figure, path)
+
+
+def _steps(stage: Stage, *, dreamt: bool) -> str:
+    """What a candidate's fitness is taken over, in words."""
+    if not dreamt:
+        return f"{stage.horizon} steps"
+    if stage.driven in (0, 1):
+        return f"{stage.horizon} {'driven' if stage.driven else 'dreamt'} steps"
+    return f"{stage.horizon} steps, {stage.driven:.0%} driven"
 
 
 def plot_learning(curves: Sequence[LearningCurve], marks: Sequence[Mark], path: Path) -> None:

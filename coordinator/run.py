@@ -158,7 +158,7 @@ class Run:
         generation = self.generation
         if len(self._agenda.stages) > 1:
             self.fleet.notes.append(f"generation {generation.number} is in {self._stage_told}")
-        self.fleet.jobs.begin(generation.number)
+        self._prepare_fleet(generation)
         work = self.slack.begin(self._generations.mean, now)
         if self._ending is None and not generation.done and (reason := self._stop_reason(generation)):
             self._end_by(reason)
@@ -181,12 +181,16 @@ class Run:
         self.fleet.jobs.offer(self.slack.schedule(closed.number, mean, now, last=reason is not None))
         self._tell_changes(generation)
         self.generation, self.opened = generation, now
-        self.fleet.jobs.begin(generation.number)
+        self._prepare_fleet(generation)
         if reason:
             self.fleet.withdraw("score")
             self._end_by(reason)
         else:
             self.fleet.jobs.offer(generation.missing)
+
+    def _prepare_fleet(self, generation: Generation) -> None:
+        self.fleet.jobs.begin(generation.number)
+        self.fleet.alone = self.terms.stage.driven == 1
 
     def _tell_changes(self, generation: Generation) -> None:
         """Say for the log under which other terms a generation opens, and why."""

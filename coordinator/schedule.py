@@ -29,6 +29,7 @@ class StageConfig:
     population: int | None = option(None, "as --population; another one begins the search anew from the mean")
     sigma0: float | None = option(None, "as --sigma0; begins the search anew from the mean")
     racing: bool | None = option(None, "as --racing")
+    driven: float | None = option(None, "as --driven")
     whole: bool = option(False, "true: from here on the search leaves the subspace, from the mean; it needs a sigma0")
 
     def __post_init__(self) -> None:

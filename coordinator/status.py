@@ -121,7 +121,7 @@ def _stage(run: Run) -> StageStatus | None:
     if not total:
         return None
     within = stage.horizon, stage.patience, stage.population, stage.episodes, stage.racing
-    return StageStatus(stage.number, total, begun.since, *within)
+    return StageStatus(stage.number, total, begun.since, *within, stage.driven)
 
 
 def _headless(standing: Standing) -> Population:

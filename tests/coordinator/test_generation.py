@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -5,6 +7,7 @@ from dreamfleet.coordinator.generation import Generation
 from dreamfleet.coordinator.jobs import make_work, travelling
 from tests.support.samples import SPEC
 
+DREAM = replace(SPEC, task="dream")
 VECTORS = [travelling(np.full(5, value)) for value in (0.0, 1.0, 2.0)]
 
 
@@ -15,6 +18,15 @@ def test_every_candidate_drives_every_seed():
         (candidate, episode, (seed,)) for candidate in range(3) for episode, seed in enumerate((100, 200))
     ]
     assert len({job.digest for job in jobs}) == generation.total == 6
+
+
+def test_of_a_dreams_episodes_the_first_are_driven_and_say_so():
+    generation = Generation(0, DREAM, VECTORS, (100, 200, 300), driven=1)
+    jobs = [work.job for work in generation.missing]
+    assert [(job.episode, job.driven) for job in jobs] == [(0, True), (1, None), (2, None)] * 3
+    for job in jobs:
+        assert job.digest == DREAM.at(driven=job.driven).digest("score", job.vector, job.seeds)
+    assert len({job.digest for job in jobs}) == 9
 
 
 def test_fitness_is_the_mean_of_a_candidates_own_episodes():

@@ -158,6 +158,34 @@ def test_what_remains_of_a_schedule_begins_with_the_stage_and_its_end(settings, 
     first, last = stages_of(found)
     assert remaining(found, first)["stages"] == found.stages
     assert remaining(found, last) == {
-        "horizon": 1000, "patience": 60, "episodes": 16, "population": 32, "sigma0": 0.05, "racing": True, "stages": (),
+        "horizon": 1000, "patience": 60, "episodes": 16, "population": 32, "sigma0": 0.05, "racing": True,
+        "driven": 0.0, "stages": (),
     }  # fmt: skip
     RunConfig(**{**settings_of(found, random_bundle.path), **remaining(found, last)}).settings(random_bundle)
+
+
+def test_a_share_that_is_driven_stays_a_share_whatever_the_episodes(settings):
+    text = "[[stage]]\ngenerations = 3\n[[stage]]\ndriven = 1\nepisodes = 4\nsteps = 9\n[[stage]]\nepisodes = 16\n"
+    found = stages_of(settings(text, task="dream"))
+    assert [each.driven_episodes for each in found] == [0, 4, 16]
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        ({"driven": 0.5}, "--driven is of task dream, not of car-racing"),
+        ({"task": "dream", "driven": 1.5}, "--driven must be from 0 to 1, not 1.5"),
+        ({"task": "dream", "driven": float("nan")}, "--driven must be from 0 to 1, not nan"),
+        ({"task": "dream", "driven": 0.1, "episodes": 4}, "--driven 0.1 of 4 episodes is none of them, or all"),
+        ({"task": "dream", "driven": 0.5, "episodes": 4, "racing": True}, "--racing compares all candidates"),
+    ],
+)
+def test_what_cannot_be_driven_is_said(flags, says):
+    with pytest.raises(UsageError, match=says.replace("(", "[(]")):
+        RunConfig(**flags)
+
+
+def test_a_later_stage_that_mixes_is_looked_at_as_the_first_is(settings):
+    text = "[[stage]]\ngenerations = 3\n[[stage]]\ndriven = 0.1\nepisodes = 4\n"
+    with pytest.raises(UsageError, match=r"stage 2: --driven 0\.1 of 4 episodes is none of them"):
+        settings(text, task="dream")

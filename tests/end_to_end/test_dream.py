@@ -139,3 +139,65 @@ def test_a_world_model_without_a_dream_is_refused_by_its_worker(processes, rando
     code, _ = worker.finish(60)
     assert code == 1
     assert any("from before dreams" in line for line in worker.lines)
+
+
+STAGES = """
+[[stage]]
+generations = 2
+
+[[stage]]
+driven = 0.5
+generations = 1
+episodes = 4
+horizon = 60
+sigma0 = 0.2
+
+[[stage]]
+driven = 1.0
+episodes = 2
+"""
+DRIVEN = [0, 0, 2, 2, 2]  # of each candidate's episodes, by generation
+
+
+def staged(processes, bundle, name, *flags):
+    path = processes.folder / "stages.toml"
+    path.write_text(STAGES)
+    return begin(processes, bundle, name, "--schedule", path, "--generations", len(DRIVEN), *flags)
+
+
+def test_a_run_that_dreams_then_mixes_then_drives_gives_the_same_bits_through_kills(processes, random_bundle):
+    coordinator = staged(processes, random_bundle, "calm")
+    coordinator.wait_for("generation 0 is in stage 1 of 3")
+    worker = processes.worker("--run", "calm", "--slots", 2)
+    coordinator.wait_for("stage 2 of 3 (60 steps, 8 x 4 episodes, 50% of them driven, a new search with step size 0.2)")
+    coordinator.wait_for("stage 3 of 3 (60 steps, 8 x 2 episodes, 100% of them driven, the search goes on)")
+    assert coordinator.finish(200)[0] == 0
+    worker.end()
+    coordinator = staged(processes, random_bundle, "night")
+    for number in range(2):
+        processes.worker("--run", "night", "--name", f"w{number}")
+    for said in ("generation 1: mean", "generation 2: mean", "generation 3: mean"):
+        coordinator.wait_for(said)
+        coordinator.end()
+        coordinator = processes.start(
+            "coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+        )  # fmt: skip
+    assert coordinator.finish(200)[0] == 0
+    told = []
+    for name in ("calm", "night"):
+        with open_run(processes.runs, name) as run:
+            places = [(g, i) for g in range(len(DRIVEN)) for i in range(POPULATION)]
+            told.append([(run.fitness(*place), [each.steps for each in run.results(*place)]) for place in places])
+            efforts = [each.effort for each in run.efforts() if not each.confirming]
+            assert sum(each.driven + each.dreamt for each in efforts) == sum(each.steps for each in run.history())
+            for generation, driven in enumerate(DRIVEN):
+                results = [each for i in range(POPULATION) for each in run.results(generation, i)]
+                wanted = sum(each.steps for each in results if each.episode < driven)
+                assert sum(each.effort.driven for each in run.efforts() if each.generation == generation) == wanted
+    assert told[0] == told[1]
+    for generation in range(1, len(DRIVEN)):
+        candidate = ("--candidate", f"{generation}/3")
+        code, out, err = processes.call("replay", "night", "--runs-dir", processes.runs, *candidate)
+        assert (code, "DIFFERS" in out) == (0, False), err
+    code, out, err = processes.call("evaluate", "--controller", "night", "--runs-dir", processes.runs, "--episodes", 1)
+    assert code == 0, err

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -51,10 +51,10 @@ class Scorer:
     ) -> Score:  # fmt: skip
         """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode.
 
-        `spec` is one other than the run's: the same at another temperature, horizon or patience.
+        `spec` is one other than the run's: the same at another temperature, horizon or patience, or driven.
         """
-        if kind == "score" and self._batch_for is not None:
-            return self._batch_for(spec or self.spec).score([(parameters, seed)], on_step)[0]
+        if (batch := self._batch((kind,), spec)) is not None:
+            return batch.score([(parameters, seed)], on_step)[0]
         return score(self._environment, self._policy, parameters, self.course(kind, seed, spec), on_step)
 
     def score_all(
@@ -62,10 +62,8 @@ class Scorer:
         spec: TaskSpec | None = None,
     ) -> list[Score]:  # fmt: skip
         """A turn's jobs, as `score` does; `on_step` hears of all steps made so far."""
-        if self._batch_for is not None and all(kind == "score" for kind, _, _ in jobs):
-            return self._batch_for(spec or self.spec).score(
-                [(parameters, seed) for _, parameters, seed in jobs], on_step
-            )
+        if (batch := self._batch([kind for kind, _, _ in jobs], spec)) is not None:
+            return batch.score([(parameters, seed) for _, parameters, seed in jobs], on_step)
         scores: list[Score] = []
         for job in jobs:
             before = sum(each.steps for each in scores)
@@ -97,6 +95,13 @@ class Scorer:
         return Course(
             seed, spec.horizon, spec.patience, world.idle_cost, time_cost, world.finish, stray_cost, world.stray
         )
+
+    def _batch(self, kinds: Iterable[Kind], spec: TaskSpec | None) -> Batch | None:
+        """What scores jobs of these kinds at once; `None` where they are driven one by one."""
+        spec = spec or self.spec
+        if self._batch_for is None or spec.driven or any(kind != "score" for kind in kinds):
+            return None
+        return self._batch_for(spec)
 
     def close(self) -> None:
         """Release the environment."""

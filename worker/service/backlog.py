@@ -65,18 +65,18 @@ class Backlog:
         return refused
 
     def take(self, count: int) -> list[tuple[Job, bytes]]:
-        """The first jobs whose vectors are whole, with them: at most `count` to be scored, or one of another kind.
+        """The first jobs whose vectors are whole, with them: at most `count` to be scored, or one that is done alone.
 
         They are of one specification.
         """
         taken: list[tuple[Job, bytes]] = []
         for digest, job in list(self._jobs.items()):
-            if len(taken) == count or (taken and (job.kind != "score" or job.terms != taken[0][0].terms)):
+            if len(taken) == count or (taken and (job.alone or job.terms != taken[0][0].terms)):
                 break
             if (vector := self._whole(job.vector)) is not None:
                 taken.append((job, vector))
                 del self._jobs[digest]
-                if job.kind != "score":
+                if job.alone:
                     break
         return taken
 

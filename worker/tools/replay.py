@@ -30,10 +30,9 @@ def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[Replayed
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.worker.scoring.scorer import Scorer
 
-    spec = terms_of(run, generation).spec
-    scorer = Scorer(spec, Bundle.open(run.bundle_path, spec.bundle) if spec.bundle else None)
+    terms, own = terms_of(run, generation), run.spec
+    scorer = Scorer(own, Bundle.open(run.bundle_path, own.bundle) if own.bundle else None)
     for result in results:
-        yield Replayed(
-            result.episode, result.seed, result.fitness, scorer.score("score", parameters, result.seed).fitness
-        )
+        score = scorer.score("score", parameters, result.seed, spec=terms.spec_of(result.episode))
+        yield Replayed(result.episode, result.seed, result.fitness, score.fitness)
     scorer.close()
