@@ -53,7 +53,7 @@ class Stage:
         patience = f", patience {self.patience}" if self.patience else ""
         search = f"a new search with step size {self.sigma0:g}" if self.anew else "the search goes on"
         raced = ", racing" if self.racing else ""
-        driven = f", {self.driven:.0%} of them driven" if self.driven else ""
+        driven = ", all driven" if self.driven == 1 else f", {self.driven:.0%} of them driven" if self.driven else ""
         search += "" if self.whole else " in the subspace"
         return f"{self.horizon} steps{patience}, {self.population} x {self.episodes} episodes{driven}{raced}, {search}"
 

@@ -174,14 +174,15 @@ def _tell_frozen(args: argparse.Namespace, stored: RunFolder) -> None:
     from dreamfleet.coordinator.config import settings_of
 
     said = given(RunConfig, "run", args.sources["file"], args.sources["environment"])
-    preset = find_preset(said.pop("preset")) if "preset" in said else {}
-    named, stages = unfold(find_schedule(said.pop("schedule", None), args.sources["file"]) or ())
+    said = {**(find_preset(said.pop("preset")) if "preset" in said else {}), **said}
+    given_stages, own_stages = find_schedule(said.pop("schedule", None), args.sources["file"]), said.pop("stages", ())
+    named, stages = unfold(own_stages if given_stages is None else given_stages)
     said |= named
     _tell_subspace(said.pop("subspace", None), stored)
     if stages and stages != stored.settings.stages:
         log.warning("run %s keeps its own schedule; the settings say another", stored.name)
     frozen: dict[str, Any] = settings_of(stored.settings, stored.bundle_path)
-    for name, value in {**preset, **said}.items():
+    for name, value in said.items():
         if name != "bundle" and frozen.get(name, value) != value:
             log.warning("%s is %s in run %s, which keeps it; the settings say %s", name, frozen[name], stored.name,
                         value)  # fmt: skip

@@ -3,12 +3,14 @@ import json
 import numpy as np
 import pytest
 
+from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.errors import ControllerError, DreamfleetError, UsageError
 from dreamfleet.common.fields import written
 from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.shelf import find_subspace
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.common.tasks import Description
-from dreamfleet.coordinator.config import RunConfig, settings_of
+from dreamfleet.coordinator.config import PRESETS, RunConfig, settings_of
 from dreamfleet.coordinator.start import Start
 from dreamfleet.worker.tasks.api import Task
 from tests.support.bundles import states, write_random_bundle
@@ -31,6 +33,16 @@ def test_a_runs_controller_is_as_configured_and_journalled(random_bundle, flags,
     assert RunSettings.from_json(settings.to_json()) == settings
     again = settings_of(settings, random_bundle.path)
     assert RunConfig(**again).settings(random_bundle) == settings
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_preset_of_a_run_is_one_that_can_begin_and_be_configured_again(name):
+    bundle = find_bundle("tiny")
+    preset = dict(PRESETS[name])
+    searched = find_subspace(preset["subspace"]) if "subspace" in preset else None
+    settings = RunConfig(**preset, searched=searched).settings(bundle)
+    assert RunConfig(**settings_of(settings, bundle.path), searched=searched).settings(bundle) == settings
+    assert RunSettings.from_json(settings.to_json()) == settings
 
 
 def test_heat_is_journalled_and_can_be_configured_again(random_bundle):

@@ -84,6 +84,16 @@ def test_credit_is_twice_the_capacity_and_a_result_returns_it():
     assert [(verdict.digest, verdict.verdict) for verdict in send.content.verdicts] == [(given[0], "accepted")]
 
 
+def test_while_jobs_are_done_alone_a_wide_workers_capacity_is_its_slots():
+    fleet = fleet_of(A, jobs=50)
+    wide = replace(beat(capacity=200), slots=2, seen=1)
+    for alone, capacity in ((False, 200), (True, 2)):
+        fleet.alone = alone
+        fleet.beat(A, wide, 1.0)
+        assert fleet.members[A].capacity == capacity
+        assert len(digests(fleet.dispatch(1.0), A)) == (50 if capacity == 200 else 0)
+
+
 def test_batches_count_without_a_gap():
     fleet = fleet_of(A)
     numbers = []

@@ -170,7 +170,7 @@ def test_a_run_that_dreams_then_mixes_then_drives_gives_the_same_bits_through_ki
     coordinator.wait_for("generation 0 is in stage 1 of 3")
     worker = processes.worker("--run", "calm", "--slots", 2)
     coordinator.wait_for("stage 2 of 3 (60 steps, 8 x 4 episodes, 50% of them driven, a new search with step size 0.2)")
-    coordinator.wait_for("stage 3 of 3 (60 steps, 8 x 2 episodes, 100% of them driven, the search goes on)")
+    coordinator.wait_for("stage 3 of 3 (60 steps, 8 x 2 episodes, all driven, the search goes on)")
     assert coordinator.finish(200)[0] == 0
     worker.end()
     coordinator = staged(processes, random_bundle, "night")
