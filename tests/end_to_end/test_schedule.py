@@ -5,7 +5,7 @@ import json
 import pytest
 
 from dreamfleet.common.runs import open_run
-from dreamfleet.common.stages import begun_stages
+from dreamfleet.common.stages import begun_stages, stages_of
 from dreamfleet.common.terms import terms_of
 from dreamfleet.coordinator.plot import plot_fitness
 from dreamfleet.worker.inspection.curves import fitness
@@ -57,10 +57,11 @@ def outcome(processes, name):
         return told, steps, run.evaluations(), [each.since for each in begun]
 
 
-def resume(processes, name):
+def resume(processes, name, *flags):
     return processes.start(
-        "coordinator", "--resume", name, "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2
-    )
+        "coordinator", "--resume", name, "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2,
+        *flags,
+    )  # fmt: skip
 
 
 def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(processes, begin):
@@ -136,3 +137,21 @@ def test_a_schedule_is_frozen_with_its_run_and_a_file_that_says_another_is_told(
         coordinator.wait_for("incarnation")
         coordinator.end()
         assert any("schedule" in line for line in coordinator.lines) == warned
+
+
+def test_a_preset_may_hold_stages_and_a_schedule_goes_before_them(processes):
+    config, schedule = processes.folder / "fleet.toml", processes.folder / "stages.toml"
+    config.write_text('[run]\npreset = "real"\n')
+    schedule.write_text(STAGES)
+    coordinator = processes.coordinator("--config", config, name="night")
+    coordinator.wait_for("generation 0 is in stage 1 of 4 (400 steps, 64 x 16 episodes")
+    coordinator.end()
+    with open_run(processes.runs, "night") as run:
+        assert [each.driven for each in stages_of(run.settings)] == [0, 1, 1, 1]
+    coordinator = resume(processes, "night", "--config", config)
+    coordinator.wait_for("incarnation 2")
+    coordinator.end()
+    assert not any("keeps" in line for line in coordinator.lines)
+    coordinator = processes.coordinator("--config", config, "--schedule", schedule, name="other")
+    coordinator.wait_for("generation 0 is in stage 1 of 3 (4 steps")
+    coordinator.end()
