@@ -91,7 +91,8 @@ class Commands:
     def subspace(self, number: int, path: Path) -> Words:
         """What the model that counts foretells of the last drives."""
         bundle = self.layout.bundle(self.ledger.kept(number))
-        return _spelt("subspace", bundle, "--data", self.layout.root, "--out", path, "--json")
+        views = ("--views", self.config.views) if self.config.views else ()
+        return _spelt("subspace", bundle, "--data", self.layout.root, *views, "--out", path, "--json")
 
     def gate(self, number: int) -> dict[str, dict[str, Words]]:
         """What is measured of the `old` and the `new` world model: `probe`, `losses`, or both.

@@ -19,6 +19,7 @@ TAKEN = ("--data", "--preset", "--device", "--seed", "--continue-from", "--new",
 LEAST = {
     "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
     "mdnrnn_updates": 1, "gate_drives": 0, "gate_losses": 0, "seed": 0, "local": 0, "jobs": 1,
+    "views": 0,
 }  # fmt: skip
 
 
@@ -55,6 +56,9 @@ class IterateConfig:
     subspace: bool = option(
         False, "let each such evolution search what its model foretells of the last drives alone: needs --go-on"
     )
+    views: int = option(
+        0, "beside it so many directions that foretell what the model will see, as `subspace` finds them"
+    )
     gate_drives: int = option(20, "drives of `inspect --probe` that a new world model is held to the old by; 0: none")
     gate_losses: int = option(30, "losses of `inspect --losses` that it is held to it by; 0: none")
     seed: int = option(0, "makes the iteration: drives, training, populations and tracks follow from it")
@@ -76,6 +80,8 @@ class IterateConfig:
             raise UsageError("--gate-drives must be 0 or at least 2, --gate-losses 0 or at least 4")
         if self.subspace and not self.go_on:
             raise UsageError("--subspace changes a controller that is there: give --go-on too")
+        if self.views and not self.subspace:
+            raise UsageError("--views are beside the features of --subspace: give that too")
         if self.seed > MOST_SEED:
             raise UsageError(f"--seed must be at most {MOST_SEED}, not {self.seed}")
         for name in ("vae_flags", "mdnrnn_flags", *RUN_FLAGS):

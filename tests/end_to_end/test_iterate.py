@@ -337,6 +337,7 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(proces
         (("--local", 0), "nobody would score"),
         (("--go-on", "--run-flags", "--generations 1 --variant feedback=last"), "--go-on fits a controller"),
         (("--subspace",), "give --go-on too"),
+        (("--views", 8), "--views are beside the features of --subspace"),
         (
             ("--run-flags", "--generations 1 --subspace few.npz"),
             "--subspace in --run-flags: each round's run has its own",

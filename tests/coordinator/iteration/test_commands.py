@@ -112,6 +112,8 @@ def test_an_evolution_in_a_subspace_is_told_where_it_lies():
     words = said(told.subspace(2, few))
     assert words == "subspace data/rounds/01/round-1.zip --data data --out few.npz --json", "of the model that counts"
     assert "--init start.npz --subspace few.npz" in said(told.begin_run(2, (), (), Path("start.npz"), few))
+    seeing = commands(*ROUND_2, views=8, subspace=True, go_on=True)
+    assert "--data data --views 8 --out" in said(seeing.subspace(2, few))
 
 
 def test_later_rounds_may_evolve_otherwise_than_the_first():
