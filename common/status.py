@@ -116,6 +116,8 @@ class Throughput:
 
     steps_per_second: float
     environment_steps: Count
+    # Of closed generations: what a limit of minutes counts. `None` from a coordinator of before this.
+    seconds: Seconds | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 
-from dreamfleet.common.bounds import saturated
+from dreamfleet.common.bounds import MOST_SECONDS, saturated
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.common.status import (
     SCHEMA,
@@ -130,7 +130,8 @@ def _headless(standing: Standing) -> Population:
 
 def _throughput(run: Run, present: Sequence[Member]) -> Throughput:
     rate = sum(member.steps_per_second for member in present)
-    return Throughput(round(rate, 1), saturated(run.history.steps + run.generation.steps))
+    steps = saturated(run.history.steps + run.generation.steps)
+    return Throughput(round(rate, 1), steps, min(round(run.history.seconds, 1), MOST_SECONDS))
 
 
 def _refused(run: Run) -> dict[str, str]:

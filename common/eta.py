@@ -1,0 +1,179 @@
+"""How a run stands in a sentence, and how long it yet takes as far as its limits tell. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+from dreamfleet.common.effort import counted
+from dreamfleet.common.status import Progress, Status
+from dreamfleet.common.stored import told
+
+PACED_BY = 10  # closed generations whose median is the pace: one that was paused for hours tells nothing
+WORKING = ("running", "evaluating")
+
+
+@dataclass(frozen=True)
+class Bound:
+    """One limit of a run: how far it is."""
+
+    name: str  # generations, steps, minutes
+    done: float
+    wanted: float
+    seconds: float | None  # until it is reached at the present pace; `None` where there is no pace yet
+    told: str  # "18 of 30 minutes"
+
+    @property
+    def share(self) -> float:
+        """From 0 to 1."""
+        return min(max(self.done / self.wanted, 0.0), 1.0)
+
+
+@dataclass(frozen=True)
+class Eta:
+    """What is known of a run's end. Its last evaluations and its confirmation come after it."""
+
+    bounds: tuple[Bound, ...]  # limits that are counted, the nearest first
+    others: tuple[str, ...]  # limits that nobody can foretell, in words
+    pace: float | None  # seconds a generation; `None` before the first is closed
+    seconds: float | None  # until the first limit; `None` while nobody works, or where nothing tells
+
+    @property
+    def told(self) -> str:
+        """In words, such as "18 of 30 minutes, 4.6 s a generation, about 12 min to go"."""
+        parts = [each.told for each in self.bounds] + list(self.others)
+        parts = parts or ["no limit: it runs until it is stopped"]
+        if self.pace is not None:
+            parts.append(f"{duration(self.pace)} a generation")
+        if self.seconds is not None:
+            parts.append(f"about {duration(self.seconds)} to go" if self.seconds >= 1 else "at its limit")
+        return ", ".join(parts)
+
+
+def eta_of(status: Status) -> Eta:
+    """From the limits, what was done, and the pace of the generations that were closed last."""
+    recent = status.recent[-PACED_BY:]
+    pace = median(each.seconds for each in recent) if recent else None
+    bounds = tuple(_bounds(status, pace))
+    if pace is not None:
+        bounds = tuple(sorted(bounds, key=lambda each: math.inf if each.seconds is None else each.seconds))
+    known = [each.seconds for each in bounds if each.seconds is not None]
+    seconds = min(known) if known and status.state in WORKING else None
+    return Eta(bounds, tuple(_others(status)), pace, seconds)
+
+
+def sentence(status: Status) -> str:
+    """What the run does now, and what it waits for; without its name."""
+    tell = SENTENCES.get(status.state)
+    return status.state if tell is None else tell(status)
+
+
+def duration(seconds: float) -> str:
+    """A time as it is said: 0.25 s, 4.6 s, 48 s, 12 min, 3 h 20 min, 5 d 2 h."""
+    if not math.isfinite(seconds):
+        return "very long"
+    if seconds < 59.5:
+        return f"{seconds:.2g} s" if seconds < 9.95 else f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    if minutes < 60:
+        return f"{minutes} min"
+    hours, minutes = divmod(minutes, 60)
+    if hours < 48:
+        return f"{hours} h {minutes} min" if minutes else f"{hours} h"
+    days, hours = divmod(round(seconds / 3600), 24)
+    return f"{days:,} d {hours} h" if hours else f"{days:,} d"
+
+
+def _bounds(status: Status, pace: float | None) -> Iterator[Bound]:
+    """Each counted limit. A run ends as a generation closes: so the open one is waited for at least."""
+    limits, spent = status.limits, status.throughput
+    gone = status.generation.seconds
+    rest = None if pace is None else max(pace - gone, 0.0)
+    seconds: float | None
+    if generations := _limit(limits, "generations"):
+        closed = status.generations
+        left = max(generations - closed, 0)
+        seconds = None if pace is None or rest is None else (left - 1) * pace + rest if left else 0.0
+        yield Bound("generations", closed, generations, seconds, f"{closed:,} of {generations:,.0f} generations")
+    if steps := _limit(limits, "steps"):
+        done, rate = spent.environment_steps, _rate(status)
+        seconds = None if not rate or rest is None else max((steps - done) / rate, rest) if done < steps else rest
+        yield Bound("steps", done, steps, seconds, f"{counted(done)} of {counted(int(steps))} steps")
+    if (minutes := _limit(limits, "minutes")) and spent.seconds is not None:
+        gone += spent.seconds
+        told_minutes = f"{_number(gone / 60)} of {_number(minutes)} minutes"
+        yield Bound("minutes", gone / 60, minutes, max(60 * minutes - gone, rest or 0.0), told_minutes)
+
+
+def _rate(status: Status) -> float:
+    """Environment steps a second of the generations that were closed last."""
+    recent = status.recent[-PACED_BY:]
+    seconds = sum(each.seconds for each in recent)
+    return sum(each.steps for each in recent) / seconds if seconds else 0.0
+
+
+def _others(status: Status) -> Iterator[str]:
+    """The limits that hang on what evaluations will find."""
+    target, parted = status.limits.get("target"), status.limits.get("parted")
+    if isinstance(target, (int, float)):
+        best = "" if status.best is None else f" (best {status.best.mean:.0f})"
+        yield f"until an evaluation reaches {target:g}{best}"
+    if isinstance(parted, int) and parted:
+        yield f"until {parted} evaluations in a row fall behind"
+
+
+def _limit(limits: Mapping[str, Any], name: str) -> float:
+    """A limit's value; 0 where there is none, or none that this version understands."""
+    found = limits.get(name)
+    return found if isinstance(found, (int, float)) and 0 < found < math.inf else 0
+
+
+def _number(value: float) -> str:
+    """Of minutes: whole ones from ten on, else with one decimal."""
+    return f"{value:,.0f}" if value >= 10 or value == int(value) else f"{value:.1f}"
+
+
+def _running(status: Status) -> str:
+    open_one = status.generation
+    return f"generation {open_one.number}: {open_one.episodes_done:,} of {open_one.episodes:,} episodes"
+
+
+def _evaluating(status: Status) -> str:
+    if status.confirming.episodes:
+        return f"confirming what it will report: {_episodes(status.confirming)}"
+    if status.evaluating.episodes:
+        return f"waiting for an evaluation: {_episodes(status.evaluating)}"
+    return "evaluating"
+
+
+def _waiting(status: Status) -> str:
+    if status.refused:
+        name, why = next(iter(status.refused.items()))
+        return f"waiting for workers; {name} cannot join: {why}"
+    known = status.workers.known
+    return f"waiting for workers: none of {known} is there" if known else "waiting for workers: none has come yet"
+
+
+def _episodes(part: Progress) -> str:
+    return f"{part.episodes_done:,} of {part.episodes:,} episodes"
+
+
+def _paused(status: Status) -> str:
+    return f"paused: {status.why}" if status.why else "paused"
+
+
+def _ended(status: Status) -> str:
+    return f"finished: {status.why or 'stopped'}; {told(status.confirmed or status.best)}"
+
+
+def _left(status: Status) -> str:
+    return f"its coordinator left; `dreamfleet coordinator --resume {status.run}` goes on"
+
+
+SENTENCES: dict[str, Callable[[Status], str]] = {
+    "running": _running, "evaluating": _evaluating, "waiting for workers": _waiting, "paused": _paused,
+    "ended": _ended, "left": _left,
+}  # fmt: skip
