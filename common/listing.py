@@ -6,10 +6,15 @@ import argparse
 import json
 import sys
 from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
 
 from dreamfleet.common.printable import one_line, printable_lines
 
+if TYPE_CHECKING:
+    from rich.table import Table
+
 WIDEST = 10_000  # columns: where nothing is cut any more
+FOLDED, LEAST = 24, 12  # columns that a last one of long texts has before others are left out for it, and at least
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -22,15 +27,19 @@ def answer(args: argparse.Namespace, text: str, **facts: object) -> None:
     print(json.dumps(facts, default=str) if args.json else printable_lines(text), flush=True)  # noqa: T201 - what a verb answers
 
 
-def print_rows(rows: Sequence[Mapping[str, object]], right: Collection[str] = ()) -> None:
+def print_rows(
+    rows: Sequence[Mapping[str, object]], right: Collection[str] = (), least_first: Sequence[str] = ()
+) -> None:
     """Print rows of the same keys under their names: nothing is cut, in a terminal or in a pipe.
 
-    In a terminal a table, the columns in `right` aligned so; elsewhere tab-separated lines.
+    In a terminal a table, the columns in `right` aligned so. Where it is too narrow the columns in `least_first` are
+    left out one by one, which is said below; then texts of the last column go on in further lines. In a pipe,
+    tab-separated lines.
     """
     if not rows:
         return
     if sys.stdout.isatty():
-        _print_table(rows, right)
+        _print_table(rows, right, least_first)
         return
     for line in (list(rows[0]), *(row.values() for row in rows)):
         print("\t".join(_cell(value) for value in line))  # noqa: T201
@@ -40,17 +49,43 @@ def _cell(value: object) -> str:
     return "-" if value is None else one_line(str(value))
 
 
-def _print_table(rows: Sequence[Mapping[str, object]], right: Collection[str]) -> None:
+def _print_table(rows: Sequence[Mapping[str, object]], right: Collection[str], least_first: Sequence[str]) -> None:
     from rich.console import Console
-    from rich.measure import Measurement
+    from rich.text import Text
+
+    console, left_out = Console(), list[str]()
+    for name in least_first:
+        if _width(_table(rows, right, left_out, last=FOLDED)) > console.width:
+            left_out.append(name)
+    table = _table(rows, right, left_out)
+    Console(width=max(console.width, _width(_table(rows, right, left_out, last=LEAST)))).print(table)
+    if left_out:
+        console.print(Text(f"no room here for {', '.join(left_out)}", style="dim"))
+
+
+def _table(
+    rows: Sequence[Mapping[str, object]], right: Collection[str], left_out: Collection[str], last: int | None = None
+) -> Table:
+    """All but some columns; `last` is the most that the last one takes."""
     from rich.table import Table
     from rich.text import Text
 
+    names = [name for name in rows[0] if name not in left_out]
     table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="dim")
-    for name in rows[0]:
-        table.add_column(name, justify="right" if name in right else "left", no_wrap=True)
+    for name in names:
+        justify: Literal["right", "left"] = "right" if name in right else "left"
+        ends = name == names[-1]
+        most = last if ends else None
+        table.add_column(name, justify=justify, no_wrap=not ends, overflow="fold", max_width=most)
     for row in rows:
-        table.add_row(*(Text(_cell(value)) for value in row.values()))  # no markup: they may come from outside
-    console = Console()
-    needed = Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum
-    Console(width=max(console.width, needed)).print(table)
+        table.add_row(*(Text(_cell(row[name])) for name in names))  # no markup: they may come from outside
+    return table
+
+
+def _width(table: Table) -> int:
+    """Columns that it takes."""
+    from rich.console import Console
+    from rich.measure import Measurement
+
+    console = Console(width=WIDEST)
+    return Measurement.get(console, console.options, table).maximum

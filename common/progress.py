@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.measure import Measurement
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Column, Table
+
+WIDEST = 10_000  # columns: where nothing is cut any more
+BAR, LEAST_BAR = 40, 8  # columns that a bar has where there is room, and before others are left out for it
 
 
 class Bar:
@@ -21,12 +35,46 @@ class Bar:
         self._progress.update(self._task, completed=done, note=note)
 
 
+class Fitted(Progress):
+    """A progress whose line is never cut: the bar shrinks, then the columns in `least_first` are left out."""
+
+    def __init__(self, *columns: ProgressColumn, least_first: Sequence[ProgressColumn], console: Console) -> None:
+        self._least_first, self._where = least_first, console
+        super().__init__(*columns, console=console)
+
+    def make_tasks_table(self, tasks: Iterable[Task]) -> Table:
+        """The line as it fits now."""
+        tasks, every = list(tasks), self.columns
+        table = super().make_tasks_table(tasks)
+        try:
+            for each in self._least_first:
+                if self._least(table) <= self._where.width:
+                    break
+                self.columns = tuple(column for column in self.columns if column is not each)
+                table = super().make_tasks_table(tasks)
+        finally:
+            self.columns = every
+        return table
+
+    def _least(self, table: Table) -> int:
+        """Columns in which nothing is cut while the bar has `LEAST_BAR`."""
+        drawn = Measurement.get(self._where, self._where.options.update(max_width=WIDEST), table).maximum
+        return drawn - (BAR - LEAST_BAR) * any(isinstance(each, BarColumn) for each in self.columns)
+
+
+def fitted(unit: str, console: Console) -> Progress:
+    """A bar with how many of what are done, time gone and time left."""
+    gone, left, word = TimeElapsedColumn(), TextColumn("left"), TextColumn(unit)
+    bar = BarColumn(None, table_column=Column(max_width=BAR))
+    columns = (
+        TextColumn("{task.description}"), bar, MofNCompleteColumn(), word, gone, left, TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )  # fmt: skip
+    return Fitted(*columns, least_first=(gone, word, left, bar), console=console)
+
+
 @contextmanager
 def progress_bar(description: str, total: int, unit: str) -> Iterator[Bar]:
     """A bar on stderr with time gone and time left."""
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeElapsedColumn(),
-        TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
-    )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with fitted(unit, Console(stderr=True)) as progress:
         yield Bar(progress, description, total)

@@ -100,6 +100,12 @@ class WorkerStatus:
     drawn_by: Word
     heard: float  # seconds ago
     fingerprint: Text
+    # Seconds that a candidate's job took a slot of late; `None` before the first.
+    job_seconds: float | None = field(default=None, metadata=OPTIONAL)
+    # The least of late until it was known that a batch had arrived, in seconds: beats tell it, so that the network's
+    # own round trip is shorter. `None` before the first.
+    round_trip: float | None = field(default=None, metadata=OPTIONAL)
+    resent: Count = field(default=0, metadata=OPTIONAL)  # batches that were sent again
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,22 @@
-"""A run's status as tables for a terminal."""
+"""A run's status as a picture for a terminal of any size: what matters least gives way, and no name is cut."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
 
-from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.cells import cell_len, chop_cells
+from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.panel import Panel
-from rich.progress_bar import ProgressBar
-from rich.table import Table
 from rich.text import Text
 
+from dreamfleet.common.cells import bar, bars, cell_lines, cells_wanted
+from dreamfleet.common.eta import eta_of, sentence
 from dreamfleet.common.printable import printable
-from dreamfleet.common.status import FailureStatus, OpenGeneration, Progress, Status, WorkerStatus
+from dreamfleet.common.roster import Roster
+from dreamfleet.common.status import FailureStatus, OpenGeneration, Population, Progress, Status
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 
 STATE_STYLES = {
@@ -23,77 +27,150 @@ STATE_STYLES = {
     "left": "bold yellow",
     "waiting for workers": "yellow",
 }
-SPARKS = "▁▂▃▄▅▆▇█"
-SPARK_WIDTH = 60
-MOST_WORKERS = 20
-PAD = 2  # columns of air on each side of a cell
-COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
-    "worker": lambda each: each.worker,
-    "state": lambda each: each.state,
-    "slots": lambda each: str(each.slots),
-    "leases": lambda each: str(each.leases),
-    "finished": lambda each: str(each.finished),
-    "steps/s": lambda each: f"{each.steps_per_second:.0f}",
-    "load": lambda each: str(each.load),
-    "picture": lambda each: each.drawn_by,
-}
-LEAST_FIRST = ("picture", "load", "leases", "finished", "slots", "steps/s", "state")
-LEFT = ("worker", "state", "picture")
+FRAME = 4  # columns of border and air
+BORDERS = 2  # lines
+LABELS = 17  # columns of a fact's name
+TWO_COLUMNS = 110  # columns from which on facts stand in two
+BAR = 40  # columns at most
+CURVE = 8  # lines at most
 
 
-def run_panel(status: Status) -> RenderableType:
-    """The whole picture: state, generation, fitness, fleet."""
-    state = printable(status.state), STATE_STYLES.get(status.state, "")
-    title = Text.assemble((printable(status.run), "bold"), " · ", state)
-    parts: list[RenderableType] = [_facts(status)]
-    if status.why:
-        parts.append(Text(printable(status.why), style="bold red" if status.state == "paused" else ""))
-    elif status.failures:
-        parts.append(Text(printable(_failure(status.failures[0])), style="red"))
-    parts.append(_progress(status))
-    if status.recent:
-        parts.append(Text.assemble(("mean fitness by generation  ", "dim"), _sparkline(status.recent)))
-    parts.append(_worker_table(status))
-    return Panel(Group(*parts), title=title, title_align="left", padding=(0, 1))
+@dataclass(frozen=True)
+class Block:
+    """A part of the picture: it takes `least` lines or none, would have `wish`, and has use for `most`."""
+
+    need: int  # 0 first: who gets lines before others
+    least: int
+    wish: int
+    most: int
+    draw: Callable[[int], list[Text]]
 
 
-def _facts(status: Status) -> Table:
+class RunPanel:
+    """The whole picture; `fitted`: as high as the terminal at most, for one that is drawn again and again."""
+
+    def __init__(self, status: Status, *, fitted: bool = False) -> None:
+        self._status = status
+        self._fitted = fitted
+
+    def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
+        """A panel of the console's width."""
+        status = self._status
+        lines = options.max_height - BORDERS - 1 if self._fitted else None  # the last line is for the shell's prompt
+        state = printable(status.state), STATE_STYLES.get(status.state, "")
+        title = Text.assemble((printable(status.run), "bold"), " · ", state)
+        content = Group(*picture(status, options.max_width - FRAME, lines))
+        yield Panel(content, title=title, title_align="left", padding=(0, 1))
+
+
+def picture(status: Status, width: int, lines: int | None = None) -> list[Text]:
+    """The picture without its frame, in `width` columns and at most so many lines; `None`: as many as it takes."""
+    blocks = list(_blocks(status, max(width, 1)))
+    return [line for block, given in zip(blocks, allot(blocks, lines), strict=True) if given
+            for line in block.draw(given)[:given]]  # fmt: skip
+
+
+def allot(blocks: Sequence[Block], lines: int | None) -> list[int]:
+    """The lines that each block has: in the order of need first the least of each, then its wish, then the most."""
+    if lines is None:
+        return [each.most for each in blocks]
+    given, left = [0] * len(blocks), lines
+    order = sorted(range(len(blocks)), key=lambda index: blocks[index].need)
+    for index in order:
+        if blocks[index].least <= left:
+            given[index] = blocks[index].least
+            left -= given[index]
+    for aim in ("wish", "most"):
+        for index in order:
+            more = min(getattr(blocks[index], aim) - given[index], left) if given[index] else 0
+            given[index] += max(more, 0)
+            left -= max(more, 0)
+    return given
+
+
+def _blocks(status: Status, width: int) -> Iterator[Block]:
+    """From top to bottom."""
+    state = STATE_STYLES.get(status.state, "")
+    yield _text_block(0, Text(printable(sentence(status)), style=state), width, least=2)
+    if status.failures and not status.why:
+        yield _text_block(1, Text(printable(_failure(status.failures[0])), style="red"), width, least=1)
+    if not status.over:
+        yield _text_block(2, Text(printable(eta_of(status).told)), width, least=1)
+    if progress := list(_progress(status, width)):
+        yield Block(3, 1, len(progress), len(progress), lambda _: progress)
+    facts = list(_facts(status))
+    most = len(_fact_lines(facts, width))
+    yield Block(4, min(3, most), min(5, most), most, lambda given: _fitting(facts, width, given))
+    if len(status.recent) > 1:
+        yield Block(7, 1, 4, CURVE, lambda given: _curve(status.recent, width, given))
+    if (population := _open_population(status)) is not None:
+        shown = population
+        wanted = 1 + cells_wanted(shown, width)
+        yield Block(5, 2, min(wanted, 4), wanted, lambda given: _candidates(status, shown, width, given))
+    yield _workers(status, width)
+
+
+def _text_block(need: int, text: Text, width: int, least: int) -> Block:
+    lines = _wrapped(text.plain, width)
+    drawn = [Text(each, style=text.style) for each in lines]
+    return Block(need, min(least, len(lines)), len(lines), len(lines), lambda given: drawn[:given])
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Broken between words; text of wide characters anywhere."""
+    return textwrap.wrap(text, width) if cell_len(text) == len(text) else chop_cells(text, width)
+
+
+def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
+    """Need (0 first), name and value, in the order in which they stand."""
     settings, task, waste = status.settings, status.settings.task, status.waste
-    grid = Table.grid(padding=(0, 3, 0, 1))
-    grid.add_column(style="dim")
-    grid.add_column()
-    grid.add_column(style="dim")
-    grid.add_column()
-    temperature = status.generation.temperature
+    temperature, stage = status.generation.temperature, status.generation.stage
     warm = "" if temperature is None else f", temperature {temperature:g}"
-    stage = status.generation.stage
-    now = task if stage is None else stage
-    size = settings if stage is None else stage
-
-    def row(*cells: str) -> None:
-        grid.add_row(*(Text(printable(each)) for each in cells))  # texts of others are no markup
-
-    row(
-        "task",
-        f"{task.task}, {now.horizon} steps{warm}",
-        "population",
-        f"{size.population} x {size.episodes}",
-    )
+    now, size = (task, settings) if stage is None else (stage, stage)
+    yield 6, "task", f"{task.task}, {now.horizon} steps{warm}"
+    yield 7, "population", f"{size.population} x {size.episodes}"
     if stage is not None:
-        row("stage", f"{stage.number} of {stage.total}, since generation {stage.since}")
-    row(
-        "last generation", _spread(status.last) if status.last else "-",
-        "step size", f"{status.generation.sigma:.4f} ({_optimiser(settings)})",
-    )  # fmt: skip
-    row("evaluated mean", _evaluated(status.evaluation), "reported", _reported(status))
-    steps, rate = status.throughput.environment_steps, status.throughput.steps_per_second
-    row(
-        "throughput", f"{rate:,.0f} steps/s, {steps:,} in all",
-        "waste", f"{waste.share:.1%}, {waste.reissued} jobs issued again",
-    )  # fmt: skip
+        yield 4, "stage", f"{stage.number} of {stage.total}, since generation {stage.since}"
+    yield 0, "last generation", _spread(status.last) if status.last else "-"
+    yield 5, "step size", f"{status.generation.sigma:.4f} ({_optimiser(settings)})"
+    yield 1, "evaluated mean", _evaluated(status.evaluation)
+    yield 2, "reported", _reported(status)
+    rate, steps = status.throughput.steps_per_second, status.throughput.environment_steps
+    yield 3, "throughput", f"{rate:,.0f} steps/s, {steps:,} in all"
+    resent = f", {waste.resent_batches} batches sent again" if waste.resent_batches else ""
+    yield 4, "waste", f"{waste.share:.1%}, {waste.reissued} jobs issued again{resent}"
     if sum(status.dropped.values()):
-        row("dropped messages", ", ".join(f"{count} {why}" for why, count in status.dropped.items()))
-    return grid
+        yield 8, "dropped messages", ", ".join(f"{count} {why}" for why, count in status.dropped.items())
+
+
+def _fitting(facts: Sequence[tuple[int, str, str]], width: int, lines: int) -> list[Text]:
+    """Those that are needed most, as many as have room."""
+    for count in range(len(facts), 0, -1):
+        kept = sorted(facts, key=lambda each: each[0])[:count]
+        drawn = _fact_lines([each for each in facts if each in kept], width)
+        if len(drawn) <= lines:
+            return drawn
+    return drawn
+
+
+def _fact_lines(facts: Sequence[tuple[int, str, str]], width: int) -> list[Text]:
+    """Names beside values, in two columns where there is room."""
+    half = (width - 2) // 2
+    if width < TWO_COLUMNS:
+        return [line for each in facts for line in _fact(each, width)]
+    found = []
+    for left, right in zip_longest(facts[::2], facts[1::2]):
+        cells = _fact(left, half), _fact(right, half) if right else []
+        for one, other in zip_longest(*cells, fillvalue=Text()):
+            one.pad_right(half + 2 - one.cell_len)
+            found.append(one + other)
+    return found
+
+
+def _fact(each: tuple[int, str, str], width: int) -> list[Text]:
+    _, name, value = each
+    lines = _wrapped(printable(value), max(width - LABELS, 1)) or [""]
+    return [Text.assemble(((name if row == 0 else "").ljust(LABELS), "dim"), line) for row, line in enumerate(lines)]
 
 
 def _spread(last: StoredGeneration) -> str:
@@ -122,58 +199,64 @@ def _failure(failure: FailureStatus) -> str:
     return f"candidate {failure.candidate} failed on {worker}: {error}; another worker will try"
 
 
-def _progress(status: Status) -> Table:
-    grid = Table.grid(padding=(0, 2, 0, 1))
-    parts: dict[str, OpenGeneration | Progress] = {
-        f"generation {status.generation.number}": status.generation,
-        "evaluation": status.evaluating,
-        "confirmation": status.confirming,
-        "kept rollouts": status.collecting,
-    }
+def _progress(status: Status, width: int) -> Iterator[Text]:
+    """What goes on beside the generation."""
+    parts = {"evaluation": status.evaluating, "confirmation": status.confirming, "kept rollouts": status.collecting}
     for label, part in parts.items():
-        if part.episodes and not (part is status.generation and status.state in ("ended", "evaluating")):
-            done, wanted = part.episodes_done, part.episodes
-            grid.add_row(label, ProgressBar(wanted, done, width=40), f"{done}/{wanted} episodes")
-    return grid
+        if part.episodes:
+            share = part.episodes_done / part.episodes
+            told = f" {part.episodes_done}/{part.episodes} episodes"
+            drawn = bar(share, max(min(BAR, width - LABELS - len(told)), 0))
+            yield Text.assemble((label.ljust(LABELS), "dim"), (drawn, "cyan"), told)
 
 
-def _sparkline(history: Sequence[StoredGeneration]) -> Text:
-    means = [each.mean for each in history][-SPARK_WIDTH:]
-    low, high = min(means), max(means)
-    span = high / 2 - low / 2  # halves, so that no difference overflows
-    bars = "".join(SPARKS[round((mean / 2 - low / 2) / span * (len(SPARKS) - 1)) if span > 0 else 0] for mean in means)
-    return Text.assemble(f"{low:.0f} ", (bars, "green"), f" {high:.0f}")
+def _open_population(status: Status) -> Population | None:
+    """The candidates to show: once a run is over, those of the generation that was closed last."""
+    population = status.last_population if status.over else status.population
+    return population if population is not None and population.done else None
 
 
-def _worker_table(status: Status) -> RenderableType:
-    if not status.worker_list:
-        lines = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
-        lines = lines or ["no workers yet: start one with  dreamfleet worker --connect tcp/HOST:PORT"]
-        return Text("\n".join(map(printable, lines)), style="yellow")
-    return WorkerTable(status.worker_list[:MOST_WORKERS], status.workers.known)
+def _candidates(status: Status, population: Population, width: int, lines: int) -> list[Text]:
+    """A line about them, and their cells."""
+    found = [each for each in population.candidates if each.fitness is not None]
+    episodes: OpenGeneration | Progress = status.generation
+    done, wanted = episodes.episodes_done, episodes.episodes
+    if population.generation != status.generation.number:
+        done, wanted = sum(population.done), sum(population.wanted)
+    told = [f"{done:,}/{wanted:,} episodes"]
+    if found:
+        values = [each.fitness or 0.0 for each in found]
+        told.append(f"so far {min(values):.0f} to {max(values):.0f}")
+    if population.total > len(population.done):
+        told.append(f"the first {len(population.done)} of {population.total} candidates")
+    caption = f"generation {population.generation}".ljust(LABELS) + ", ".join(told)
+    return [Text(caption[:width], style="dim"), *cell_lines(population, width, lines - 1)]
 
 
-class WorkerTable:
-    """Workers, a row each: where the terminal is narrow, the columns that matter least are left out, never a name."""
+def _curve(history: Sequence[StoredGeneration], width: int, lines: int) -> list[Text]:
+    """The mean fitness of the last generations: a line of bars, or, with more lines, a plot under a caption."""
+    caption = "mean fitness by generation"
+    margin = max(len(f"{each.mean:.0f}") for each in history) + 1
+    room = width - margin - (len(caption) + 1 + margin if lines == 1 else 0)
+    shown = [(each.number, each.mean) for each in history[-max(room, 1) :]]
+    means = [mean for _, mean in shown]
+    low, high = f"{min(means):.0f}", f"{max(means):.0f}"
+    if lines == 1:
+        return [Text.assemble((f"{caption} ", "dim"), f"{low} ", (bars(means, 1)[0], "green"), f" {high}")]
+    wide = max(1, room // len(shown))
+    rows = bars([mean for mean in means for _ in range(wide)], lines - 1)
+    marks = [high] if len(rows) == 1 else [high, *[""] * (len(rows) - 2), low]
+    drawn = [Text.assemble((f"{mark:>{margin - 1}} ", "dim"), (row, "green"))
+             for mark, row in zip(marks, rows, strict=True)]  # fmt: skip
+    return [Text(f"{caption}, {shown[0][0]} to {shown[-1][0]}", style="dim"), *drawn]
 
-    def __init__(self, workers: Sequence[WorkerStatus], known: int) -> None:
-        self._workers = workers
-        self._known = known
 
-    def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
-        """As many columns as fit, in their order."""
-        cells = {name: [printable(tell(each)) for each in self._workers] for name, tell in COLUMNS.items()}
-        widths = {name: max(map(cell_len, (name, *column))) + 2 * PAD for name, column in cells.items()}
-        kept = list(COLUMNS)
-        for name in LEAST_FIRST:
-            if sum(widths[each] for each in kept) > options.max_width:
-                kept.remove(name)
-        table = Table(box=None, padding=(0, PAD), header_style="dim")
-        for name in kept:
-            justify = "left" if name in LEFT else "right"
-            table.add_column(name, justify=justify, overflow="fold")  # type: ignore[arg-type]
-        for row, each in enumerate(self._workers):
-            table.add_row(*(Text(cells[name][row]) for name in kept), style="" if each.state == "present" else "red")
-        if self._known > len(self._workers):
-            table.add_row(f"and {self._known - len(self._workers)} more")
-        yield table
+def _workers(status: Status, width: int) -> Block:
+    if status.worker_list:
+        roster = Roster(status.worker_list, status.workers.known)
+        most = roster.wanted(width)
+        return Block(6, min(3, most), min(8, most), most, lambda given: roster.lines(width, given))
+    said = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
+    said = said or ["no workers yet: start one with  dreamfleet worker --connect tcp/HOST:PORT"]
+    lines = [Text(part, style="yellow") for each in said for part in _wrapped(printable(each), width)]
+    return Block(6, min(3, len(lines)), len(lines), len(lines), lambda given: lines[:given])

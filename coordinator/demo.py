@@ -27,7 +27,7 @@ from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, Usa
 from dreamfleet.common.processes import Child, ask, call, spoken
 from dreamfleet.common.runs import CONTROLLER, open_run
 from dreamfleet.common.stored import best_of
-from dreamfleet.common.table import run_panel
+from dreamfleet.common.table import RunPanel
 from dreamfleet.coordinator.config import NO_SUBSPACE
 
 REFRESH = 0.5
@@ -166,7 +166,7 @@ class Demo:
         with Live(console=self._console, refresh_per_second=4) as live:
             while coordinator.poll() is None:
                 with suppress(ConnectionFailedError):  # it is starting, or has just ended
-                    live.update(run_panel(client.status(run)))
+                    live.update(RunPanel(client.status(run), fitted=self._console.is_terminal))
                 try:
                     coordinator.wait(REFRESH)
                 except subprocess.TimeoutExpired:

@@ -127,6 +127,8 @@ class Fleet:
             if member.known or len(member.verdicts) < MOST_GUESTS:
                 member.verdicts.append(Verdict(result.digest, verdict))
             member.finished += verdict == "accepted"
+            if work is not None and work.job.kind == "score":
+                member.record.took(result.seconds)
         if verdict == "accepted":
             self._tail.learn(result.steps)
         self.counts["accepted_steps" if verdict == "accepted" else "discarded_steps"] += result.steps
@@ -198,6 +200,7 @@ class Fleet:
             sent = member.unseen[number]
             sent.at, sent.times = now, sent.times + 1
             self.counts["resent_batches"] += 1
+            member.resent += 1
             yield Send(member.identity, member.numbering, number, sent.content)
 
     def _news(self, member: Member, given: Sequence[Work], durable: bool, now: float) -> Iterator[Send]:

@@ -66,6 +66,7 @@ class Member:
     steps_per_second: float = 0.0
     drawn_by: str = "-"
     finished: int = 0
+    resent: int = 0  # batches that were sent again
     leases: dict[bytes, Lease] = field(default_factory=dict)  # in the order in which they were given
     trials: dict[bytes, Handful] = field(default_factory=dict)  # copies that show how soon it is, wanted or not
     returned: list[Handful] = field(default_factory=list)  # of which something came back since the last dispatch
@@ -92,6 +93,7 @@ class Member:
         if arrived and all(sent.times == 1 for sent in arrived):  # else nobody knows which of them arrived
             since = max(self.delivered, min(sent.first for sent in arrived))
             self.record.delivered(sum(sent.content.size for sent in arrived), now - since)
+            self.record.confirmed(now - max(sent.first for sent in arrived))
         if arrived:
             self.delivered = now
 

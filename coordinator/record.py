@@ -48,6 +48,8 @@ class HostRecord:
     deaths: int = 0  # since it last proved to live
     life: float = math.inf  # seconds between them
     steps: float = 0.0  # environment steps a second of one of its slots
+    job: float | None = None  # seconds that a candidate's job takes one of its slots
+    trip: float | None = None  # seconds until a batch was known to have arrived, at best
 
     def inherit(self) -> HostRecord:
         """The same for another life of it."""
@@ -109,6 +111,14 @@ class HostRecord:
     def risky(self, jobs: int, age: float) -> bool:
         """Whether it may well be lost before it brings so many back."""
         return self.deaths >= DEATHS and self.expected(jobs) * LIFETIMES > max(self.life, age)
+
+    def took(self, seconds: float) -> None:
+        """A candidate's job took a slot so long."""
+        self.job = seconds if self.job is None else self.job + FALLING * (seconds - self.job)
+
+    def confirmed(self, seconds: float) -> None:
+        """A batch was known to have arrived so long after it was sent."""
+        self.trip = seconds if self.trip is None else min(seconds, self.trip / FORGOTTEN)
 
     def delivered(self, size: int, seconds: float) -> None:
         """So many bytes had arrived after so long; a beat says so, which makes it a lower bound."""

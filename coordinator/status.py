@@ -178,6 +178,9 @@ def _worker(member: Member, now: float) -> WorkerStatus:
         drawn_by=member.drawn_by,
         heard=round(now - member.heard, 1),
         fingerprint=member.fingerprint,
+        job_seconds=None if member.record.job is None else round(member.record.job, 4),
+        round_trip=None if member.record.trip is None else round(member.record.trip, 4),
+        resent=member.resent,
     )
 
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.site import offer
 
 if TYPE_CHECKING:
     from dreamfleet.common.client import Client
+    from dreamfleet.common.status import Status
 
 SUMMARY = "show how a run is: generation, population, best, workers, throughput, waste"
 EXTRAS = ()
@@ -46,9 +50,9 @@ def _print_once(document: dict[str, Any]) -> None:
     from rich.console import Console
 
     from dreamfleet.common.status import read_status
-    from dreamfleet.common.table import run_panel
+    from dreamfleet.common.table import RunPanel
 
-    Console().print(run_panel(read_status(document)))
+    Console().print(RunPanel(read_status(document)))
 
 
 def _print_lines(client: Client, name: str) -> int:
@@ -60,9 +64,18 @@ def _print_lines(client: Client, name: str) -> int:
 def _show(client: Client, name: str) -> int:
     from rich.live import Live
 
-    from dreamfleet.common.table import run_panel
+    from dreamfleet.common.table import RunPanel
 
-    with Live(refresh_per_second=4) as live:
+    with Live(refresh_per_second=4, vertical_overflow="crop") as live:
         for status in client.watch(name, REFRESH):
-            live.update(run_panel(status), refresh=True)
+            live.update(RunPanel(_with_all_workers(client, status), fitted=live.console.is_terminal), refresh=True)
     return 0
+
+
+def _with_all_workers(client: Client, status: Status) -> Status:
+    """The same with those that had no room in it, while the coordinator is there to tell of them."""
+    if status.over or len(status.worker_list) >= status.workers.known:
+        return status
+    with suppress(ConnectionFailedError):
+        return replace(status, worker_list=tuple(client.workers(status.run)))
+    return status

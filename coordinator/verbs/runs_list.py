@@ -14,6 +14,7 @@ from dreamfleet.common.site import offer
 
 SUMMARY = "list the runs on this disk"
 EXTRAS = ()
+LEAST_FIRST = ("created", "task", "mean", "evaluated")  # what a narrow terminal does without
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     if not rows:
         print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME", file=sys.stderr)
         return 0
-    print_rows(rows, right=("generations", "mean", "evaluated", "confirmed"))
+    print_rows(rows, right=("generations", "mean", "evaluated", "confirmed"), least_first=LEAST_FIRST)
     return 0
 
 

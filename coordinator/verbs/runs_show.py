@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     lines = [_row(each, judged.get(each.number)) for each in shown]
     if len(shown) < len(history):
         print(f"the last {SHOWN} of {len(history)} generations; --json has all")
-    print_rows(lines, right=tuple(lines[0]) if lines else ())
+    print_rows(lines, right=tuple(lines[0]) if lines else (), least_first=("seconds", "worst", "steps", "std", "sigma"))
     return 0
 
 

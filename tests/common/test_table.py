@@ -4,9 +4,15 @@ import dataclasses
 import io
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.cells import cell_len
 from rich.console import Console
 
-from dreamfleet.common.table import run_panel
+from dreamfleet.common.cells import bars, cell_lines
+from dreamfleet.common.roster import Roster, slowest_of
+from dreamfleet.common.status import Population, WorkerCount
+from dreamfleet.common.table import Block, RunPanel, allot, picture
 from tests.support.samples import STATUS
 
 LONG = "a-host-with-quite-a-long-name.example.org/0a1b2c3d"
@@ -17,7 +23,7 @@ WORKER = dataclasses.replace(
 
 def drawn(status, width):
     console = Console(file=io.StringIO(), width=width)
-    console.print(run_panel(status))
+    console.print(RunPanel(status))
     return console.file.getvalue()
 
 
@@ -30,10 +36,104 @@ def test_a_workers_name_is_whole_in_a_terminal_of_any_width(width):
 
 def test_what_matters_least_is_left_out_first():
     status = dataclasses.replace(STATUS, worker_list=(WORKER,))
-    narrow, wide = drawn(status, 80), drawn(status, 140)
-    assert all(column in wide for column in ("slots", "leases", "finished", "load", "picture"))
+    narrow, wide = drawn(status, 80), drawn(status, 160)
+    assert all(column in wide for column in ("slots", "leases", "finished", "load", "picture", "round trip", "resent"))
     assert "state" in narrow
     assert "picture" not in narrow
+
+
+FLEET = tuple(
+    dataclasses.replace(
+        STATUS.worker_list[0], worker=f"a-host-of-thirty-letters-x{number:04d}/0a1b2c3d", job_seconds=1.2,
+        round_trip=0.05, resent=3,
+    )
+    for number in range(40)
+)  # fmt: skip
+RECENT = tuple(dataclasses.replace(STATUS.recent[0], number=number, mean=float(number)) for number in range(60))
+LARGE = dataclasses.replace(
+    STATUS, worker_list=FLEET, workers=WorkerCount(40, 40), recent=RECENT,
+    population=Population(7, 0, 64, (16,) * 30 + (4,) * 10 + (0,) * 24, (16,) * 64, (5.0,) * 40 + (None,) * 24),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (60, 10), (200, 60), (20, 5)])
+def test_a_picture_that_is_drawn_again_and_again_fits_the_terminal(width, height):
+    console = Console(file=io.StringIO(), width=width, height=height)
+    console.print(RunPanel(LARGE, fitted=True))
+    lines = console.file.getvalue().splitlines()
+    assert len(lines) <= height - 1
+    assert max(map(cell_len, lines)) <= width
+
+
+def test_at_80_columns_and_24_lines_every_part_is_there_and_names_are_whole():
+    lines = [line.plain for line in picture(LARGE, 76, 21)]
+    text = "\n".join(lines)
+    assert len(lines) == 21
+    for part in ("episodes", "a generation", "last generation", "reported", "mean fitness by generation", "worker"):
+        assert part in text
+    rows = [line for line in lines if line.startswith("a-host")]
+    assert len(rows) >= 3
+    assert {line.split()[0] for line in rows} <= {each.worker for each in FLEET}
+    assert f"and {40 - len(rows)} more" in lines[-1]
+
+
+def test_whoever_is_lost_or_slow_is_among_the_few_that_have_room():
+    odd = {17: {"state": "silent"}, 31: {"job_seconds": 4.6}}
+    fleet = [dataclasses.replace(each, **odd.get(number, {})) for number, each in enumerate(FLEET)]
+    lines = [line.plain for line in Roster(fleet, 41).lines(76, 5)]
+    assert [line.split("  ")[0] for line in lines[1:4]] == [fleet[number].worker for number in (0, 17, 31)]
+    assert "slowest" in lines[3]
+    assert "4.6 s" in lines[3]
+    assert lines[4] == "and 38 more"
+    assert slowest_of(FLEET) is None
+
+
+def test_a_name_longer_than_the_terminal_goes_on_in_the_next_line():
+    lines = [line.plain for line in Roster([WORKER], 1).lines(30, 10)]
+    assert "".join(lines[1:]) == LONG
+    assert Roster([WORKER], 1).wanted(30) == len(lines)
+
+
+def test_lines_go_to_the_blocks_that_are_needed_first():
+    blocks = [Block(1, 2, 4, 9, list), Block(0, 1, 1, 1, list), Block(2, 3, 5, 5, list)]
+    assert allot(blocks, None) == [9, 1, 5]
+    assert allot(blocks, 0) == [0, 0, 0]
+    assert allot(blocks, 2) == [0, 1, 0]
+    assert allot(blocks, 5) == [4, 1, 0]
+    assert allot(blocks, 7) == [3, 1, 3]
+    assert allot(blocks, 99) == [9, 1, 5]
+
+
+SIZES = st.tuples(st.integers(0, 9), st.integers(1, 5), st.integers(0, 5), st.integers(0, 5))
+
+
+@given(st.lists(SIZES), st.integers(0, 40))
+def test_no_more_lines_are_allotted_than_there_are(parts, lines):
+    blocks = [Block(need, least, least + wish, least + wish + most, list) for need, least, wish, most in parts]
+    given_lines = allot(blocks, lines)
+    assert sum(given_lines) <= lines
+    assert all(found == 0 or each.least <= found <= each.most for found, each in zip(given_lines, blocks, strict=True))
+
+
+def test_candidates_are_cells_that_fill_in_and_the_best_is_marked():
+    population = Population(7, 0, 5, (4, 2, 1, 0, 4), (4, 4, 4, 4, 4), (1.0, 2.0, 3.0, None, 4.0))
+    (line,) = cell_lines(population, 80, 1)
+    assert line.plain == "█▄▂·█"
+    assert line.spans[-1].style == "bold yellow"
+    many = Population(7, 0, 300, (4,) * 150 + (0,) * 150, (4,) * 300, (None,) * 300)
+    assert [len(each) for each in cell_lines(many, 76, 2)] == [76, 74]
+
+
+def test_a_curve_is_as_high_as_it_may_be():
+    assert bars([0.0, 7.0], 1) == ["▁█"]
+    assert bars([0.0, 15.0], 2) == [" █", "▁█"]
+    assert bars([3.0, 3.0], 2) == ["  ", "▁▁"]
+
+
+def test_an_ended_run_shows_its_last_generations_candidates():
+    text = drawn(dataclasses.replace(STATUS, state="ended", why="7 generations"), 100)
+    assert "finished: 7 generations" in text
+    assert "generation 6     8/8 episodes, so far -12 to 140" in text
 
 
 def test_workers_beyond_the_head_are_counted():

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from dreamfleet.common.runs import RunFolder
-from dreamfleet.common.table import run_panel
+from dreamfleet.common.table import RunPanel
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.status import take_snapshot
 from dreamfleet.coordinator.verbs import fork
@@ -94,7 +94,7 @@ def test_the_temperature_is_told_as_it_rises(heated):
     bench.drive(lambda _: 0, lambda: told.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0)))
     assert {each.status.generation.temperature for each in told} == {1.0, 1.5, 2.25}
     console = Console(file=io.StringIO(), width=120)
-    console.print(run_panel(told[-1].status))
+    console.print(RunPanel(told[-1].status))
     assert "temperature 2.25" in console.file.getvalue()
     notes = [note for note in bench.run.fleet.notes if "dreams at" in note]
     assert notes == [

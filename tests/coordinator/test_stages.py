@@ -12,7 +12,7 @@ from dreamfleet.common.messages import Result
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.stages import begun_stages
 from dreamfleet.common.stored import StageSettings
-from dreamfleet.common.table import run_panel
+from dreamfleet.common.table import RunPanel
 from dreamfleet.common.terms import terms_of
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.status import take_snapshot
@@ -150,7 +150,7 @@ def test_the_status_says_which_stage_it_is_and_what_counts_there(staged):
     stage = told[-1].generation.stage
     assert (stage.total, stage.horizon, stage.patience, stage.population, stage.episodes) == (4, 600, 0, 8, 2)
     console = Console(file=io.StringIO(), width=120)
-    console.print(run_panel(told[-1]))
+    console.print(RunPanel(told[-1]))
     shown = console.file.getvalue()
     assert "4 of 4, since generation 10" in shown
     assert "600 steps" in shown

@@ -9,7 +9,7 @@ import pytest
 
 from dreamfleet.common.codec import from_plain
 from dreamfleet.common.messages import MAX_MESSAGE, MAX_OPTIONS, Result
-from dreamfleet.common.status import PARTS, Population, read_document, read_status
+from dreamfleet.common.status import PARTS, Population, WorkerStatus, read_document, read_status
 from dreamfleet.common.stored import StoredGeneration
 from dreamfleet.coordinator import answers
 from dreamfleet.coordinator.generation import Standing
@@ -192,3 +192,18 @@ def test_a_run_that_is_left_open_says_so_and_one_that_ended_has_ended(bench):
         score(bench, 1)
     assert as_left(snapshot_of(bench)).status.state == "ended"
     assert json.loads(answers.status(as_left(snapshot_of(bench))))["why"] == "3 generations"
+
+
+def test_a_worker_is_told_with_the_time_of_a_job_its_round_trip_and_what_was_sent_again(bench):
+    first = snapshot_of(bench).workers[0]
+    assert (first.job_seconds, first.round_trip, first.resent) == (None, None, 0)
+    (send,) = [each for each in bench.run.exchange.dispatch(0.0) if each.identity == A]
+    bench.now = 0.25
+    bench.beat(A)
+    assert snapshot_of(bench).workers[0].round_trip == 0.25
+    bench.deliver(A, Result(send.content.work[0].job.digest, 1.0, 10, 0.1, None, None))
+    bench.run.exchange.dispatch(bench.now)  # its verdict, which no beat shows as seen
+    bench.run.exchange.dispatch(bench.now + 30.0)
+    told = snapshot_of(bench).workers[0]
+    assert (told.job_seconds, told.round_trip, told.resent) == (0.1, 0.25, 1)
+    assert WorkerStatus(**answered(snapshot_of(bench), "workers")["workers"][0]) == told

@@ -1,0 +1,109 @@
+"""The workers of a run as lines of a terminal: columns go by worth, rows by need, and no name is cut. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import ceil
+from statistics import median
+
+from rich.cells import cell_len, chop_cells
+from rich.text import Text
+
+from dreamfleet.common.eta import duration
+from dreamfleet.common.printable import printable
+from dreamfleet.common.status import WorkerStatus
+
+PAD = 2  # columns of air between two columns
+SLOW = 1.5  # times the median of seconds a job: the slowest is marked from there on
+COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
+    "worker": lambda each: each.worker,
+    "state": lambda each: each.state,
+    "slots": lambda each: str(each.slots),
+    "a job": lambda each: "-" if each.job_seconds is None else duration(each.job_seconds),
+    "round trip": lambda each: "-" if each.round_trip is None else f"< {duration(each.round_trip)}",
+    "resent": lambda each: str(each.resent),
+    "leases": lambda each: str(each.leases),
+    "finished": lambda each: str(each.finished),
+    "steps/s": lambda each: f"{each.steps_per_second:.0f}",
+    "load": lambda each: str(each.load),
+    "picture": lambda each: each.drawn_by,
+}
+LEAST_FIRST = ("picture", "load", "leases", "finished", "steps/s", "resent", "round trip", "slots", "a job", "state")
+LEFT = ("worker", "state", "picture")
+
+
+@dataclass(frozen=True)
+class Roster:
+    """The workers that are told of, of `known`."""
+
+    workers: Sequence[WorkerStatus]
+    known: int
+
+    def wanted(self, width: int) -> int:
+        """Lines with which each of them is shown."""
+        return 1 + sum(_rows(each, width) for each in self.workers) + (self.known > len(self.workers))
+
+    def lines(self, width: int, most: int) -> list[Text]:
+        """At most `most` lines, 3 at least, of `width` columns: those of whom there is most to say, in their order."""
+        slowest = slowest_of(self.workers)
+        chosen = list(self.workers)
+        if self.wanted(width) > most:
+            room, chosen = most - 2, []
+            for each in sorted(self.workers, key=lambda each: _need(each, slowest)):
+                room -= _rows(each, width)
+                if room < 0 and chosen:
+                    break
+                chosen.append(each)
+            names = {each.worker for each in chosen}
+            chosen = [each for each in self.workers if each.worker in names]
+        found = _table(chosen, slowest, width)
+        if self.known > len(chosen):
+            found.append(Text(f"and {self.known - len(chosen)} more", style="dim"))
+        return found
+
+
+def slowest_of(workers: Sequence[WorkerStatus]) -> WorkerStatus | None:
+    """The worker that takes longest for a job, if it stands out from the others."""
+    times = {each.worker: each.job_seconds for each in workers if each.job_seconds is not None}
+    last = max(workers, key=lambda each: times.get(each.worker, 0.0), default=None)
+    return last if last and times and times.get(last.worker, 0.0) > SLOW * median(times.values()) else None
+
+
+def _need(each: WorkerStatus, slowest: WorkerStatus | None) -> tuple[bool, bool, float]:
+    """Who is lost or silent comes first, then the slowest ones."""
+    return each.state == "present", each is not slowest, -(each.job_seconds or 0.0)
+
+
+def _rows(each: WorkerStatus, width: int) -> int:
+    return max(1, ceil(cell_len(printable(each.worker)) / max(width, 1)))
+
+
+def _table(workers: Sequence[WorkerStatus], slowest: WorkerStatus | None, width: int) -> list[Text]:
+    cells = {name: [printable(tell(each)) for each in workers] for name, tell in COLUMNS.items()}
+    for row, each in enumerate(workers):
+        cells["state"][row] += ", slowest" if each is slowest else ""
+    widths = {name: max(map(cell_len, (name, *column))) for name, column in cells.items()}
+    kept = list(COLUMNS)
+    for name in LEAST_FIRST:
+        if sum(widths[each] + PAD for each in kept) - PAD > width:
+            kept.remove(name)
+    found = [_line([_padded(name, name, widths[name]) for name in kept], "dim", width)]
+    for row, each in enumerate(workers):
+        style = "red" if each.state != "present" else "yellow" if each is slowest else ""
+        found += _folded([_padded(name, cells[name][row], widths[name]) for name in kept], style, width)
+    return found
+
+
+def _padded(name: str, text: str, width: int) -> str:
+    air = " " * (width - cell_len(text))
+    return text + air if name in LEFT else air + text
+
+
+def _line(cells: Sequence[str], style: str, width: int) -> Text:
+    return Text((" " * PAD).join(cells).rstrip()[:width], style=style)
+
+
+def _folded(cells: Sequence[str], style: str, width: int) -> list[Text]:
+    """One line, or several where not even the name fits."""
+    return [Text(part, style=style) for part in chop_cells((" " * PAD).join(cells).rstrip(), width)]
