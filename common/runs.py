@@ -21,10 +21,11 @@ from dreamfleet.common.files import check_regular, is_folder, is_there
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.seeds import CHOOSING
+from dreamfleet.common.seeds import CHOOSING, CONFIRMING, VALIDATION
 from dreamfleet.common.stages import BegunStage, begun_stages
 from dreamfleet.common.stored import (
     RunSettings,
+    StoredCandidate,
     StoredConfirmation,
     StoredEvaluation,
     StoredGeneration,
@@ -123,6 +124,20 @@ class RunFolder:
         query = f"SELECT {_RESULT} FROM result WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"  # noqa: S608
         return [StoredResult(*row) for row in self._typed(self._all(query, kind, generation, number), "siiiififss")]
 
+    def candidates(self) -> list[StoredCandidate]:
+        """Every candidate by generation and number."""
+        return [StoredCandidate(generation, number, fitness, episodes, saturated(int(finite(steps))), finite(seconds))
+                for generation, number, fitness, episodes, steps, seconds
+                in self._typed(self._all(_CANDIDATES), "iiFiff")]  # fmt: skip
+
+    def scores(self, generation: int, *, confirming: bool = False) -> dict[int, float]:
+        """What a generation's mean scored on each validation seed of its evaluation, or of its confirmation."""
+        since, until = (CONFIRMING, VALIDATION.stop) if confirming else (0, CHOOSING)
+        query = (
+            "SELECT seed, fitness FROM result WHERE kind = 'evaluate' AND generation = ? AND episode BETWEEN ? AND ?"
+        )
+        return dict(self._typed(self._all(query, generation, since, until - 1), "if"))
+
     def result_count(self) -> int:
         """Accepted results of every kind."""
         return int(self._one("SELECT count(*) FROM result")[0])
@@ -215,6 +230,11 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "i": (int,), "f": (int, float), "F": (int, float, NoneType), "s": (str,), "b": (bytes,),
 }  # fmt: skip
 _RESULT = "kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint"
+_CANDIDATES = (
+    "SELECT candidate.generation, number, candidate.fitness, count(digest), total(steps), total(seconds) "
+    "FROM candidate LEFT JOIN result ON kind = 'score' AND candidate = number "
+    "AND result.generation = candidate.generation GROUP BY 1, 2 ORDER BY 1, 2"
+)
 
 
 def efforts_query(begun: Sequence[BegunStage]) -> str:

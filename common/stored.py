@@ -119,6 +119,18 @@ class StoredResult:
 
 
 @dataclass(frozen=True)
+class StoredCandidate:
+    """One candidate: what the strategy was told of it, and what its accepted results took."""
+
+    generation: int
+    number: int
+    fitness: float | None  # `None` while its generation is open
+    episodes: int  # that were scored
+    steps: int
+    seconds: float  # that slots worked
+
+
+@dataclass(frozen=True)
 class StoredGeneration:
     """Statistics of a closed generation over its candidates' fitness."""
 

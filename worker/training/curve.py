@@ -1,11 +1,34 @@
-"""A training's loss curve on disk."""
+"""A training's loss curve on disk, and where it is asked for as TensorBoard's events."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from dreamfleet.common.events import event_file
 from dreamfleet.worker.training.room import told_where_full
+
+Point = Callable[..., None]  # `point(update=120, error=0.3)`
+
+
+@contextmanager
+def loss_curve(path: Path, events: Path | None, update: int) -> Iterator[Point]:
+    """Takes points of a training that goes on behind `update`; `events`: the folder of TensorBoard's, if there is one.
+
+    `MissingExtraError` where events are wanted and cannot be written.
+    """
+    if events is None:
+        yield lambda **values: append_curve(path, **values)
+        return
+    with event_file(events / path.stem, since=update + 1) as file:
+
+        def point(*, update: int, **values: float) -> None:
+            append_curve(path, update=update, **values)
+            file.add(update, **{f"loss__{name}": value for name, value in values.items()})
+
+        yield point
 
 
 def append_curve(path: Path, **values: float) -> None:

@@ -31,6 +31,9 @@ def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> No
         action="store_true",
         help="print layers and parameters, and train nothing; a model to continue from must have these layers",
     )
+    parser.add_argument(
+        "--tensorboard", type=Path, metavar="FOLDER", help="write the losses as TensorBoard's events there too"
+    )
     add_json(parser)
     add_config_flags(parser, "training", TrainConfig)
     add_config_flags(parser, "layers", layers)

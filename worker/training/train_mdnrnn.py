@@ -13,7 +13,7 @@ from torch import Tensor
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.stopping import Stop, never
 from dreamfleet.worker.training.checkpoint import load_progress
-from dreamfleet.worker.training.curve import append_curve
+from dreamfleet.worker.training.curve import Point, loss_curve
 from dreamfleet.worker.training.dataset import episodes, load, split
 from dreamfleet.worker.training.encode import ENCODED, encoder_of, mirrored_too
 from dreamfleet.worker.training.foresight import foresight
@@ -32,10 +32,12 @@ VALIDATION_ROLLOUTS = 20  # for the curve while training
 def train_mdnrnn(
     folder: Path, config: TrainConfig, report: Report, layers: MDNRNNConfig = REWARDED,
     device: torch.device | None = None, continue_from: Path | None = None, stop: Stop = never, new: bool = False,
+    events: Path | None = None,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
 
     A stop changes nothing: all follows from the seed and the update alone. `StoppedError` if `stop` asks for one.
+    `events`: a folder for TensorBoard's.
     """
     train, held_out = split(episodes(folder, ENCODED))
     vae, mirrors = encoder_of(folder), mirrored_too(folder)
@@ -45,33 +47,33 @@ def train_mdnrnn(
     torch.manual_seed(config.seed)
     model = MDNRNN(layers).to(device)
     schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from, new, HEADS_TO_COME)
-    curve = folder / CURVE
     if schedule.progress.setdefault("vae", vae) != vae:
         raise DatasetError(f"{folder / CHECKPOINT} was trained on latents of another VAE; --new begins anew")
     report(schedule.update, "")
-    while schedule.goes_on(stop):
-        update = schedule.update + 1
-        schedule.set_rate(update * config.batch // len(train) if config.decay < 1 else 0)
-        random = np.random.default_rng([config.seed, update])
-        noise = torch.Generator().manual_seed(config.seed * 1_000_003 + update)
-        torch.manual_seed(config.seed * 1_000_003 + update)  # of the dropout
-        chosen = random.choice(len(train), size=min(config.batch, len(train)), replace=False)
-        flipped = (random.random(len(chosen)) < 0.5) & mirrors
-        rollouts = load_rollouts([train[index] for index in chosen], flipped)
-        model.train()
-        values = backward(model, rollouts, noise, device)
-        schedule.step(sum(values.values()))
-        report(update, "  ".join(f"{name} {value:.3f}" for name, value in values.items()))
-        if update % 10 == 0:
-            append_curve(curve, update=update, **values)
-        schedule.close_update(lambda: _look(model, held_out[:VALIDATION_ROLLOUTS], curve, schedule.update, device))
+    with loss_curve(folder / CURVE, events, schedule.update) as point:
+        while schedule.goes_on(stop):
+            update = schedule.update + 1
+            schedule.set_rate(update * config.batch // len(train) if config.decay < 1 else 0)
+            random = np.random.default_rng([config.seed, update])
+            noise = torch.Generator().manual_seed(config.seed * 1_000_003 + update)
+            torch.manual_seed(config.seed * 1_000_003 + update)  # of the dropout
+            chosen = random.choice(len(train), size=min(config.batch, len(train)), replace=False)
+            flipped = (random.random(len(chosen)) < 0.5) & mirrors
+            rollouts = load_rollouts([train[index] for index in chosen], flipped)
+            model.train()
+            values = backward(model, rollouts, noise, device)
+            schedule.step(sum(values.values()))
+            report(update, "  ".join(f"{name} {value:.3f}" for name, value in values.items()))
+            if update % 10 == 0:
+                point(update=update, **values)
+            schedule.close_update(lambda: _look(model, held_out[:VALIDATION_ROLLOUTS], point, schedule.update, device))
     return quality(model, held_out, device)
 
 
-def _look(model: MDNRNN, paths: Sequence[Path], curve: Path, update: int, device: torch.device | None) -> float:
+def _look(model: MDNRNN, paths: Sequence[Path], point: Point, update: int, device: torch.device | None) -> float:
     """The held-out loss that counts; a point of the curve."""
     parts = validate(model, paths, device)
-    append_curve(curve, update=update, **{f"held_out_{name}": part for name, part in parts.items()})
+    point(update=update, **{f"held_out_{name}": part for name, part in parts.items()})
     return sum(weighted(model.config, parts).values())
 
 

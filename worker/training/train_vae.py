@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.stopping import Stop, never
-from dreamfleet.worker.training.curve import append_curve
+from dreamfleet.worker.training.curve import Point, loss_curve
 from dreamfleet.worker.training.dataset import (
     POOL_EPISODES,
     check_pictures,
@@ -47,12 +47,13 @@ class Losses(NamedTuple):
 def train_vae(
     folder: Path, config: TrainConfig, report: Report, layers: VAEConfig = PAPER,
     device: torch.device | None = None, continue_from: Path | None = None, decoder_only: bool = False,
-    stop: Stop = never, new: bool = False,
+    stop: Stop = never, new: bool = False, events: Path | None = None,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
 
     With `decoder_only` the encoder stays as it is, and with it latents, MDN-RNNs and controllers. A stop changes
     nothing: batches and chance follow from the seed and the update alone. `StoppedError` if `stop` asks for one.
+    `events`: a folder for TensorBoard's.
     """
     train, held_out = split(episodes(folder))
     check_whole([*train, *held_out], "picture", "preprocessing")
@@ -64,28 +65,29 @@ def train_vae(
     schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from, new)
     progress = schedule.progress
     report(schedule.update, "")
-    validation, curve = held_out_pictures(held_out, CURVE_PICTURES), folder / CURVE
+    validation = held_out_pictures(held_out, CURVE_PICTURES)
     batches = picture_batches(train, config.batch, config.seed, progress.get("pool", 0), progress.get("taken", 0))
     epoch_pools = max(1, len(train) // POOL_EPISODES)
-    while schedule.goes_on(stop):
-        pool, taken, batch = next(batches)
-        schedule.set_rate(pool // epoch_pools)
-        torch.manual_seed(config.seed * 1_000_003 + schedule.update)
-        loss = backward(model, batch, decoder_only, device)
-        schedule.step(loss.weighted)
-        schedule.progress |= {"pool": pool, "taken": taken}
-        report(schedule.update, f"error {loss.error:.1f}  KL {loss.divergence:.1f}")
-        if schedule.update % 20 == 0:
-            append_curve(curve, update=schedule.update, error=loss.error, kl=loss.divergence)
-        schedule.close_update(lambda: _look(model, validation, curve, schedule.update, device))
+    with loss_curve(folder / CURVE, events, schedule.update) as point:
+        while schedule.goes_on(stop):
+            pool, taken, batch = next(batches)
+            schedule.set_rate(pool // epoch_pools)
+            torch.manual_seed(config.seed * 1_000_003 + schedule.update)
+            loss = backward(model, batch, decoder_only, device)
+            schedule.step(loss.weighted)
+            schedule.progress |= {"pool": pool, "taken": taken}
+            report(schedule.update, f"error {loss.error:.1f}  KL {loss.divergence:.1f}")
+            if schedule.update % 20 == 0:
+                point(update=schedule.update, error=loss.error, kl=loss.divergence)
+            schedule.close_update(lambda: _look(model, validation, point, schedule.update, device))
     return quality(model, held_out, device)
 
 
-def _look(model: VAE, pictures: NDArray[np.uint8], curve: Path, update: int, device: torch.device | None) -> float:
+def _look(model: VAE, pictures: NDArray[np.uint8], point: Point, update: int, device: torch.device | None) -> float:
     """The held-out loss that counts; a point of the curve."""
     loss = validate(model, pictures, device)
     parts = {"held_out": loss.plain, "held_out_error": loss.error, "held_out_kl": loss.divergence}
-    append_curve(curve, update=update, **parts)
+    point(update=update, **parts)
     return loss.weighted
 
 

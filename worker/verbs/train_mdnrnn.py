@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     def train(report: Report, stop: Stop) -> dict[str, float]:
         device, other = device_of(args.device), args.continue_from
-        return train_mdnrnn(args.data, config, report, layers, device, other, stop, args.new)
+        return train_mdnrnn(args.data, config, report, layers, device, other, stop, args.new, args.tensorboard)
 
     if waiting := unencoded(args.data):
         note = f"note: {waiting} drives are not encoded, and not learnt from: `dreamfleet encode --data {args.data}`"

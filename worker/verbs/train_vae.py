@@ -45,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     def train(report: Report, stop: Stop) -> dict[str, float]:
         device, other = device_of(args.device), args.continue_from
-        return train_vae(args.data, config, report, layers, device, other, args.decoder_only, stop, args.new)
+        return train_vae(args.data, config, report, layers, device, other, args.decoder_only, stop, args.new,
+                         args.tensorboard)  # fmt: skip
 
     return show(args, "VAE", config.updates, args.data / CHECKPOINT, train)

@@ -9,6 +9,7 @@ from dreamfleet.worker.training.checkpoint import load_config
 from dreamfleet.worker.verbs import collect, train_mdnrnn, train_vae
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import write_drive, write_drives
+from tests.support.events import scalars
 
 
 def call(verb, *arguments):
@@ -76,3 +77,16 @@ def test_a_set_goes_on_with_drives_of_controllers(tmp_path, capsys):
 def test_flags_of_controllers_that_do_not_drive_are_refused(tmp_path, flags, said):
     with pytest.raises(UsageError, match=said):
         call(collect, "--data", str(tmp_path), *flags)
+
+
+def test_losses_go_to_tensorboard_too_and_a_continued_training_adds_to_them(tmp_path, capsys):
+    data, events = tmp_path / "data", tmp_path / "events"
+    write_drives(data, episodes=3, steps=4)
+    layers = ("--channels", "2", "2", "4", "4")
+    flags = ("--data", str(data), *layers, "--validate-every", "1", "--tensorboard", str(events))
+    for updates in ("1", "3"):
+        call(train_vae, *flags, "--updates", updates)
+    points = [json.loads(line) for line in (data / "vae.jsonl").read_text().splitlines()]
+    found = scalars(events / "vae")
+    assert [step for step, _ in found["loss/held_out"]] == [1, 2, 3]
+    assert [value for _, value in found["loss/held_out"]] == pytest.approx([each["held_out"] for each in points])

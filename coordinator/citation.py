@@ -1,0 +1,92 @@
+"""A run's receipt in words, as a paper or a report cites it: what was computed with what, and how to have it again."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from typing import Any
+
+from dreamfleet.common.controller import Controller
+from dreamfleet.common.fields import written
+from dreamfleet.common.receipt import Receipt, receipt_of, settings_in
+from dreamfleet.common.runs import RunFolder
+from dreamfleet.common.seeds import TRAINING_FIRST
+from dreamfleet.common.stored import RunSettings, best_of, told
+
+
+def facts(run: RunFolder) -> dict[str, Any]:
+    """The receipt with what it is of, as plain values; `ControllerError` where the run reports no controller yet."""
+    controller = Controller.load(run.controller_path)
+    receipt, settings = receipt_of(controller), settings_in(controller)
+    return {
+        "run": run.name, "run_uid": run.uid, "created": run.created, "ended": run.ended,
+        "controller": controller.sha256, "bundle": settings.task.bundle or None, "score": _score(run),
+        "settings": written(settings), "receipt": written(receipt), "commands": _commands(run),
+    }  # fmt: skip
+
+
+def markdown(run: RunFolder) -> str:
+    """The same for people: a list in Markdown, the commands, and an entry for BibTeX."""
+    controller = Controller.load(run.controller_path)
+    receipt, settings = receipt_of(controller), settings_in(controller)
+    lines = [
+        f"# Run {run.name}",
+        "",
+        *(f"- {name}: {value}" for name, value in _rows(run, controller, receipt, settings)),
+    ]
+    commands = [f"{command}   # {why}" for why, command in _commands(run).items()]
+    return "\n".join(
+        [*lines, "", "```sh", *commands, "```", "", "```bibtex", *_bibtex(run, controller, receipt), "```"]
+    )
+
+
+def _rows(run: RunFolder, controller: Controller, receipt: Receipt, settings: RunSettings) -> Iterator[tuple[str, str]]:
+    spec = settings.task
+    yield "run", f"`{run.uid}`, begun {run.created}, {f'ended after {run.ended}' if run.ended else 'open'}"
+    yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
+    yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
+    yield "score", _score(run)
+    yield "task", f"{spec.task}, {spec.horizon} steps, version {spec.version}"
+    size = f"population {settings.population} x {settings.episodes} episodes, sigma0 {settings.sigma0:g}"
+    yield "search", f"{settings.optimiser}, {settings.covariance}, {size}, {receipt.generations} generations"
+    yield "spent", receipt.total.told
+    yield "seed", f"{settings.seed}; training tracks follow from it, from {TRAINING_FIRST} up"
+    for what, (first, count) in (receipt.seeds or {}).items():
+        yield f"seeds of the {what}", f"{first} to {first + count - 1}"
+    if receipt.start is not None:
+        yield "begun at", f"{receipt.start.source}, SHA-256 `{receipt.start.sha256}`"
+    if settings.subspace:
+        yield "subspace", f"SHA-256 `{settings.subspace}`"
+    if receipt.fingerprint is not None:
+        yield "hosts", f"`{receipt.fingerprint}`" + (", and others: its last bits are its own" if receipt.mixed else "")
+    if receipt.versions is not None:
+        yield "coordinator", ", ".join(f"{name} {version}" for name, version in receipt.versions.items())
+
+
+def _score(run: RunFolder) -> str:
+    return told(run.confirmation() or best_of(run.evaluations()))
+
+
+def _commands(run: RunFolder) -> dict[str, str]:
+    """What checks the run, by what it shows."""
+    last = max((each.number for each in run.history()), default=0)
+    beside, controller = ("--runs-dir", str(run.path.parent)), str(run.controller_path)
+    words = {
+        "one candidate's fitness again, to the bit, on any host of the fingerprint": (
+            "replay", run.name, "--candidate", f"{last}/0", *beside,
+        ),
+        "the whole run again, to the bit": ("repeat", controller, *beside),
+        "its score on unseen tracks": ("evaluate", "--controller", controller, "--episodes", "100"),
+    }  # fmt: skip
+    return {why: shlex.join(("dreamfleet", *each)) for why, each in words.items()}
+
+
+def _bibtex(run: RunFolder, controller: Controller, receipt: Receipt) -> list[str]:
+    version = (receipt.versions or {}).get("dreamfleet", "")
+    return [
+        f"@misc{{dreamfleet-{run.name},",
+        f"  title = {{Run {run.name} of dreamfleet {version}}},",
+        f"  year = {{{run.created[:4]}}},",
+        f"  note = {{run {run.uid}, controller SHA-256 {controller.sha256}, {receipt.generations} generations}}",
+        "}",
+    ]

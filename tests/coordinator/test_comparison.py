@@ -1,0 +1,100 @@
+"""Runs beside each other: what differs, and what a difference is worth."""
+
+import json
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common import cli
+from dreamfleet.common.difference import Difference
+from dreamfleet.common.runs import CONFIRMED, open_run
+from dreamfleet.common.seeds import CONFIRMING, VALIDATION
+from dreamfleet.common.stored import StoredConfirmation
+from dreamfleet.coordinator.comparison import Side, at_equal_spending, difference, differing
+
+FIXTURES = Path(__file__).parents[1] / "fixtures"
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for name in ("dream", "reality", "hidden"):
+        shutil.copytree(FIXTURES / "runs" / name, tmp_path / "runs" / name)
+        shutil.copyfile(FIXTURES / "small.zip", tmp_path / "runs" / name / "bundle.zip")
+    return tmp_path / "runs"
+
+
+def confirm(runs, name, scores):
+    """As a run ends: its last evaluated mean on fresh tracks."""
+    with open_run(runs, name) as run:
+        last, closed = run.evaluations()[-1].generation, len(run.history())
+    with closing(sqlite3.connect(runs / name / "journal.sqlite")) as journal:
+        for number, score in enumerate(scores):
+            row = (f"{name}{number}".encode(), last, CONFIRMING + number, VALIDATION.start + CONFIRMING + number, score)
+            journal.execute("INSERT INTO result VALUES (?, 'evaluate', ?, 0, ?, ?, ?, 10, 0.1, 'w', 'f', 1)", row)
+        found = StoredConfirmation(last, len(scores), sum(scores) / len(scores), 1.0, closed)
+        journal.execute("INSERT INTO run VALUES (?, ?)", (CONFIRMED, found.to_json()))
+        journal.commit()
+
+
+def sides(runs, *names):
+    found = []
+    for name in names:
+        with open_run(runs, name) as run:
+            found.append(Side.of(run))
+    return found
+
+
+def test_settings_that_differ_are_named_and_others_are_not(runs):
+    found = differing(sides(runs, "dream", "reality"))
+    assert found["seed"] == [12, 11]
+    assert found["task.task"] == ["dream", "car-racing"]
+    assert "sigma0" not in found
+    assert differing(sides(runs, "dream", "dream")) == {}
+
+
+def test_at_equal_spending_no_look_had_spent_more(runs):
+    dream, reality = sides(runs, "dream", "reality")
+    for equal in at_equal_spending([dream, reality]):
+        spent = {"steps in reality": lambda effort: effort.steps, "core-hours": lambda effort: effort.core_hours}
+        ends = [spent[equal.what](side.looks[-1].point.effort) for side in (dream, reality)]
+        assert equal.spent == min(ends)
+        assert all(look is None or spent[equal.what](look.point.effort) <= equal.spent for look in equal.looks)
+    assert at_equal_spending(sides(runs, "dream", "hidden")) == []
+
+
+def test_confirmed_scores_are_compared_on_the_tracks_that_both_drove(runs):
+    confirm(runs, "dream", [1.0, 2.0, 3.0, 4.0])
+    confirm(runs, "reality", [2.0, 3.5, 3.5, 5.5, 99.0])
+    one, other = sides(runs, "dream", "reality")
+    found = difference(one.confirmed_scores, other.confirmed_scores)
+    assert isinstance(found, Difference)
+    assert (found.seeds, found.mean, found.clear) == (4, 1.125, True)
+
+
+def test_the_verb_tells_the_difference_in_words_and_as_json(runs, capsys):
+    confirm(runs, "dream", [1.0, 2.0, 3.0, 4.0])
+    confirm(runs, "reality", [2.0, 3.5, 3.5, 5.5])
+    words = ["runs", "compare", "dream", "reality", "--runs-dir", str(runs)]
+    assert cli.main(words) == 0
+    text = capsys.readouterr().out
+    assert "the same validation tracks" in text
+    assert "confirmed: reality less dream: +1.1 ± 0.2 (standard error) on 4 equal seeds: better" in text
+    assert cli.main([*words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [each["of"] for each in told["differences"]] == [
+        "at equal steps in reality",
+        "at equal core-hours",
+        "confirmed",
+    ]
+
+
+def test_runs_without_scores_are_compared_by_their_settings(runs, capsys):
+    assert cli.main(["runs", "compare", "reality", "hidden", "--runs-dir", str(runs)]) == 0
+    told = capsys.readouterr().out
+    assert "covariance\tdiagonal\tfull" in told
+    assert "less" not in told
+    assert cli.main(["runs", "compare", "reality", "--runs-dir", str(runs)]) == 2
+    assert "two runs or more" in capsys.readouterr().err

@@ -1,0 +1,99 @@
+"""A run's journal as CSV, Parquet and TensorBoard's events, read back by those who read such files."""
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from pyarrow import parquet
+
+from dreamfleet.common import cli
+from dreamfleet.common.runs import open_run
+from tests.support.events import scalars
+
+RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
+
+
+@pytest.fixture
+def runs(tmp_path):
+    shutil.copytree(RUNS / "reality", tmp_path / "runs" / "reality")
+    return tmp_path / "runs"
+
+
+def export(runs, tmp_path, kind):
+    out = tmp_path / "out"
+    assert cli.main(["runs", "export", "reality", kind, "--out", str(out), "--runs-dir", str(runs)]) == 0
+    return out
+
+
+def stored(runs):
+    with open_run(runs, "reality") as run:
+        return run.history(), run.candidates(), run.evaluations()
+
+
+def test_csv_tables_hold_every_row_of_the_journal(runs, tmp_path):
+    out = export(runs, tmp_path, "--csv")
+    assert sorted(path.name for path in out.iterdir()) == ["candidates.csv", "evaluations.csv", "generations.csv"]
+    history, candidates, evaluations = stored(runs)
+    read = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in out.iterdir()}
+    assert [float(row["mean"]) for row in read["generations"]] == [each.mean for each in history]
+    assert [(int(row["generation"]), int(row["number"])) for row in read["candidates"]] == [
+        (each.generation, each.number) for each in candidates
+    ]
+    assert [float(row["error"]) for row in read["evaluations"]] == [each.error for each in evaluations]
+
+
+def test_candidates_are_told_with_what_they_were_scored_by(runs):
+    history, candidates, _ = stored(runs)
+    first = [each for each in candidates if each.generation == 0]
+    assert sum(each.fitness for each in first) / len(first) == pytest.approx(history[0].mean)
+    assert sum(each.steps for each in first) == history[0].steps
+    with open_run(runs, "reality") as run:
+        assert first[0].episodes == len(run.results(0, 0))
+
+
+def test_parquet_tables_have_types(runs, tmp_path):
+    out = export(runs, tmp_path, "--parquet")
+    history, candidates, _ = stored(runs)
+    table = parquet.read_table(out / "generations.parquet")
+    assert table.column("mean").to_pylist() == [each.mean for each in history]
+    assert str(table.schema.field("number").type) == "int64"
+    assert parquet.read_table(out / "candidates.parquet").num_rows == len(candidates)
+
+
+def test_tensorboard_gets_a_curve_a_figure_and_no_second_one(runs, tmp_path, capsys):
+    out = export(runs, tmp_path, "--tensorboard")
+    found, (history, _, evaluations) = scalars(out), stored(runs)
+    assert found["fitness/mean"] == [(each.number, pytest.approx(each.mean)) for each in history]
+    assert [step for step, _ in found["score/evaluated"]] == [each.generation for each in evaluations]
+    again = ["runs", "export", "reality", "--tensorboard", "--out", str(out), "--runs-dir", str(runs)]
+    assert cli.main(again) == 2
+    assert "events already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("kind", "package"), [("--parquet", "pyarrow"), ("--tensorboard", "tensorboardX")])
+def test_a_missing_package_names_the_extra(runs, tmp_path, kind, package):
+    words = ["runs", "export", "reality", kind, "--out", str(tmp_path / "out"), "--runs-dir", str(runs)]
+    lacking = f"import sys; sys.modules[{package!r}] = None"
+    code = f"{lacking}\nfrom dreamfleet.common.cli import main; sys.exit(main({words!r}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("dreamfleet: ")
+    assert done.stderr.count("\n") == 1
+    assert "pip install 'dreamfleet[export]'" in done.stderr
+
+
+def test_the_receipt_says_what_a_paper_cites(runs, capsys):
+    assert cli.main(["runs", "receipt", "reality", "--runs-dir", str(runs)]) == 0
+    text = capsys.readouterr().out
+    with open_run(runs, "reality") as run:
+        for part in (run.uid, run.spec.bundle, f"seed: {run.settings.seed};", "dreamfleet replay reality --candidate",
+                     "dreamfleet repeat ", "@misc{dreamfleet-reality,"):  # fmt: skip
+            assert part in text
+    assert cli.main(["runs", "receipt", "reality", "--runs-dir", str(runs), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["receipt"]["generations"] == len(stored(runs)[0])
+    assert told["controller"] in text
