@@ -10,9 +10,8 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
-import numpy as np
-from matplotlib.ticker import MaxNLocator
 
+from dreamfleet.common.charts import COLOURS, draw_fitness
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.saving import saving
 from dreamfleet.common.stages import Stage, begun_stages, in_turn
@@ -20,50 +19,21 @@ from dreamfleet.common.tasks import DREAM
 from dreamfleet.coordinator.learning import LearningCurve, Mark, Point
 
 KINDS = (".png", ".svg")
-COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive")
 PAPERS_NAME = "Ha & Schmidhuber 2018, their public log (1024 tracks; of its time the end alone is known)"
 REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # names of an SVG's parts are drawn at random otherwise
 
 
 def plot_fitness(run: RunFolder, path: Path) -> None:
-    """Draw each generation's mean, spread and best; evaluations and the confirmed mean where there are any."""
-    history, evaluations, settings = run.history(), run.evaluations(), run.settings
-    number = np.array([each.number for each in history])
-    mean = np.array([each.mean for each in history])
-    std = np.array([each.std for each in history])
+    """Draw one run's fitness over its generations, with its evaluated and its confirmed means."""
+    settings = run.settings
+    stages = begun_stages(settings, run.history(), run.evaluations())
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
-    dreamt = settings.task.task == DREAM
-    axes.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label="± 1 standard deviation")
-    axes.plot(number, mean, color="tab:blue", label="mean of the population")
-    axes.plot(number, [each.best for each in history], color="tab:orange", linewidth=1, label="best candidate")
-    stages = begun_stages(settings, history, evaluations)
-    apart = dreamt and not any(each.stage.driven for each in stages)  # else both are scores of one world
-    for each in stages[1:]:
-        label = "a stage begins" if each is stages[1] else None
-        axes.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1, label=label)
-    handles: tuple[Any, ...] = axes.get_legend_handles_labels()
-    if evaluations:
-        real = axes.twinx() if apart else axes
-        episodes = f"{settings.evaluation_episodes} whole episodes"
-        real.errorbar(
-            [each.generation for each in evaluations], [each.mean for each in evaluations],
-            [each.error for each in evaluations], fmt="o-" if dreamt else "o", color="tab:green", capsize=3,
-            label=f"evaluated mean{' in reality' if dreamt else ''}, {episodes} (± standard error)",
-        )  # fmt: skip
-        _draw_confirmed(real, run)
-        if apart:
-            real.set_ylabel(f"score in reality, {episodes}", color="tab:green")
-            handles = tuple(a + b for a, b in zip(handles, real.get_legend_handles_labels(), strict=True))
-        else:
-            handles = axes.get_legend_handles_labels()
+    handles = draw_fitness(axes, run)
     size = in_turn(f"{each.stage.population} candidates x {each.stage.episodes} episodes" for each in stages)
-    steps = in_turn(_steps(each.stage, dreamt=dreamt) for each in stages)
-    axes.set(xlabel="generation", ylabel=f"fitness over {steps}")
-    title = f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}"
-    axes.set_title(title, fontsize=11)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.grid(alpha=0.3)
-    figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    steps = in_turn(_steps(each.stage, dreamt=settings.task.task == DREAM) for each in stages)
+    axes.set_ylabel(f"fitness over {steps}")
+    axes.set_title(f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}", fontsize=11)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     _save(figure, path)
 
 
@@ -136,12 +106,3 @@ def _save(figure: Any, path: Path) -> None:
     with saving(path) as file, mpl.rc_context(REPEATABLE):
         figure.savefig(file, format=path.suffix.removeprefix("."), dpi=120, metadata=told)
     plt.close(figure)
-
-
-def _draw_confirmed(axes: Any, run: RunFolder) -> None:
-    """The score that the run reports, which lies below its best evaluation where that was lucky."""
-    if (confirmed := run.confirmation()) is not None:
-        axes.errorbar(
-            confirmed.generation, confirmed.mean, confirmed.error, fmt="*", color="tab:red", capsize=3, markersize=10,
-            label=f"reported: confirmed on {confirmed.episodes} fresh tracks (± standard error)",
-        )  # fmt: skip

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
+from dreamfleet.common.charts import COLOURS, draw_fitness
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.stages import begun_stages, in_turn
 from dreamfleet.worker.inspection.charts import FONT, new_figure, png
 from dreamfleet.worker.inspection.section import Section
 from dreamfleet.worker.inspection.trainings import MODELS, UNITS, Curve, Training
 
-COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 Style = dict[str, Any]
 
@@ -105,38 +105,13 @@ def _scale(panel: Any, lines: Sequence[NDArray[np.float64]]) -> None:
 
 def fitness(run: RunFolder) -> Section | None:
     """The population's fitness over a run's generations; `None` before the first has closed."""
-    history, evaluations = run.history(), run.evaluations()
+    history = run.history()
     if not history:
         return None
-    number, mean, std, best = np.array([(each.number, each.mean, each.std, each.best) for each in history]).T
     figure, axes = new_figure(3.6)
     panel = axes[0, 0]
-    panel.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label="± 1 standard deviation")
-    panel.plot(number, mean, "o-", markersize=3, color="tab:blue", label="mean of the population")
-    panel.plot(number, best, color="tab:orange", linewidth=1, label="best candidate")
-    stages = begun_stages(run.settings, history, evaluations)
-    for each in stages[1:]:
-        panel.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1)
-    panel.set(xlabel="generation", ylabel="fitness")
-    panel.xaxis.set_major_locator(MaxNLocator(integer=True))
-    handles = list(panel.get_legend_handles_labels()[0])
-    if evaluations:
-        # On its own scale: where the run dreams, fitness and score are not of one kind.
-        real = panel.twinx()
-        generations, means, errors = zip(*((e.generation, e.mean, e.error) for e in evaluations), strict=True)
-        handles.append(
-            real.errorbar(generations, means, errors, fmt="s", color="tab:green", capsize=3, label="evaluated mean")
-        )
-        if (confirmed := run.confirmation()) is not None:
-            handles.append(
-                real.errorbar(
-                    confirmed.generation, confirmed.mean, confirmed.error, fmt="*", color="tab:red", capsize=3,
-                    markersize=9, label="reported, confirmed",
-                )
-            )  # fmt: skip
-        real.set_ylabel("score of whole episodes", color="tab:green")
-    panel.legend(handles=handles, fontsize=FONT, loc="best")
-    panel.grid(alpha=0.3)
-    horizon = in_turn(str(each.stage.horizon) for each in stages)
+    panel.legend(handles=draw_fitness(panel, run), fontsize=FONT, loc="best")
+    panel.set_ylabel("fitness")
+    horizon = in_turn(str(each.stage.horizon) for each in begun_stages(run.settings, history, run.evaluations()))
     text = f"Run {run.name}, task {run.spec.task}, {horizon} steps an episode: fitness over the generations."
     return Section("fitness", "How its controller evolved", text, png(figure))
