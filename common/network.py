@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from dreamfleet.common.errors import UsageError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+LOOPBACK = "127.0.0.1"
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[0-9a-fA-F:]+\]|[^:/\s]+):(\d{1,5})")
 
 
@@ -30,3 +31,11 @@ def check_endpoint(endpoint: str) -> str:
         run = "" if "/" in endpoint or ":" in endpoint else "; if it is a run's name, that stands before the addresses"
         raise UsageError(f"{endpoint!r} is no endpoint: write it as tcp/HOST:PORT, such as {DEFAULT_ENDPOINT}{run}")
     return endpoint
+
+
+def address_of(text: str) -> tuple[str, int]:
+    """Host and port of `--metrics-port`: a port of this host alone, or HOST:PORT; `UsageError` if it is neither."""
+    host, _, port = text.rpartition(":")
+    if not (port.isdecimal() and 0 < int(port) <= 65535):
+        raise UsageError(f"--metrics-port {text!r}: give a port such as 9108, or HOST:PORT for more than this host")
+    return host.strip("[]") or LOOPBACK, int(port)

@@ -16,6 +16,7 @@ from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import COLDEST, HOTTEST, MAX_OPTIONS, TaskSpec
+from dreamfleet.common.network import address_of
 from dreamfleet.common.presets import check_preset, preset_help
 from dreamfleet.common.stages import Stage, stages_of
 from dreamfleet.common.stored import NAMED, RunSettings, StageSettings
@@ -375,8 +376,13 @@ class NetworkConfig:
         "take results of hosts whose CPU features or package versions differ from those of the first accepted result; "
         "last bits may then differ, so the run cannot be repeated to the bit",
     )
+    metrics_port: str = option(
+        "", "answer Prometheus under /metrics at this port of 127.0.0.1, or at HOST:PORT; anybody there may read it"
+    )
 
     def __post_init__(self) -> None:
+        if self.metrics_port:
+            address_of(self.metrics_port)
         if not 0.05 <= self.beat <= 60:
             raise UsageError(f"--beat must be from 0.05 to 60 seconds, not {self.beat}")
         if not 0 <= self.evaluation_share <= LARGEST_SHARE:

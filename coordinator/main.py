@@ -70,7 +70,8 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
 def _service(request: RunRequest, custody: Custody, bundle: ServedBundle | None) -> Service:
     network = request.network
     intervals = Intervals(network.beat, network.beat)
-    return Service(request.name, Network(network.listen, network.connect), intervals, custody, bundle)
+    return Service(request.name, Network(network.listen, network.connect), intervals, custody, bundle,
+                   network.metrics_port)  # fmt: skip
 
 
 def _open(request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None) -> Journal:

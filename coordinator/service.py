@@ -39,6 +39,7 @@ from dreamfleet.coordinator.fleet import Send
 from dreamfleet.coordinator.queryables import BundleServer, answer_status
 from dreamfleet.coordinator.replies import control_reply, hello_reply, misunderstanding
 from dreamfleet.coordinator.run import Run
+from dreamfleet.coordinator.scrape import metrics_served
 from dreamfleet.coordinator.served import ServedBundle
 from dreamfleet.coordinator.status import Snapshot, as_left, take_snapshot
 
@@ -55,12 +56,14 @@ class Service:
     """Serves one run until it ends or `stop` is called."""
 
     def __init__(
-        self, name: str, network: Network, intervals: Intervals, custody: Custody, bundle: ServedBundle | None
-    ) -> None:
+        self, name: str, network: Network, intervals: Intervals, custody: Custody, bundle: ServedBundle | None,
+        metrics_port: str = "",
+    ) -> None:  # fmt: skip
         self._name = name
         self._custody = custody
         self._bundle = bundle
         self._network = network
+        self._metrics_port = metrics_port
         self._intervals = intervals
         self._nonce = secrets.token_hex(8)
         self._events = Arrivals()
@@ -84,6 +87,7 @@ class Service:
             self._exchange = self._run.exchange
             self._started = self._alone_since = monotonic()
             self._snapshot = self._take_snapshot()
+            stack.enter_context(metrics_served(self._metrics_port, lambda: self._snapshot))
             declared = self._declare(session)
             log.info("run %s, incarnation %d, generation %d", self._name, self._run.incarnation,
                      self._run.generation.number)  # fmt: skip

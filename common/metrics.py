@@ -1,0 +1,150 @@
+"""A run's status as Prometheus reads it: the text exposition format, version 0.0.4. Pure.
+
+https://prometheus.io/docs/instrumenting/exposition_formats/. Label sets are bounded, whatever the run: texts of others
+are label values only, escaped and shortened, and of workers the first `MOST_WORKERS` have series of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from dreamfleet.common.eta import eta_of
+from dreamfleet.common.printable import shortened
+from dreamfleet.common.status import OVER, Status, WorkerStatus
+from dreamfleet.common.stored import StoredConfirmation, StoredEvaluation
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+MOST_WORKERS, MOST_REASONS = 200, 50
+LONGEST = 128  # characters of a label's value
+STATES = ("running", "evaluating", "waiting for workers", "paused", *OVER)
+ESCAPES = str.maketrans({"\\": r"\\", '"': r"\"", "\n": r"\n"})
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One metric with its samples: a value for each set of labels."""
+
+    name: str
+    kind: Literal["gauge", "counter"]
+    text: str
+    samples: Sequence[tuple[Mapping[str, str], float | None]]  # `None`: it has none
+
+    def lines(self, run: str) -> Iterator[str]:
+        """As they are written; nothing for a metric without a value."""
+        samples = [(labels, value) for labels, value in self.samples if value is not None]
+        if not samples:
+            return
+        yield f"# HELP {self.name} {self.text}"
+        yield f"# TYPE {self.name} {self.kind}"
+        for labels, value in samples:
+            named = ",".join(f'{name}="{_escaped(text)}"' for name, text in {"run": run, **labels}.items())
+            yield f"{self.name}{{{named}}} {_number(value)}"
+
+
+def exposition(status: Status) -> str:
+    """All metrics of a run, each labelled with its name."""
+    return "".join(f"{line}\n" for metric in metrics(status) for line in metric.lines(status.run))
+
+
+def metrics(status: Status) -> Iterator[Metric]:
+    """In the order in which they are written."""
+    yield from _progress(status)
+    yield from _fitness(status)
+    yield from _fleet(status)
+    yield from _waste(status)
+    yield from _workers(status.worker_list[:MOST_WORKERS])
+
+
+def _progress(status: Status) -> Iterator[Metric]:
+    opened, spent = status.generation, status.throughput
+    states = [({"state": each}, float(each == status.state)) for each in STATES]
+    yield Metric("dreamfleet_state", "gauge", "1 for the state that the run is in.", states)
+    yield _gauge("generation", "The open generation's number.", opened.number)
+    yield _gauge("generation_seconds", "Seconds since it was opened.", opened.seconds)
+    yield _gauge("generation_episodes_done", "Its episodes that are scored.", opened.episodes_done)
+    yield _gauge("generation_episodes", "Its episodes, as far as that is known.", opened.episodes)
+    yield _counter("generations_closed_total", "Generations that were closed.", status.generations)
+    yield _counter("environment_steps_total", "Environment steps of candidates.", spent.environment_steps)
+    yield _gauge("steps_per_second", "Environment steps a second of the present workers.", spent.steps_per_second)
+    eta = eta_of(status)
+    yield _gauge("pace_seconds", "Seconds a generation, the median of the last ones.", eta.pace)
+    yield _gauge("eta_seconds", "Seconds until the nearest limit at this pace.", eta.seconds)
+    yield _gauge("uptime_seconds", "Seconds since its coordinator began.", status.uptime)
+
+
+def _fitness(status: Status) -> Iterator[Metric]:
+    last = status.last
+    told = [] if last is None else [("mean", last.mean), ("best", last.best), ("worst", last.worst)]
+    samples = [({"of": name}, value) for name, value in told]
+    yield Metric("dreamfleet_fitness", "gauge", "Of the candidates of the generation closed last.", samples)
+    yield _gauge("fitness_deviation", "Standard deviation of their fitness.", None if last is None else last.std)
+    yield from _judged("evaluated_score", "Of the mean that was evaluated last.", status.evaluation)
+    yield from _judged("best_evaluated_score", "The best of all evaluations; provisional.", status.best)
+    yield from _judged("confirmed_score", "Of what is reported, on fresh tracks.", status.confirmed)
+    yield _gauge("sigma", "The strategy's step size.", status.generation.sigma)
+    yield _gauge("temperature", "At which the open generation dreams.", status.generation.temperature)
+
+
+def _fleet(status: Status) -> Iterator[Metric]:
+    count = [({"which": "present"}, float(status.workers.present)), ({"which": "known"}, float(status.workers.known))]
+    yield Metric("dreamfleet_workers", "gauge", "Workers that are present, and that are known.", count)
+    yield _gauge("slots", "Slots of the present workers.", status.slots)
+    yield _gauge("failing_jobs", "Wanted jobs that failed somewhere.", status.failing)
+
+
+def _waste(status: Status) -> Iterator[Metric]:
+    waste = status.waste
+    yield _counter("discarded_steps_total", "Environment steps done twice or for nothing.", waste.discarded_steps)
+    jobs = {"reissued": waste.reissued, "recalled": waste.recalled, "copied": waste.copied}
+    results = {"duplicate": waste.duplicate, "obsolete": waste.obsolete, "error": waste.errors}
+    yield _by("jobs_given_again_total", "Jobs given to another worker too, or instead.", "why", jobs)
+    yield _by("results_not_counted_total", "Results that were not accepted.", "why", results)
+    yield _counter("resent_batches_total", "Batches that were sent again.", waste.resent_batches)
+    yield _counter("silences_total", "Workers that fell silent.", waste.silences)
+    dropped = dict(list(status.dropped.items())[:MOST_REASONS])
+    yield _by("dropped_messages_total", "Messages that were dropped, by reason.", "why", dropped)
+
+
+def _workers(workers: Sequence[WorkerStatus]) -> Iterator[Metric]:
+    def each(name: str, kind: Literal["gauge", "counter"], text: str, values: Sequence[float | None]) -> Metric:
+        samples = [({"worker": worker.worker}, value) for worker, value in zip(workers, values, strict=True)]
+        return Metric(f"dreamfleet_worker_{name}", kind, text, samples)
+
+    yield each("present", "gauge", "1 while it is neither silent nor lost.",
+               [float(one.state == "present") for one in workers])  # fmt: skip
+    yield each("slots", "gauge", "Its slots.", [one.slots for one in workers])
+    yield each("leases", "gauge", "Jobs in its hands.", [one.leases for one in workers])
+    yield each("finished_total", "counter", "Its results that were accepted.", [one.finished for one in workers])
+    yield each("steps_per_second", "gauge", "Environment steps a second.", [one.steps_per_second for one in workers])
+    yield each("job_seconds", "gauge", "Seconds that a candidate's job takes a slot.", [w.job_seconds for w in workers])
+    yield each("round_trip_seconds", "gauge", "Bound of its network's round trip.", [one.round_trip for one in workers])
+    yield each("resent_batches_total", "counter", "Batches sent to it again.", [one.resent for one in workers])
+    yield each("load", "gauge", "Its host's load over a minute.", [one.load for one in workers])
+    yield each("heard_seconds", "gauge", "Seconds since it was heard.", [one.heard for one in workers])
+
+
+def _judged(name: str, text: str, found: StoredEvaluation | StoredConfirmation | None) -> Iterator[Metric]:
+    yield _gauge(name, text, None if found is None else found.mean)
+    yield _gauge(f"{name}_error", f"Standard error of {name}.", None if found is None else found.error)
+
+
+def _gauge(name: str, text: str, value: float | None) -> Metric:
+    return Metric(f"dreamfleet_{name}", "gauge", text, [({}, value)])
+
+
+def _counter(name: str, text: str, value: float) -> Metric:
+    return Metric(f"dreamfleet_{name}", "counter", text, [({}, value)])
+
+
+def _by(name: str, text: str, label: str, values: Mapping[str, float]) -> Metric:
+    return Metric(f"dreamfleet_{name}", "counter", text, [({label: key}, value) for key, value in values.items()])
+
+
+def _escaped(text: str) -> str:
+    return shortened(text, LONGEST).translate(ESCAPES)
+
+
+def _number(value: float) -> str:
+    return repr(float(value))

@@ -1,0 +1,74 @@
+"""`/metrics` of a coordinator, in a thread of its own: read-only, from the latest snapshot."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, HTTPServer
+
+from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.metrics import CONTENT_TYPE, exposition
+from dreamfleet.common.network import address_of
+from dreamfleet.coordinator.answers import RECENT
+from dreamfleet.coordinator.status import Snapshot
+
+PATIENCE = 5.0  # seconds for a question: one client at a time is answered
+
+
+@contextmanager
+def metrics_served(where: str, snapshot: Callable[[], Snapshot]) -> Iterator[None]:
+    """Answer at the address that `where` names; nowhere if it is empty. `ConnectionFailedError` where it is taken."""
+    if not where:
+        yield
+        return
+    try:
+        server = _Server(address_of(where), _handler(snapshot))
+    except OSError as error:
+        raise ConnectionFailedError(
+            f"cannot serve metrics at {where}: {error.strerror}; choose another --metrics-port"
+        ) from error
+    thread = threading.Thread(target=server.serve_forever, args=(0.2,), name="metrics", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def text_of(snapshot: Snapshot) -> str:
+    """The exposition of a snapshot: its status with all that metrics are made of."""
+    recent = snapshot.history.part(max(len(snapshot.history) - RECENT, 0), RECENT)
+    return exposition(replace(snapshot.status, worker_list=snapshot.workers, recent=tuple(recent)))
+
+
+class _Server(HTTPServer):
+    def handle_error(self, *_: object) -> None:
+        """A client that leaves, or says nothing, is no news."""
+
+
+def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        timeout = PATIENCE
+        server_version = "dreamfleet"
+        sys_version = ""
+
+        def do_GET(self) -> None:  # the name is http.server's
+            if self.path.partition("?")[0] != "/metrics":
+                self.send_error(HTTPStatus.NOT_FOUND, "there is /metrics")
+                return
+            body = text_of(snapshot()).encode()
+            self.send_response(HTTPStatus.OK)
+            self.send_header("Content-Type", CONTENT_TYPE)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: object) -> None:
+            """Every scrape would be a line."""
+
+    return Handler

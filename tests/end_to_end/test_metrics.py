@@ -1,0 +1,45 @@
+"""`/metrics` of a live coordinator."""
+
+import urllib.error
+import urllib.request
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from tests.support import tasks
+from tests.support.processes import free_port
+
+pytestmark = pytest.mark.timeout(120)
+
+
+def read(port, path="/metrics"):
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=10) as answer:
+        text = answer.read().decode()
+    return {sample.name: sample for family in text_string_to_metric_families(text) for sample in family.samples}
+
+
+def test_a_coordinator_answers_prometheus_and_a_taken_port_is_one_line(processes, random_bundle):
+    port = free_port()
+    settings = ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+                "--task", tasks.TOY, "--generations", 100000, "--metrics-port", port)  # fmt: skip
+    coordinator = processes.coordinator(*settings)
+    assert read(port)["dreamfleet_generation"].value == 0
+    processes.worker("--task", tasks.TOY, "--name", "host-a")
+    coordinator.wait_for("generation 1: mean")
+    while (found := read(port))["dreamfleet_generations_closed_total"].value < 1:
+        pass  # a snapshot is a fifth of a second old
+    assert found["dreamfleet_worker_slots"].labels["worker"].startswith("host-a/")
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        read(port, "/")
+    other = f"tcp/127.0.0.1:{free_port()}"
+    code, _, err = processes.call("coordinator", "--run", "other", "--runs-dir", processes.runs, "--listen", other,
+                                  *settings)  # fmt: skip
+    assert code == 1
+    assert f"cannot serve metrics at {port}" in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize("wrong", ["none", "0", "host:", "70000"])
+def test_a_port_that_is_none_is_said_at_once(processes, wrong):
+    code, _, err = processes.call("coordinator", "--run", "test", "--runs-dir", processes.runs, "--metrics-port", wrong)
+    assert (code, "give a port such as 9108" in err) == (2, True), err
