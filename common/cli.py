@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import difflib
 import errno
-import logging
 import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,7 +18,7 @@ from importlib.metadata import EntryPoint, entry_points, version
 from typing import NoReturn, Protocol
 
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
-from dreamfleet.common.printable import PrintableFormatter, one_line
+from dreamfleet.common.logs import begin_logging, last_word
 
 GROUP = "dreamfleet.verbs"
 INTERRUPTED = 130
@@ -62,19 +61,17 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; an expected error is one line on stderr and an exit code that is not 0."""
-    handler = logging.StreamHandler()
-    handler.setFormatter(PrintableFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    begin_logging()
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         code = run_verb({point.name: point for point in entry_points(group=GROUP)}, words)
         sys.stdout.flush()
         return code
     except DreamfleetError as error:
-        print(f"dreamfleet: {one_line(str(error))}", file=sys.stderr)
+        last_word(str(error))
         return error.exit_code
     except KeyboardInterrupt:
-        print("dreamfleet: interrupted", file=sys.stderr)
+        last_word("interrupted")
         return INTERRUPTED
     except BrokenPipeError:  # `dreamfleet runs list | head`
         _forget_stdout()
@@ -83,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise
         _forget_stdout()
-        print("dreamfleet: what this verb prints could not be written: no space left", file=sys.stderr)
+        last_word("what this verb prints could not be written: no space left")
         return 1
 
 

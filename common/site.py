@@ -17,6 +17,7 @@ from typing import Literal
 
 from dreamfleet.common.config import add_flags, load, option, read_toml
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.logs import choose_format
 from dreamfleet.common.network import DEFAULT_ENDPOINT, check_endpoint
 
 ARRAYS = ("stage",)  # tables that a file may hold several of
@@ -34,6 +35,7 @@ class SiteConfig:
     listen: tuple[str, ...] = option((), f"listen here (default {DEFAULT_ENDPOINT}, unless --connect is given)")
     runs_dir: Path = option(Path("runs"), "where runs live")  # noqa: RUF009 - a field, and paths do not change
     log_level: Literal["debug", "info", "warning", "error"] = option("info", "the least that is logged on stderr")
+    log_format: Literal["text", "json", "auto"] = option("text", "as lines, as JSON, or auto: JSON but in a terminal")
 
     def __post_init__(self) -> None:
         for endpoint in (*self.connect, *self.listen):
@@ -48,7 +50,7 @@ def offer(parser: argparse.ArgumentParser, *names: str, texts: Mapping[str, str]
 def offer_everywhere(parser: argparse.ArgumentParser) -> None:
     """The flags that each verb has."""
     parser.add_argument("--config", type=Path, help="TOML file with settings (default $DREAMFLEET_CONFIG, else none)")
-    offer(parser, "log_level")
+    offer(parser, "log_level", "log_format")
     parser.add_argument(
         "-q", "--quiet", dest="log_level", action="store_const", const="warning", default=argparse.SUPPRESS,
         help="log warnings and errors alone",
@@ -71,6 +73,7 @@ def settle(args: argparse.Namespace, environment: Mapping[str, str] = os.environ
     args.connect, args.listen = site.connect or (DEFAULT_ENDPOINT,), site.listen
     args.runs_dir, args.log_level = site.runs_dir, site.log_level
     logging.getLogger("dreamfleet").setLevel(site.log_level.upper())
+    choose_format(site.log_format)
 
 
 def _check_variables(environment: Mapping[str, str]) -> dict[str, str]:

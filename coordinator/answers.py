@@ -14,10 +14,10 @@ from dreamfleet.common.messages import MAX_MESSAGE
 from dreamfleet.common.status import SCHEMA, Population, WorkerStatus
 from dreamfleet.common.stored import StoredGeneration
 from dreamfleet.coordinator.generation import Standing
-from dreamfleet.coordinator.status import Snapshot
+from dreamfleet.coordinator.status import Snapshot, status_of
 
 PAGE_BYTES = 36_000  # of the rows of a page
-PAGE, CANDIDATES, RECENT = 100, 1000, 60  # rows of a page, candidates of a page, closed generations in the status
+PAGE, CANDIDATES = 100, 1000  # rows of a page, candidates of a page
 HEAD_WORKERS, HEAD_HISTORY, HEAD_CANDIDATES = 11_000, 12_000, 6_000  # bytes of each head in the status
 PARAMETERS = 4_000  # parameters of a controller in one answer: 21 KB in base64
 
@@ -61,11 +61,11 @@ def status(snapshot: Snapshot) -> bytes:
 
 def _with_heads(snapshot: Snapshot, share: float) -> Any:
     candidates = int(HEAD_CANDIDATES * share)
-    recent = snapshot.history.part(max(len(snapshot.history) - RECENT, 0), RECENT)
+    whole = status_of(snapshot)
     return replace(
-        snapshot.status,
-        recent=tuple(reversed(_head(reversed(recent), int(HEAD_HISTORY * share)))),
-        worker_list=tuple(_head(snapshot.workers, int(HEAD_WORKERS * share))),
+        whole,
+        recent=tuple(reversed(_head(reversed(whole.recent), int(HEAD_HISTORY * share)))),
+        worker_list=tuple(_head(whole.worker_list, int(HEAD_WORKERS * share))),
         population=_population(snapshot.standing, 0, CANDIDATES, candidates),
         last_population=None if snapshot.last is None else _population(snapshot.last, 0, CANDIDATES, candidates),
     )

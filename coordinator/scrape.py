@@ -5,15 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.metrics import CONTENT_TYPE, exposition
 from dreamfleet.common.network import address_of
-from dreamfleet.coordinator.answers import RECENT
-from dreamfleet.coordinator.status import Snapshot
+from dreamfleet.coordinator.status import Snapshot, status_of
 
 PATIENCE = 5.0  # seconds for a question: one client at a time is answered
 
@@ -40,12 +38,6 @@ def metrics_served(where: str, snapshot: Callable[[], Snapshot]) -> Iterator[Non
         server.server_close()
 
 
-def text_of(snapshot: Snapshot) -> str:
-    """The exposition of a snapshot: its status with all that metrics are made of."""
-    recent = snapshot.history.part(max(len(snapshot.history) - RECENT, 0), RECENT)
-    return exposition(replace(snapshot.status, worker_list=snapshot.workers, recent=tuple(recent)))
-
-
 class _Server(HTTPServer):
     def handle_error(self, *_: object) -> None:
         """A client that leaves, or says nothing, is no news."""
@@ -61,7 +53,7 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
             if self.path.partition("?")[0] != "/metrics":
                 self.send_error(HTTPStatus.NOT_FOUND, "there is /metrics")
                 return
-            body = text_of(snapshot()).encode()
+            body = exposition(status_of(snapshot())).encode()
             self.send_response(HTTPStatus.OK)
             self.send_header("Content-Type", CONTENT_TYPE)
             self.send_header("Content-Length", str(len(body)))

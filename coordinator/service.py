@@ -11,6 +11,7 @@ import queue
 import secrets
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import asdict
 from time import monotonic
 from typing import Any
 
@@ -36,18 +37,20 @@ from dreamfleet.coordinator.arrivals import Arrivals
 from dreamfleet.coordinator.claim import Claim
 from dreamfleet.coordinator.custody import Custody
 from dreamfleet.coordinator.fleet import Send
+from dreamfleet.coordinator.lines import summary, worker_command
 from dreamfleet.coordinator.queryables import BundleServer, answer_status
 from dreamfleet.coordinator.replies import control_reply, hello_reply, misunderstanding
 from dreamfleet.coordinator.run import Run
 from dreamfleet.coordinator.scrape import metrics_served
 from dreamfleet.coordinator.served import ServedBundle
-from dreamfleet.coordinator.status import Snapshot, as_left, take_snapshot
+from dreamfleet.coordinator.status import Snapshot, as_left, status_of, take_snapshot
 
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a loss waits to be acted upon
 DRAIN = 256  # events that share one commit at most
 LINGER = 0.005  # seconds that a commit waits for more to share it
 SNAPSHOT_INTERVAL = 0.2
+SUMMARY = 60.0  # seconds from one line about the run to the next
 ALONE = 5.0  # seconds without a worker after which the log says so
 _REPEATED: dict[str, type[Message]] = {"result": ResultBatch, "beat": Beat, "upload": UploadPart}
 
@@ -85,12 +88,13 @@ class Service:
             self._run = run_maker()
             self._claim.announce(self._run.uid, self._run.incarnation)
             self._exchange = self._run.exchange
-            self._started = self._alone_since = monotonic()
+            self._started = self._alone_since = self._summed_up = monotonic()
             self._snapshot = self._take_snapshot()
             stack.enter_context(metrics_served(self._metrics_port, lambda: self._snapshot))
             declared = self._declare(session)
+            begun = {"run": self._name, "run_uid": self._run.uid, "incarnation": self._run.incarnation}
             log.info("run %s, incarnation %d, generation %d", self._name, self._run.incarnation,
-                     self._run.generation.number)  # fmt: skip
+                     self._run.generation.number, extra={"facts": {"event": "begin", **begun}})  # fmt: skip
             if self._network.listen:
                 log.info("listening on %s", ", ".join(self._network.listen))
             self._evaluations_told = len(self._run.slack.evaluations)
@@ -148,6 +152,7 @@ class Service:
             if now - taken >= SNAPSHOT_INTERVAL or self._run.state != self._snapshot.status.state:
                 self._snapshot, taken = self._take_snapshot(), now
                 self._tell_alone(now)
+                self._tell_summary(now)
             self._publish_closed(session)
             self._write_notes()
             if self._draining and not self._exchange.leased:
@@ -171,7 +176,16 @@ class Service:
             self._alone_since = now
         elif now - self._alone_since > ALONE:
             self._alone_since = math.inf
-            log.warning("no worker is there: the run waits for one")
+            command = worker_command(self._network, self._name)
+            log.warning("no worker is there: the run waits for one; on any host: %s", command,
+                        extra={"facts": {"event": "no worker", "command": command}})  # fmt: skip
+
+    def _tell_summary(self, now: float) -> None:
+        """One line a minute: who looks into the log sees how the run is."""
+        if now - self._summed_up >= SUMMARY:
+            self._summed_up = now
+            text, facts = summary(status_of(self._snapshot))
+            log.info("%s", text, extra={"facts": facts})
 
     def _write_notes(self) -> None:
         for note in self._exchange.take_notes():
@@ -300,11 +314,13 @@ class Service:
                 environment_steps=self._run.history.steps,
             )
             session.put(keys.event_generation(self._name), encode_json(event), encoding="application/json")
-            log.info("generation %d: mean %.1f, best %.1f", closed.number, closed.mean, closed.best)
+            log.info("generation %d: mean %.1f, best %.1f", closed.number, closed.mean, closed.best,
+                     extra={"facts": {"event": "generation", **asdict(closed)}})  # fmt: skip
         evaluations = self._run.slack.evaluations
         if (last := evaluations.last) is not None and len(evaluations) > self._evaluations_told:
             log.info("evaluation of generation %d's mean: %.1f ± %.1f (standard error), %d episodes",
-                     last.generation, last.mean, last.error, last.episodes)  # fmt: skip
+                     last.generation, last.mean, last.error, last.episodes,
+                     extra={"facts": {"event": "evaluation", **asdict(last), "error": last.error}})  # fmt: skip
         self._evaluations_told = len(evaluations)
 
     def _take_snapshot(self) -> Snapshot:

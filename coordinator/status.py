@@ -33,6 +33,7 @@ from dreamfleet.coordinator.run import Run
 
 MOST_FAILURES, MOST_NAMED = 3, 3  # failed jobs that are told, and workers of each
 LONGEST = 200  # characters of an error
+RECENT = 60  # closed generations in the status
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,12 @@ def _status(run: Run, name: str, standing: Standing, now: float) -> Status:
         confirmed=run.confirmed,
         confirming=Progress(*run.slack.confirming),
     )
+
+
+def status_of(snapshot: Snapshot) -> Status:
+    """The status with all workers and the last closed generations, for who is bound by no message's length."""
+    recent = snapshot.history.part(max(len(snapshot.history) - RECENT, 0), RECENT)
+    return replace(snapshot.status, worker_list=snapshot.workers, recent=tuple(recent))
 
 
 def as_left(snapshot: Snapshot) -> Snapshot:

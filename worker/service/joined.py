@@ -141,8 +141,13 @@ class JoinedRun:
         nonce = str(event.key_expr).rsplit("/", 1)[-1]
         if event.kind == zenoh.SampleKind.DELETE:
             self._membership.vanish(nonce, monotonic())
-            then = "it is given up soon" if self._membership.leaves_alone else "this worker waits for it (see --any)"
-            log.info("the coordinator of run %s left; %s", self._admission.run, then)
+            then = (
+                "it is given up soon"
+                if self._membership.leaves_alone
+                else "this worker waits for that run alone (--any: the next one)"
+            )
+            log.info("the coordinator of run %s is gone; %s", self._admission.run, then,
+                     extra={"facts": {"event": "coordinator gone", "run": self._admission.run}})  # fmt: skip
         else:
             self._membership.appear(nonce)
 

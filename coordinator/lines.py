@@ -1,0 +1,43 @@
+"""What a coordinator's log says of a run beside what happens: how it is, and how a worker joins. Pure."""
+
+from __future__ import annotations
+
+import shlex
+import socket
+from typing import Any
+
+from dreamfleet.common.eta import eta_of
+from dreamfleet.common.network import Network
+from dreamfleet.common.status import Status
+
+ANYWHERE = ("0.0.0.0", "[::]")  # noqa: S104 - hosts that an address may name, none that is listened on
+
+
+def summary(status: Status) -> tuple[str, dict[str, Any]]:
+    """One line about the run as it is, and the same as facts."""
+    opened, best, eta = status.generation, status.confirmed or status.best, eta_of(status)
+    rate, present = status.throughput.steps_per_second, status.workers.present
+    score = "nothing evaluated yet" if best is None else f"best mean {best.mean:.1f} ± {best.error:.1f}"
+    text = (
+        f"{status.state}, generation {opened.number} ({opened.episodes_done}/{opened.episodes} episodes), {score}, "
+        f"{rate:,.0f} steps/s, {present} workers with {status.slots} slots, {eta.told}"
+    )
+    facts = {
+        "event": "summary", "state": status.state, "generation": opened.number, "steps_per_second": rate,
+        "best": None if best is None else best.mean, "best_error": None if best is None else best.error,
+        "workers": present, "slots": status.slots, "eta_seconds": eta.seconds,
+    }  # fmt: skip
+    return text, facts
+
+
+def worker_command(network: Network, run: str) -> str:
+    """The command that starts a worker of the run, on this host or another."""
+    addresses = [_reached(each) for each in network.listen or network.connect]
+    return shlex.join(("dreamfleet", "worker", "--run", run, "--connect", *addresses))
+
+
+def _reached(endpoint: str) -> str:
+    """An endpoint as others name it: who listens everywhere is reached by this host's name."""
+    protocol, _, where = endpoint.partition("/")
+    host, _, port = where.rpartition(":")
+    return f"{protocol}/{socket.gethostname()}:{port}" if host in ANYWHERE else endpoint
