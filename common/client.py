@@ -20,7 +20,7 @@ from dreamfleet.common.errors import ConnectionFailedError, ControllerError, Ref
 from dreamfleet.common.fields import known
 from dreamfleet.common.messages import ControlReply
 from dreamfleet.common.session import Network, enqueue_into, open_session
-from dreamfleet.common.status import OVER, Population, Status, WorkerStatus, read_document, read_status
+from dreamfleet.common.status import OVER, Event, Population, Status, WorkerStatus, read_document, read_status
 from dreamfleet.common.stored import StoredGeneration
 
 QUERY_TIMEOUT = 3.0
@@ -112,6 +112,17 @@ class Client:
     def history(self, run: str) -> list[StoredGeneration]:
         """All closed generations of `run`, oldest first."""
         return [from_plain(StoredGeneration, known(StoredGeneration, row)) for row in self.pages("history", run)]
+
+    def story(self, run: str | None = None, worker: str = "", job: str = "") -> tuple[list[Event], int]:
+        """What happened of late, oldest first, and how many such events are kept: more than one answer may hold.
+
+        `worker` is a worker, or the host's name in its name; `job` a candidate as generation/index; else all.
+        """
+        document = self.document(run, "story", f"worker={worker};job={job}")
+        rows = document.get("story")
+        if not isinstance(rows, list):
+            raise MalformedError("the run's coordinator tells no story: install a newer dreamfleet there")
+        return [from_plain(Event, known(Event, row)) for row in rows], int(document.get("total", len(rows)))
 
     def candidates(self, run: str, generation: int) -> list[Population]:
         """All candidates of the open generation of `run`, or of the one before it, in parts; the open one otherwise."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.fields import OPTIONAL, known
@@ -16,7 +16,7 @@ from dreamfleet.common.messages import MAX_MESSAGE, Count, Length, Seconds, Text
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 
 SCHEMA = 2
-PARTS = ("", "generation", "workers", "history", "candidates", "best")
+PARTS = ("", "generation", "workers", "history", "candidates", "best", "story")
 OVER = ("ended", "left")  # the states in which a coordinator leaves
 Long = Annotated[str, Length(0, 10_000)]
 
@@ -106,6 +106,22 @@ class WorkerStatus:
     # own round trip is shorter. `None` before the first.
     round_trip: float | None = field(default=None, metadata=OPTIONAL)
     resent: Count = field(default=0, metadata=OPTIONAL)  # batches that were sent again
+
+
+What = Literal[
+    "joined", "back", "silent", "left", "given", "seen", "sent again", "recalled", "copied", "reissued", "accepted",
+    "duplicate", "obsolete", "refused",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened to a worker, or to a job in its hands."""
+
+    ago: float  # seconds
+    what: What
+    worker: Word
+    job: Annotated[str, Length(0, 128)]  # kind generation/candidate/episode; empty where it is of no job that is known
 
 
 @dataclass(frozen=True)

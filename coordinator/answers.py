@@ -11,10 +11,11 @@ from typing import Any, Protocol, TypeVar
 from dreamfleet.common.codec import encode_json
 from dreamfleet.common.fields import written
 from dreamfleet.common.messages import MAX_MESSAGE
-from dreamfleet.common.status import SCHEMA, Population, WorkerStatus
+from dreamfleet.common.status import SCHEMA, Event, Population, WorkerStatus
 from dreamfleet.common.stored import StoredGeneration
 from dreamfleet.coordinator.generation import Standing
 from dreamfleet.coordinator.status import Snapshot, status_of
+from dreamfleet.coordinator.story import Happening
 
 PAGE_BYTES = 36_000  # of the rows of a page
 PAGE, CANDIDATES = 100, 1000  # rows of a page, candidates of a page
@@ -34,7 +35,10 @@ class Parameters(Protocol):
 
 
 def answer(snapshot: Snapshot, part: str, parameters: Parameters) -> bytes:
-    """The JSON of one part: `workers`, `history` and `candidates` by page, `best` with part of the parameters."""
+    """The JSON of one part: `workers`, `history` and `candidates` by page, `best` with part of the parameters.
+
+    Of the `story` as many of the last events as one answer holds.
+    """
     if part == "":
         return status(snapshot)
     offset, limit = _number(parameters.get("offset"), 0), _number(parameters.get("limit"), 10**9)
@@ -44,6 +48,7 @@ def answer(snapshot: Snapshot, part: str, parameters: Parameters) -> bytes:
         "history": lambda: _history(snapshot, offset, limit),
         "candidates": lambda: _candidates(snapshot, parameters.get("generation"), offset, limit),
         "best": lambda: _best(snapshot, offset),
+        "story": lambda: _story(snapshot, parameters.get("worker") or "", parameters.get("job") or ""),
     }
     head = {"schema": SCHEMA, "run": snapshot.status.run, "run_uid": snapshot.status.run_uid}
     return json.dumps({**head, **documents[part]()}, allow_nan=False).encode()
@@ -91,6 +96,21 @@ def _candidates(snapshot: Snapshot, generation: str | None, offset: int, limit: 
     last = snapshot.last
     chosen = last if last is not None and generation == str(last.generation) else snapshot.standing
     return asdict(_population(chosen, offset, min(limit, CANDIDATES), PAGE_BYTES))
+
+
+def _story(snapshot: Snapshot, worker: str, job: str) -> dict[str, Any]:
+    """The last events of a worker, of a candidate's jobs (`generation/index`), or of all; the newest last."""
+    generation, slash, index = job.partition("/")
+    chosen = (_number(generation, -1), _number(index, -1)) if slash else None
+    found = list(snapshot.story.latest(worker, chosen))
+    plain = (asdict(_event(each, snapshot.now)) for each in found)
+    rows = _fitting(plain, PAGE_BYTES, lambda row: len(json.dumps(row)) + 2)
+    return {"total": len(found), "story": rows[::-1]}
+
+
+def _event(each: Happening, now: float) -> Event:
+    job = "" if each.job is None else "{} {}/{}/{}".format(*each.job)
+    return Event(round(now - each.at, 3), each.what, each.worker, job)
 
 
 def _best(snapshot: Snapshot, offset: int) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from dreamfleet.coordinator.jobs import Work
 from dreamfleet.coordinator.member import Handful, Lease, Member, Sent
 from dreamfleet.coordinator.packing import Content, pack
 from dreamfleet.coordinator.record import HostRecord
+from dreamfleet.coordinator.story import Story
 from dreamfleet.coordinator.tail import Move, Tail
 from dreamfleet.coordinator.wanted import Wanted, WantedJobs
 
@@ -54,6 +55,7 @@ class Fleet:
         self.jobs = WantedJobs(evaluation_share)
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
+        self.story = Story()  # of workers and jobs, for whoever asks
         self.notes: list[str] = []  # what happened, for whoever writes it down and clears it
         self.hurry = False  # nothing but evaluations and collected rollouts is left to wait for
         self.paused = False
@@ -93,15 +95,21 @@ class Fleet:
 
     def beat(self, identity: str, beat: Beat, now: float) -> None:
         """Reconcile what the worker holds with what it was given."""
-        member = self.members.get(identity)
+        member, self._now = self.members.get(identity), now
         if member is None:
             return
         self._hear(member, now)
-        self._guests.pop(identity, None)
+        if identity in self._guests:  # until it has beaten it may be anybody, and strangers would fill the story
+            del self._guests[identity]
+            self.story.add(now, "joined", identity)
         if beat.numbering != member.numbering:
             # It was late, or its worker has not heard of the welcome: what it had queued, it will then forget.
             beat = replace(beat, seen=0, queued=())
-        member.observe(replace(beat, capacity=min(beat.capacity, beat.slots)) if self.alone else beat, now)
+        if self.alone:
+            beat = replace(beat, capacity=min(beat.capacity, beat.slots))
+        for sent in member.observe(beat, now):
+            for work in sent.content.work:
+                self.story.add(now, "seen", identity, work.job.digest)
         running = {self.jobs.named(run.tag): run.steps for run in beat.running}
         shown = {self.jobs.named(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
         for digest, lease in list(member.leases.items()):
@@ -122,6 +130,8 @@ class Fleet:
             self._hear(member, now)
             member.take_back(result)
         verdict, work = self._judge(identity, result)
+        if member is not None or verdict == "accepted":
+            self.story.add(now, verdict, identity, result.digest)
         if member is not None:
             member.leases.pop(result.digest, None)
             if member.known or len(member.verdicts) < MOST_GUESTS:
@@ -148,7 +158,7 @@ class Fleet:
     def tick(self, now: float) -> None:
         """Let time pass: departures, silences, batches to send again."""
         gap = now - self._ticked if self._ticked is not None else 0.0
-        self._ticked = now
+        self._ticked = self._now = now
         for member in list(self.members.values()):
             if gap > CLOCK_GAP:
                 self._extend(member, gap)
@@ -169,6 +179,7 @@ class Fleet:
 
         Verdicts stay until everything so far is `durable`.
         """
+        self._now = now
         for member in self.members.values():
             member.learn(now)
         given = self._assign(now)
@@ -201,6 +212,8 @@ class Fleet:
             sent.at, sent.times = now, sent.times + 1
             self.counts["resent_batches"] += 1
             member.resent += 1
+            for work in sent.content.work:
+                self.story.add(now, "sent again", member.identity, work.job.digest)
             yield Send(member.identity, member.numbering, number, sent.content)
 
     def _news(self, member: Member, given: Sequence[Work], durable: bool, now: float) -> Iterator[Send]:
@@ -211,6 +224,7 @@ class Fleet:
             member.unseen[member.number] = Sent(content, now, now)
             for work in content.work:
                 self._take(member, work.job.digest, Lease(member.number, handful))
+                self.story.give(now, member.identity, work.job)
             yield Send(member.identity, member.numbering, member.number, content)
         member.cancels = []
         if durable:
@@ -247,7 +261,9 @@ class Fleet:
 
     def _hear(self, member: Member, now: float) -> None:
         member.heard = now
-        member.silent = False
+        if member.silent:
+            member.silent = False
+            self.story.add(now, "back", member.identity)
 
     def _extend(self, member: Member, gap: float) -> None:
         """A suspended host's gap is nobody's silence."""
@@ -270,6 +286,7 @@ class Fleet:
         if not member.known:
             return  # nothing was given to it, and no log should grow with what strangers call themselves
         self.notes.append(f"worker {member.identity} {what}: {len(member.leases)} jobs are free again")
+        self.story.add(now, "left" if member.lost is not None else "silent", member.identity)
         if member.leases:
             last = self._records.get(member.identity.partition("/")[0], member.record)
             last.die(now - member.born)
@@ -287,6 +304,9 @@ class Fleet:
             donor.leases.pop(move.digest)
             donor.cancels.append(move.digest)
             self.jobs.let_go(move.digest, donor.identity)
+            self.story.add(now, "recalled", donor.identity, move.digest)
+        else:
+            self.story.add(now, "copied", move.to, move.digest)
         if move.trial:
             self.members[move.to].trials[move.digest] = Handful(now, 0)
         self.counts["recalled" if move.instead_of else "copied"] += 1
@@ -298,6 +318,7 @@ class Fleet:
         member.leases.pop(digest, None)
         if self.jobs.let_go(digest, member.identity):
             self.counts["reissued"] += 1
+            self.story.add(self._now, "reissued", member.identity, digest)
             self.jobs.enqueue(digest)
 
     def _forget(self, member: Member) -> None:

@@ -82,8 +82,8 @@ class Member:
         self.unseen.clear()
         self.cancels, self.verdicts = [], []
 
-    def observe(self, beat: Beat, now: float) -> None:
-        """Take what a beat says of the worker itself."""
+    def observe(self, beat: Beat, now: float) -> list[Sent]:
+        """Take what a beat says of the worker itself; the batches that it has seen since the last one."""
         self.known = True
         self.capacity, self.slots, self.seen = beat.capacity, beat.slots, beat.seen
         self.load, self.steps_per_second, self.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
@@ -96,6 +96,7 @@ class Member:
             self.record.confirmed(now - max(sent.first for sent in arrived))
         if arrived:
             self.delivered = now
+        return arrived
 
     def overdue(self, now: float, patience: float) -> list[int]:
         """Batches to send again: not seen for `patience`, and what the link takes for all that is on the way."""

@@ -30,6 +30,7 @@ from dreamfleet.coordinator.history import HistoryView
 from dreamfleet.coordinator.member import Member
 from dreamfleet.coordinator.report import Reported
 from dreamfleet.coordinator.run import Run
+from dreamfleet.coordinator.story import StoryView
 
 MOST_FAILURES, MOST_NAMED = 3, 3  # failed jobs that are told, and workers of each
 LONGEST = 200  # characters of an error
@@ -46,6 +47,8 @@ class Snapshot:
     standing: Standing
     last: Standing | None
     reported: Reported | None
+    story: StoryView
+    now: float  # of the clock that the story tells time by
 
 
 def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float) -> Snapshot:
@@ -53,7 +56,8 @@ def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float
     workers = tuple(_worker(member, now) for member in run.exchange.members)
     standing = run.generation.standing()
     status = replace(_status(run, name, standing, now), uptime=round(uptime, 1), dropped=dict(dropped))
-    return Snapshot(status, workers, run.history.view(), standing, run.last, run.slack.report.current)
+    return Snapshot(status, workers, run.history.view(), standing, run.last, run.slack.report.current,
+                    run.fleet.story.view(), now)  # fmt: skip
 
 
 def _status(run: Run, name: str, standing: Standing, now: float) -> Status:

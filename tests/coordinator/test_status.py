@@ -15,6 +15,7 @@ from dreamfleet.coordinator import answers
 from dreamfleet.coordinator.generation import Standing
 from dreamfleet.coordinator.history import History
 from dreamfleet.coordinator.status import Snapshot, as_left, take_snapshot
+from dreamfleet.coordinator.story import Story
 from tests.coordinator.test_run import SETTINGS, A, Bench
 from tests.support.samples import CLOSED, STATUS
 
@@ -88,7 +89,10 @@ def large(population, workers, generations, text="x"):
         workers=dataclasses.replace(STATUS.workers, known=workers),
     )  # fmt: skip
     last = dataclasses.replace(standing, generation=generations - 1)
-    return Snapshot(status, fleet, History(rows(generations)).view(), standing, last, None)
+    story = Story()
+    for number in range(3 * workers):
+        story.add(number / 10, "accepted", fleet[number % workers].worker)
+    return Snapshot(status, fleet, History(rows(generations)).view(), standing, last, None, story.view(), 1e6)
 
 
 @pytest.mark.parametrize(("population", "workers", "generations"), [(4, 1, 1), (100_000, 2000, 5000)])

@@ -24,3 +24,27 @@ def test_a_fleets_log_is_json_where_it_is_asked_for_and_tells_how_to_start_a_wor
     assert (closed["event"], closed["number"], closed["level"]) == ("generation", 0, "info")
     coordinator.popen.kill()
     assert "this worker waits for that run alone" in worker.wait_for("the coordinator of run test is gone")
+
+
+def test_the_story_of_a_killed_workers_jobs_is_told_while_the_run_lives(processes, random_bundle):
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+        "--task", tasks.SLOW_TOY, "--generations", 100000,
+    )  # fmt: skip
+    worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "host-a")
+    coordinator.wait_for("generation 0: mean")
+    worker.popen.kill()
+    coordinator.wait_for("jobs are free again")
+
+    def story(*words):
+        code, out, err = processes.call("story", "test", "--connect", processes.endpoint, *words, "--json")
+        assert code == 0, err
+        return json.loads(out)
+
+    while "reissued" not in (whats := [each["what"] for each in story("--worker", "host-a")]):
+        pass  # a snapshot is a fifth of a second old
+    assert whats[0] == "joined"
+    assert {"given", "seen", "accepted", "left"} <= set(whats)
+    assert {each["job"].split("/")[1] for each in story("--job", "0/3")} == {"3"}
+    code, _, err = processes.call("story", "test", "--connect", processes.endpoint, "--job", "three")
+    assert (code, "write generation/index" in err) == (2, True)

@@ -1,0 +1,44 @@
+"""`dreamfleet story`: what happened to a worker or a job of late."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.listing import add_json, print_rows
+from dreamfleet.common.site import offer
+
+SUMMARY = "tell what happened to a live run's workers and jobs of late: given, seen, silent, reissued, accepted, ..."
+EXTRAS = ()
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("run_name", nargs="?", metavar="RUN", help="name of the run (default: the only live one)")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--worker", metavar="W", help="of this worker, or of all lives of this host's worker")
+    which.add_argument("--job", metavar="G/I", help="of this candidate's jobs: generation/index, such as 3/0")
+    offer(parser, "connect")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the events, the newest last."""
+    from dreamfleet.common.client import Client
+
+    if args.job is not None and not re.fullmatch(r"\d{1,12}/\d{1,12}", args.job):
+        raise UsageError(f"--job {args.job!r}: write generation/index, such as 3/0")
+    if args.worker is not None and not re.fullmatch(r"[A-Za-z0-9._/-]+", args.worker):
+        raise UsageError(f"--worker {args.worker!r}: give a name as `dreamfleet status` shows it")
+    with Client(args.connect) as client:
+        events, total = client.story(args.run_name, args.worker or "", args.job or "")
+    if args.json:
+        print(json.dumps([vars(each) for each in events]))
+        return 0
+    print_rows([{"seconds ago": f"{each.ago:.2f}", "what": each.what, "job": each.job or None, "worker": each.worker}
+                for each in events], right=("seconds ago",))  # fmt: skip
+    if total > len(events):
+        print(f"the last {len(events)} of {total} events that are kept")
+    return 0

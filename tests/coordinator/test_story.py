@@ -1,0 +1,75 @@
+"""What is told of workers and jobs: the ring alone, and what a fleet writes into it."""
+
+import pytest
+
+from dreamfleet.common.messages import Result
+from dreamfleet.coordinator.fleet import DEPARTURE_GRACE, SILENT_BEATS
+from dreamfleet.coordinator.story import BLOCK, BLOCKS, Story
+from tests.coordinator.test_run import A, B, Bench
+from tests.coordinator.test_status import SCORED, answered, score, snapshot_of
+
+
+@pytest.fixture
+def bench(tmp_path, random_bundle):
+    made = Bench(tmp_path / "night", random_bundle.path, SCORED, generations=3)
+    yield made
+    made.journal.close()
+
+
+def told(bench, **asked):
+    return [
+        (each["what"], each["worker"], each["job"]) for each in answered(snapshot_of(bench), "story", **asked)["story"]
+    ]
+
+
+def test_the_ring_is_bounded_and_a_view_does_not_change():
+    story = Story()
+    for number in range(BLOCK * BLOCKS + 10):
+        story.add(float(number), "back", "a/0")
+    view = story.view()
+    kept = list(view.latest())
+    assert BLOCK * (BLOCKS - 1) < len(kept) <= BLOCK * BLOCKS
+    assert kept[0].at == BLOCK * BLOCKS + 9
+    story.add(0.0, "left", "a/0")
+    assert list(view.latest()) == kept
+
+
+def test_a_jobs_story_goes_from_given_to_accepted(bench):
+    score(bench, 1)
+    (given,) = [each for each in told(bench, job="0/0") if each[0] == "accepted"]
+    name = given[2]
+    assert name.startswith("score 0/0/")
+    story = [each for each in told(bench, job="0/0") if each[2] == name]
+    assert [what for what, _, _ in story] == ["given", "accepted"]
+    assert {job.split()[1].rpartition("/")[0] for _, _, job in told(bench, job="0/1")} == {"0/1"}
+
+
+def test_jobs_of_a_silent_worker_are_told_as_given_out_again(bench):
+    sends = bench.run.exchange.dispatch(bench.now)
+    held = sum(len(send.content.work) for send in sends if send.identity == A)
+    bench.beat(A)
+    bench.now += SILENT_BEATS + 0.1
+    bench.beat(B)
+    bench.run.exchange.tick(bench.now)
+    whats = [what for what, _, _ in told(bench, worker=A)]
+    assert whats[:1] == ["joined"]
+    assert whats.count("given") == whats.count("seen") == whats.count("reissued") == held > 0
+    assert "silent" in whats
+    bench.beat(A)
+    assert told(bench, worker="a")[-1][:2] == ("back", A)
+
+
+def test_a_worker_that_leaves_is_told_and_a_stranger_is_not(bench):
+    bench.run.exchange.depart(B, bench.now)
+    bench.now += 2 * DEPARTURE_GRACE
+    bench.run.exchange.tick(bench.now)
+    assert ("left", B, "") in told(bench)
+    before = len(told(bench))
+    bench.deliver("stranger/00000009", Result(b"x" * 32, 1.0, 10, 0.1, None, None))
+    assert len(told(bench)) == before
+
+
+@pytest.mark.parametrize("asked", [{"worker": "nobody"}, {"job": "9/9"}, {"job": "x/y"}, {"job": "7"}])
+def test_what_is_not_known_has_no_story_and_no_number_means_all(bench, asked):
+    bench.run.exchange.dispatch(bench.now)
+    assert bool(told(bench, **asked)) == (asked == {"job": "7"})
