@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from math import ceil
 from statistics import median
@@ -47,19 +47,17 @@ class Roster:
     def lines(self, width: int, most: int) -> list[Text]:
         """At most `most` lines, 3 at least, of `width` columns: those of whom there is most to say, in their order."""
         slowest = slowest_of(self.workers)
-        chosen = list(self.workers)
+        shown = set(range(len(self.workers)))
         if self.wanted(width) > most:
-            room, chosen = most - 2, []
-            for each in sorted(self.workers, key=lambda each: _need(each, slowest)):
-                room -= _rows(each, width)
-                if room < 0 and chosen:
+            room, shown = most - 2, set()
+            for row in sorted(range(len(self.workers)), key=lambda row: _need(self.workers[row], slowest)):
+                room -= _rows(self.workers[row], width)
+                if room < 0 and shown:
                     break
-                chosen.append(each)
-            names = {each.worker for each in chosen}
-            chosen = [each for each in self.workers if each.worker in names]
-        found = _table(chosen, slowest, width)
-        if self.known > len(chosen):
-            found.append(Text(f"and {self.known - len(chosen)} more", style="dim"))
+                shown.add(row)
+        found = _table(self.workers, shown, slowest, width)
+        if self.known > len(shown):
+            found.append(Text(f"and {self.known - len(shown)} more", style="dim"))
         return found
 
 
@@ -79,7 +77,10 @@ def _rows(each: WorkerStatus, width: int) -> int:
     return max(1, ceil(cell_len(printable(each.worker)) / max(width, 1)))
 
 
-def _table(workers: Sequence[WorkerStatus], slowest: WorkerStatus | None, width: int) -> list[Text]:
+def _table(
+    workers: Sequence[WorkerStatus], shown: Collection[int], slowest: WorkerStatus | None, width: int
+) -> list[Text]:
+    """A heading and the rows that are shown; the columns fit all workers, so that they stand still."""
     cells = {name: [printable(tell(each)) for each in workers] for name, tell in COLUMNS.items()}
     for row, each in enumerate(workers):
         cells["state"][row] += ", slowest" if each is slowest else ""
@@ -88,22 +89,16 @@ def _table(workers: Sequence[WorkerStatus], slowest: WorkerStatus | None, width:
     for name in LEAST_FIRST:
         if sum(widths[each] + PAD for each in kept) - PAD > width:
             kept.remove(name)
-    found = [_line([_padded(name, name, widths[name]) for name in kept], "dim", width)]
-    for row, each in enumerate(workers):
+    heading = (" " * PAD).join(_padded(name, name, widths[name]) for name in kept)
+    found = [Text(heading.rstrip()[:width], style="dim")]
+    for row in sorted(shown):
+        each = workers[row]
         style = "red" if each.state != "present" else "yellow" if each is slowest else ""
-        found += _folded([_padded(name, cells[name][row], widths[name]) for name in kept], style, width)
+        line = (" " * PAD).join(_padded(name, cells[name][row], widths[name]) for name in kept)
+        found += [Text(part, style=style) for part in chop_cells(line.rstrip(), width)]
     return found
 
 
 def _padded(name: str, text: str, width: int) -> str:
     air = " " * (width - cell_len(text))
     return text + air if name in LEFT else air + text
-
-
-def _line(cells: Sequence[str], style: str, width: int) -> Text:
-    return Text((" " * PAD).join(cells).rstrip()[:width], style=style)
-
-
-def _folded(cells: Sequence[str], style: str, width: int) -> list[Text]:
-    """One line, or several where not even the name fits."""
-    return [Text(part, style=style) for part in chop_cells((" " * PAD).join(cells).rstrip(), width)]

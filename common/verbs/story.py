@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import sys
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, print_rows
@@ -25,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the events, the newest last."""
+    """Print the events, the newest last; how many more there are goes to stderr."""
     from dreamfleet.common.client import Client
 
     if args.job is not None and not re.fullmatch(r"\d{1,12}/\d{1,12}", args.job):
@@ -39,6 +40,8 @@ def run(args: argparse.Namespace) -> int:
         return 0
     print_rows([{"seconds ago": f"{each.ago:.2f}", "what": each.what, "job": each.job or None, "worker": each.worker}
                 for each in events], right=("seconds ago",))  # fmt: skip
-    if total > len(events):
-        print(f"the last {len(events)} of {total} events that are kept")
+    if not events:
+        print("nothing of that is kept: it is too long ago, or not yet", file=sys.stderr)
+    elif total > len(events):
+        print(f"the last {len(events)} of {total} events that are kept", file=sys.stderr)
     return 0
