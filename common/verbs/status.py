@@ -42,17 +42,17 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             print(json.dumps(document, indent=2))
         else:
-            _print_once(document)
+            _print_once(client, document)
     return 0
 
 
-def _print_once(document: dict[str, Any]) -> None:
+def _print_once(client: Client, document: dict[str, Any]) -> None:
     from rich.console import Console
 
     from dreamfleet.common.status import read_status
     from dreamfleet.common.table import RunPanel
 
-    Console().print(RunPanel(read_status(document)))
+    Console().print(RunPanel(_with_all_workers(client, read_status(document))))
 
 
 def _print_lines(client: Client, name: str) -> int:

@@ -27,6 +27,7 @@ def look(folder):
     with RunFolder(folder) as run:
         assert run.settings.population > 1
         run.history(), run.evaluations(), run.rollouts(), run.strategy_state(), run.result_count()
+        run.candidates(), run.scores(1), run.scores(1, confirming=True)
         run.uid, run.created, run.ended, run.fingerprint  # noqa: B018
         run.candidate(0, 0), run.fitness(0, 0), run.results(0, 0)
 
