@@ -12,8 +12,8 @@ from typing import NamedTuple
 from dreamfleet.common.messages import Job
 from dreamfleet.common.status import What
 
-BLOCK, BLOCKS = 1024, 32  # events of a block, and blocks that are kept
-MOST_NAMED = BLOCK * BLOCKS  # jobs whose names are kept for results that come late
+BLOCK, BLOCKS = 256, 128  # events of a block, and blocks that are kept
+MOST_NAMED = 10_000  # jobs whose names are kept: many more than can be in workers' hands
 
 
 class Happening(NamedTuple):
