@@ -261,9 +261,9 @@ class Fleet:
 
     def _hear(self, member: Member, now: float) -> None:
         member.heard = now
-        if member.silent:
-            member.silent = False
+        if member.silent and member.known:  # else its silence was not told either
             self.story.add(now, "back", member.identity)
+        member.silent = False
 
     def _extend(self, member: Member, gap: float) -> None:
         """A suspended host's gap is nobody's silence."""

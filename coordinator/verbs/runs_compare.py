@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         budgets = [_plain(sides, each) for each in equal]
         print(json.dumps({"runs": runs, "settings": settings, "equal": budgets, "differences": found}, default=str))
         return 0
-    print_rows([_row(each) for each in sides], right=("generations",), least_first=("task", "spent"))
+    print_rows([_row(each) for each in sides], least_first=("task", "spent"))
     print()
     _print_settings(sides, settings)
     if len(worlds) > 1:

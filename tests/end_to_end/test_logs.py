@@ -41,10 +41,10 @@ def test_the_story_of_a_killed_workers_jobs_is_told_while_the_run_lives(processe
         assert code == 0, err
         return json.loads(out)
 
-    while "reissued" not in (whats := [each["what"] for each in story("--worker", "host-a")]):
+    while "left" not in (whats := [each["what"] for each in story("--worker", "host-a")]):
         pass  # a snapshot is a fifth of a second old
     assert whats[0] == "joined"
-    assert {"given", "seen", "accepted", "left"} <= set(whats)
+    assert {"given", "accepted", "reissued"} <= set(whats)
     assert {each["job"].split("/")[1] for each in story("--job", "0/3")} == {"3"}
     code, _, err = processes.call("story", "test", "--connect", processes.endpoint, "--job", "three")
     assert (code, "write generation/index" in err) == (2, True)
