@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.worker.dream.noise import SharedNoise
 from dreamfleet.worker.dream.world import DreamWorld
-from dreamfleet.worker.tasks.api import Episode, Score, World
+from dreamfleet.worker.tasks.api import Episode, Glimpse, Onlooker, Score, World
 
 DEFAULT_TEMPERATURE = 1.0
 TILE = 256  # rows that dream together: larger batches are slower again
@@ -24,7 +25,14 @@ class Dreamer:
         """`world` is the bundle's own; found by its name if it is not given."""
         self._size = bundle.controller_shape.size
         self._horizon = spec.horizon
+        self._onlooker: Onlooker | None = None
         self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, world, spec.recorded)
+
+    def watched(self, onlooker: Onlooker) -> Dreamer:
+        """The same, which shows the first of the dreams that still go on."""
+        shown = copy(self)
+        shown._onlooker = onlooker
+        return shown
 
     def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None] = lambda _: None) -> list[Score]:
         """The summed reward of each dream, in step order, in double precision; `on_step` hears of all steps so far."""
@@ -32,10 +40,10 @@ class Dreamer:
         for start in range(0, len(episodes), TILE):
             before = sum(score.steps for score in scores)
             tile = episodes[start : start + TILE]
-            scores += self._dream(tile, lambda made, before=before: on_step(before + made))  # type: ignore[misc]
+            scores += self._dream(tile, lambda made, before=before: on_step(before + made), start)  # type: ignore[misc]
         return scores
 
-    def _dream(self, episodes: Sequence[Episode], on_step: Callable[[int], None]) -> list[Score]:
+    def _dream(self, episodes: Sequence[Episode], on_step: Callable[[int], None], start: int) -> list[Score]:
         parameters = np.stack([vector for vector, _ in episodes]).astype(np.float32)
         if parameters.shape[1] != self._size or not np.isfinite(parameters).all():
             raise UsageError(f"a dream needs controllers of {self._size} finite parameters")
@@ -43,8 +51,12 @@ class Dreamer:
         noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.beginnings)
         fitness, steps = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
         latent, state, made = noise.first.latent, world.begin(len(rows), noise.first.memory), 0
-        for _ in range(self._horizon):
+        for step in range(self._horizon):
             moment = world.live(latent, parameters, state, noise.next(rows))
+            if self._onlooker is not None and self._onlooker.due():
+                first = int(rows[0])
+                seen = Glimpse(step, float(fitness[first]), moment.action[0], None, latent[0], state[0])
+                self._onlooker.see(start + first, seen)
             fitness[rows] += moment.reward
             steps[rows] += 1
             made += len(rows)

@@ -26,6 +26,7 @@ class Moment(NamedTuple):
     state: Floats
     reward: NDArray[np.float64]
     done: NDArray[np.bool_]
+    action: Floats  # that led here
 
 
 class DreamWorld:
@@ -79,7 +80,7 @@ class DreamWorld:
     def _judge(self, dream: Dream) -> Moment:
         told = dream.reward.astype(np.float64)
         reward = told if self._worth is None or self._kind == "value" else self._value(told, self._worth, dream)
-        return Moment(dream.latent, dream.state, reward, dream.done > 0.5)
+        return Moment(dream.latent, dream.state, reward, dream.done > 0.5, dream.action)
 
     def _value(self, told: NDArray[np.float64], worth: DreamReward, dream: Dream) -> NDArray[np.float64]:
         if worth.source == "survival":

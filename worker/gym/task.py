@@ -22,6 +22,7 @@ from dreamfleet.common.tasks import GYM
 from dreamfleet.worker.tasks.api import ENVIRONMENTS_OWN, Assignment, Description, Policy, Task, World
 from dreamfleet.worker.tasks.policy import FlatPolicy
 
+RGB = "rgb_array"  # gymnasium's name of the mode in which `render` gives pictures
 OPTIONS = ("environment", "normalise", "seed")
 NORMALISING_EPISODES = 20
 MOST_STEPS = 10_000  # of an episode where the environment was registered without a limit of its own
@@ -57,6 +58,13 @@ class GymTask(Task):
         """The same environment."""
         arguments = dict(assignment.spec.option("environment", {}))
         return self._make(arguments if render_mode is None else {**arguments, "render_mode": render_mode})
+
+    def make_shown(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:
+        """Of gymnasium's own environments, whose `render` changes nothing that is scored; others' might."""
+        plain = self.make_environment(assignment)
+        plain.close()
+        own = type(plain.unwrapped).__module__.startswith(tuple(ENGINES))
+        return self.make_judge(assignment, RGB) if own and RGB in plain.metadata.get("render_modes", ()) else None
 
     def make_policy(self, assignment: Assignment) -> Policy:
         """A controller on the flat observation, normalised as it was when the run began."""

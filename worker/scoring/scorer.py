@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
+from contextlib import suppress
+from functools import cached_property, lru_cache
+from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +17,8 @@ from dreamfleet.common.messages import Kind, TaskSpec
 from dreamfleet.common.variants import Variant
 from dreamfleet.worker.scoring.episode import Course, score
 from dreamfleet.worker.scoring.rollout import Rollout
-from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Score, World
+from dreamfleet.worker.scoring.watched import WatchedPolicy
+from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Onlooker, Score, Watchable, World
 from dreamfleet.worker.tasks.registry import find_task
 
 DRIVER = "controller"  # as a kept rollout names who drove
@@ -30,6 +34,7 @@ class Scorer:
     """
 
     def __init__(self, spec: TaskSpec, bundle: Bundle | None = None) -> None:
+        self.onlooker: Onlooker | None = None  # to be set between turns; `None` costs an episode nothing
         task = find_task(spec.task)
         fitting = None if bundle is None else bundle.under(spec.controller, Variant.of(spec.options))
         assignment = Assignment(spec, fitting)
@@ -41,6 +46,7 @@ class Scorer:
             # One is kept: a run's terms change now and then, and making a batch takes milliseconds.
             self._batch_for = lru_cache(maxsize=1)(lambda each: make(Assignment(each, assignment.bundle)))
             self._batch_for(spec)  # so that what is wrong with it shows at once
+        self._task, self._assignment = task, assignment
         self._environment = task.make_environment(assignment)
         self._policy = task.make_policy(assignment)
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
@@ -53,9 +59,7 @@ class Scorer:
 
         `spec` is one other than the run's: the same at another temperature, horizon or patience, or driven.
         """
-        if (batch := self._batch((kind,), spec)) is not None:
-            return batch.score([(parameters, seed)], on_step)[0]
-        return score(self._environment, self._policy, parameters, self.course(kind, seed, spec), on_step)
+        return self.score_all([(kind, parameters, seed)], on_step, spec)[0]
 
     def score_all(
         self, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]], on_step: Callable[[int], None],
@@ -63,13 +67,20 @@ class Scorer:
     ) -> list[Score]:  # fmt: skip
         """A turn's jobs, as `score` does; `on_step` hears of all steps made so far."""
         if (batch := self._batch([kind for kind, _, _ in jobs], spec)) is not None:
+            if self.onlooker is not None and isinstance(batch, Watchable):
+                batch = batch.watched(self.onlooker)
             return batch.score([(parameters, seed) for _, parameters, seed in jobs], on_step)
         scores: list[Score] = []
-        for job in jobs:
+        for kind, parameters, seed in jobs:
             before = sum(each.steps for each in scores)
-            scores.append(
-                self.score(*job, lambda done, before=before: on_step(before + done), spec)  # type: ignore[misc]
-            )
+
+            def move(done: int, before: int = before) -> None:
+                on_step(before + done)
+
+            if (alone := self._batch((kind,), spec)) is not None:
+                scores += alone.score([(parameters, seed)], move)
+            else:
+                scores.append(self._drive(len(scores), parameters, self.course(kind, seed, spec), move))
         return scores
 
     def collect(
@@ -79,7 +90,7 @@ class Scorer:
         """An episode as candidates drive it, and what happened in it, failures included; `spec` as in `score`."""
         rollout = Rollout(DRIVER, self._preprocessing)
         course = self.course("collect", seed, spec)
-        return score(self._environment, self._policy, parameters, course, on_step, rollout), rollout
+        return self._drive(0, parameters, course, on_step, rollout), rollout
 
     @property
     def drawn_by(self) -> str:
@@ -106,6 +117,24 @@ class Scorer:
     def close(self) -> None:
         """Release the environment."""
         self._environment.close()
+
+    def _drive(
+        self, episode: int, parameters: NDArray[np.float32], course: Course, on_step: Callable[[int], None],
+        rollout: Rollout | None = None,
+    ) -> Score:  # fmt: skip
+        """Drive an episode, the one of this place in the turn, before the onlooker's eyes if there is one."""
+        if self.onlooker is None:
+            return score(self._environment, self._policy, parameters, course, on_step, rollout)
+        shown = self._shown
+        policy = WatchedPolicy(self._policy, self.onlooker, episode, None if shown is None else shown.render)
+        return score(shown or self._environment, policy, parameters, course, on_step, rollout)
+
+    @cached_property
+    def _shown(self) -> gymnasium.Env[Any, Any] | None:
+        """What is scored in while somebody looks on, if that is another environment; one that cannot be had is none."""
+        with suppress(Exception):
+            return self._task.make_shown(self._assignment)
+        return None
 
 
 def checked_world(assignment: Assignment) -> World:

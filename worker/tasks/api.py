@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
@@ -36,6 +36,8 @@ __all__ = [
     "DreamReward",
     "Driver",
     "Episode",
+    "Glimpse",
+    "Onlooker",
     "Policy",
     "Preprocessing",
     "Rewarded",
@@ -43,6 +45,7 @@ __all__ = [
     "Sourced",
     "Task",
     "Truthful",
+    "Watchable",
     "World",
 ]
 
@@ -76,6 +79,27 @@ class Score:
 
 Episode = tuple[NDArray[np.float32], int]
 """A candidate's flat vector and the seed of its episode."""
+
+
+class Glimpse(NamedTuple):
+    """A step of an episode as whoever looks on is shown it, before its action is done."""
+
+    step: int  # those that were made before it
+    score: float  # what they brought
+    action: NDArray[Any]  # that follows
+    picture: NDArray[np.uint8] | None = None  # (height, width, 3), where one is seen
+    latent: NDArray[np.float32] | None = None  # (latent,), of a world model
+    state: NDArray[np.float32] | None = None  # (state,), what it remembers before the action
+
+
+class Onlooker(Protocol):
+    """Somebody looks on while episodes are scored; what he sees changes no score by a bit."""
+
+    def due(self) -> bool:
+        """Whether the present step is to be shown: far fewer are than are made."""
+
+    def see(self, episode: int, glimpse: Glimpse) -> None:
+        """Be shown a step of one of the episodes that are scored together, by its place among them."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +200,14 @@ class Task:
             raise UsageError(f"task {self.name} draws no pictures: its make_judge takes no render_mode")
         return self.make_environment(assignment)
 
+    def make_shown(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:  # noqa: ARG002 - as above
+        """What candidates are scored in while somebody looks on, where it takes another environment to have pictures.
+
+        The same to the bit, and `render` gives pictures and changes nothing. `None`: there is none, and what the
+        policy observes is shown if it is a picture.
+        """
+        return None
+
     def make_policy(self, assignment: Assignment) -> Policy:
         """What drives; `BundleError` if the bundle is of another task."""
         return FlatPolicy(assignment.controller, self.world_of(assignment).actions)
@@ -186,6 +218,14 @@ class Batch(Protocol):
 
     def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None]) -> list[Score]:
         """The score of each; `on_step` hears of all steps made so far."""
+
+
+@runtime_checkable
+class Watchable(Protocol):
+    """A batch that somebody may look on at."""
+
+    def watched(self, onlooker: Onlooker) -> Batch:
+        """The same batch, which shows the onlooker one of its episodes; its scores are the same bits."""
 
 
 @runtime_checkable
