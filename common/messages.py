@@ -18,6 +18,7 @@ from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 
 MAX_MESSAGE = 48 * 1024
 MAX_PART = 40 * 1024  # room for the envelope around a part's bytes
+MAX_SIDE = 256  # pixels of a live frame's picture
 MAX_UPLOAD = 32 << 20  # a rollout of 1000 steps is 12 MB (64x64) or 28 MB (96x96) before it is compressed
 MAX_OPTIONS = 8_000  # characters: a status and a controller carry them too
 MAX_LEASES = 1024  # of one worker: so that a beat, which names them all, stays under MAX_MESSAGE
@@ -257,17 +258,30 @@ class UploadPart(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class ViewFrame(Message):
-    """What a slot sees: a `height x width x 3` picture of 8-bit values, row by row."""
+    """What a slot sees: a `height x width x 3` picture of 8-bit values, row by row; empty where it sees none.
+
+    `latent`, `state` and `parameters` are float32, little-endian: by them and the run's world model a viewer decodes
+    and dreams on for itself. They are empty where there are none, and where they are too long.
+    """
 
     SCHEMA: ClassVar[str] = "view"
 
     slot: Count
-    tag: Tag
-    step: Count
-    reward: float
-    height: Annotated[int, Between(1, 256)]
-    width: Annotated[int, Between(1, 256)]
+    tag: Tag  # of the job
+    step: Count  # of the episode: those that were made before this moment
+    reward: float  # the sum of what they brought
+    height: Annotated[int, Between(1, MAX_SIDE)]
+    width: Annotated[int, Between(1, MAX_SIDE)]
     picture: Part
+    packed: bool = field(default=False, metadata=OPTIONAL)  # the picture is deflated
+    kind: Kind = field(default="score", metadata=OPTIONAL)  # of job; an evaluation is of its generation's mean
+    generation: Count = field(default=0, metadata=OPTIONAL)
+    candidate: Count = field(default=0, metadata=OPTIONAL)
+    seed: Count = field(default=0, metadata=OPTIONAL)
+    action: Annotated[tuple[float, ...], Length(0, 64)] = field(default=(), metadata=OPTIONAL)  # that follows
+    latent: Part = field(default=b"", metadata=OPTIONAL)
+    state: Part = field(default=b"", metadata=OPTIONAL)  # what the world model remembers before the action
+    parameters: Part = field(default=b"", metadata=OPTIONAL)  # of the controller
 
 
 @dataclass(frozen=True)

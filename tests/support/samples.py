@@ -84,6 +84,11 @@ MSGPACK = {
         **HEAD, digest=b"\x01" * 32, sha256=b"\x04" * 32, offset=0, total=16, data=b"part of a drive!"
     ),
     "view": ViewFrame(**HEAD, slot=1, tag=b"ABCDEFGH", step=99, reward=-0.1, height=2, width=2, picture=bytes(12)),
+    "view-whole": ViewFrame(
+        **HEAD, slot=1, tag=b"ABCDEFGH", step=99, reward=-0.1, height=2, width=2, packed=True,
+        picture=bytes.fromhex("789c6360400000000c0001"), kind="evaluate", generation=7, candidate=2, seed=20003,
+        action=(0.25, 1.0, 0.0), latent=bytes(8), state=bytes(16), parameters=VECTOR,
+    ),
 }  # fmt: skip
 JSON = {
     "hello-request": HelloRequest(1, 1, "0.1.0", "host-a/0a1b2c3d", ("car-racing", "dream"), "x86_64 avx2", 8),

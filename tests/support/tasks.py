@@ -16,15 +16,15 @@ from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 MODULE = "tests.support.tasks"
 (
     TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, EXPLODING, ENDLESS,
-    CHATTY,
+    CHATTY, PAINTED,
 ) = (
     f"{MODULE}:{name}"
     for name in (
         "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Optimistic",
-        "Exploding", "Endless", "Chatty",
+        "Exploding", "Endless", "Chatty", "Painted",
     )
 )  # fmt: skip
-ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC
+ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, PAINTED
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
 ODD_REWARD = "DREAMFLEET_TEST_ODD_REWARD"  # a file that holds a number: the next episode gives it, and the file is gone
 
@@ -315,6 +315,37 @@ class OptimisticBatch:
             scores.append(Score(float((vector[:8].astype(np.float64) * noise).sum()), 10))
             on_step(10 * len(scores))
         return scores
+
+
+class Painted(Toy):
+    """It sees pictures, whose colour says how many steps were made; so many steps, at leisure."""
+
+    name = PAINTED
+    seconds = 0.02
+    length = 50
+
+    def make_environment(self, assignment):
+        return PaintedEnvironment(self.seconds, self.length)
+
+
+class PaintedEnvironment(ToyEnvironment):
+    observation_space = spaces.Box(0, 255, (16, 24, 3), np.uint8)
+
+    def __init__(self, seconds, length):
+        super().__init__(seconds)
+        self._length = length
+
+    def reset(self, *, seed=None, options=None):
+        _, told = super().reset(seed=seed)
+        self._left = self._length
+        return self._look(), told
+
+    def step(self, action):
+        _, *rest = super().step(action)
+        return self._look(), *rest
+
+    def _look(self):
+        return np.full((16, 24, 3), (self._length - self._left) % 256, np.uint8)
 
 
 def steps_made(folder):

@@ -56,7 +56,7 @@ class Dreamer:
             if self._onlooker is not None and self._onlooker.due():
                 first = int(rows[0])
                 seen = Glimpse(step, float(fitness[first]), moment.action[0], None, latent[0], state[0])
-                self._onlooker.see(start + first, seen)
+                self._onlooker.see(start + first, lambda seen=seen: seen)  # type: ignore[misc]
             fitness[rows] += moment.reward
             steps[rows] += 1
             made += len(rows)

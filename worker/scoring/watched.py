@@ -37,11 +37,12 @@ class WatchedPolicy:
             return self._policy.act(observation)
         state = _row(self._policy, "state")  # before it acts: from here the world model may dream on
         action = self._policy.act(observation)
-        seen = Glimpse(
-            self._steps, self._score, np.atleast_1d(np.asarray(action)), self._picture(observation),
-            _row(self._policy, "latent"), state,
-        )  # fmt: skip
-        self._onlooker.see(self._episode, seen)
+
+        def look() -> Glimpse:
+            told = self._steps, self._score, np.atleast_1d(np.asarray(action))
+            return Glimpse(*told, self._picture(observation), _row(self._policy, "latent"), state)
+
+        self._onlooker.see(self._episode, look)
         self._steps += 1
         return action
 

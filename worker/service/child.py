@@ -31,10 +31,10 @@ class Ready:
 
 
 def serve_jobs(
-    pipe: Connection[Any, Any], steps: Any, abandoned: Any, spec: TaskSpec, bundle: Path | None,
+    pipe: Connection[Any, Any], steps: Any, abandoned: Any, shown: Any, spec: TaskSpec, bundle: Path | None,
     announced: tuple[str, ...], parent: int,
 ) -> None:  # fmt: skip
-    """Score jobs from the pipe until it closes. `steps` and `abandoned` are shared with the parent.
+    """Score jobs from the pipe until it closes. `steps`, `abandoned` and `shown` are shared with the parent.
 
     Nothing is imported for a task that is not among the `announced` ones.
     """
@@ -48,7 +48,7 @@ def serve_jobs(
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     scorer = _make_scorer(pipe, spec, bundle, announced)
     pipe.send(Ready(scorer.drawn_by))
-    _take_turns(pipe, scorer, steps, abandoned)
+    _take_turns(pipe, scorer, steps, abandoned, shown)
 
 
 def _make_scorer(pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None, announced: tuple[str, ...]) -> Scorer:
@@ -70,9 +70,11 @@ def _make_scorer(pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None
         raise SystemExit(1) from error
 
 
-def _take_turns(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandoned: Any) -> None:
+def _take_turns(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandoned: Any, shown: Any) -> None:
+    from dreamfleet.worker.service.glimpses import Sampler
     from dreamfleet.worker.service.turn import AbandonedError, do_turn
 
+    sampler = Sampler(pipe.send, lambda: bool(shown.value))
     while True:
         try:
             turn, work = pipe.recv()
@@ -84,4 +86,5 @@ def _take_turns(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandone
             if abandoned[turn % 2] == turn:  # noqa: B023 - called within this round
                 raise AbandonedError
 
+        scorer.onlooker = sampler.of(turn) if shown.value else None
         pipe.send(do_turn(scorer, turn, work, count))

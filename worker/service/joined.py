@@ -24,12 +24,14 @@ from dreamfleet.common.mishaps import Mishaps
 from dreamfleet.common.session import enqueue_into
 from dreamfleet.worker.service.admission import Admission
 from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.glimpses import Seen
 from dreamfleet.worker.service.membership import Hands, Membership
 from dreamfleet.worker.service.outbox import Outbox
 from dreamfleet.worker.service.post import Post, Rate
 from dreamfleet.worker.service.slot import SlotEvent
 from dreamfleet.worker.service.slots import Slots
 from dreamfleet.worker.service.uploads import PACE, Uploads
+from dreamfleet.worker.service.viewing import Viewing
 
 log = logging.getLogger(__name__)
 MOST_WAITING = 1024  # batches; a coordinator sends again what was not seen
@@ -78,6 +80,7 @@ class JoinedRun:
         run, session = self._admission.run, self._line.session
         self._membership.join(self._admission.nonce, self._admission.intervals.beat, monotonic())
         coordinators = keys.live_coordinator(run, "*")
+        self._viewing = Viewing(session, run, self._line.identity, enqueue_into(self._events, "viewers"))
         declared = [
             session.declare_subscriber(
                 keys.job(run, self._line.identity), enqueue_into(self._events, "job", MOST_WAITING)
@@ -86,6 +89,7 @@ class JoinedRun:
                 coordinators, enqueue_into(self._events, "coordinator"), history=True
             ),
             session.liveliness().declare_token(keys.live_worker(run, self._line.identity)),
+            self._viewing,
         ]
         log.info("joined run %s as %s, %d slots", run, self._line.identity, len(self._slots))
         return declared
@@ -126,6 +130,9 @@ class JoinedRun:
 
         What a slot says is our own affair: a slot that cannot start ends the worker.
         """
+        if kind == "slot" and isinstance(event.word, Seen):
+            self._show(event, event.word)
+            return
         if kind == "slot":
             self._take_slot_event(event)
             return
@@ -134,6 +141,8 @@ class JoinedRun:
                 self._take_batch(event.payload.to_bytes())
             elif kind == "coordinator":
                 self._take_token(event)
+            elif kind == "viewers":
+                self._slots.show(event.matching)
         except Exception as error:
             self._mishaps.note(kind, error, event)
 
@@ -189,6 +198,12 @@ class JoinedRun:
             if event.upload is not None:
                 self._uploads.add(results[0].digest, event.upload)
             self._fill_slots(now)  # before the other slots' events are looked at
+
+    def _show(self, event: SlotEvent, seen: Seen) -> None:
+        """Publish a frame. It is no news that the coordinator owes an answer to, so its silence goes on."""
+        work = self._slots.work_of(event.slot, event.life, seen)
+        if work is not None:
+            self._viewing.show(self._admission, event.slot, work, seen)
 
     def _fill_slots(self, now: float) -> None:
         if not self._membership.leaving(now):

@@ -18,11 +18,12 @@ from dreamfleet.common.children import signals_held
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.threads import pin_thread_pools
 from dreamfleet.worker.service.child import Ready, serve_jobs
+from dreamfleet.worker.service.glimpses import Seen
 from dreamfleet.worker.service.turn import Done, Failure, Work
 
 ENDING = 2.0  # seconds between a child's last word and its end
 
-Word = Ready | Done | Failure | None
+Word = Ready | Seen | Done | Failure | None
 """What a child says; `None`, from the reader itself, is that it says nothing any more."""
 
 
@@ -36,10 +37,11 @@ class ChildProcess:
         context = get_context("spawn")
         self._steps: Any = context.Value("Q", 0, lock=False)
         self._abandoned: Any = context.Array("Q", 2, lock=False)  # turns to give up: an even one, an odd one
+        self._shown: Any = context.Value("B", 0, lock=False)
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
             target=serve_jobs,
-            args=(theirs, self._steps, self._abandoned, spec, bundle, announced, os.getpid()),
+            args=(theirs, self._steps, self._abandoned, self._shown, spec, bundle, announced, os.getpid()),
             daemon=True,
         )
         with signals_held():
@@ -79,6 +81,10 @@ class ChildProcess:
     def give_up(self, turn: int) -> None:
         """Have it end a turn at its next step; of two turns that it has, both can be given up."""
         self._abandoned[turn % 2] = turn
+
+    def show(self, wanted: bool) -> None:
+        """Have it show steps of its turns from the next one on, or no more from now on."""
+        self._shown.value = wanted
 
     def kill(self) -> None:
         """End it; its reader then says so."""

@@ -15,6 +15,7 @@ from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.messages import Job, Result, TaskSpec
 from dreamfleet.common.printable import shortened
 from dreamfleet.worker.service.child import Ready
+from dreamfleet.worker.service.glimpses import Seen
 from dreamfleet.worker.service.process import ChildProcess, Word
 from dreamfleet.worker.service.turn import Done, Failure, Turn, Work
 
@@ -86,6 +87,7 @@ class Slot:
         self._child: ChildProcess | None = None  # `None` while it must wait for the next one
         self._ended_for, self._last_word = "", ""
         self._sent = 0  # turns given to this child
+        self._shown = False
         self._start()
 
     @property
@@ -133,6 +135,19 @@ class Slot:
             self._watch_anew()
         self._child.send(turn.number, turn.work)
 
+    def show(self, wanted: bool) -> None:
+        """Have steps of its turns shown from the next one on, by this child and those after it; or no more."""
+        self._shown = wanted
+        if self._child is not None:
+            self._child.show(wanted)
+
+    def work_of(self, life: int, seen: Seen) -> Work | None:
+        """The job whose step was shown; `None` of a turn that is none of this child's any more."""
+        if life != self._life or not self._turns or self._turns[0].number != seen.turn:
+            return None
+        work = self._turns[0].work
+        return work[seen.episode] if seen.episode < len(work) else None
+
     def check(self, now: float, gap: float) -> None:
         """Kill a child that hangs in a turn or as it starts; `gap` is how long this host itself stood still.
 
@@ -174,7 +189,7 @@ class Slot:
             return self._end_turn(event.word)
         elif isinstance(event.word, Failure):
             self._last_word = event.word.text
-        else:
+        elif not isinstance(event.word, Seen):
             return self._replace()
         return ()
 
@@ -264,6 +279,7 @@ class Slot:
             log.warning("slot %d cannot start a process yet: %s", number, error)
             self._vacate(RESPITE)
             return
+        self._child.show(self._shown)
         self._watch_anew()
         waiting, self._turns = self._turns, deque()
         for turn in waiting:

@@ -13,7 +13,9 @@ from dreamfleet.common.messages import MAX_LEASES, TAG_BYTES, Job, Result, Runni
 from dreamfleet.worker.service.announced import check_announced
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.failures import Failures
+from dreamfleet.worker.service.glimpses import Seen
 from dreamfleet.worker.service.slot import Slot, SlotEvent
+from dreamfleet.worker.service.turn import Work
 from dreamfleet.worker.tasks.registry import find_task
 
 log = logging.getLogger(__name__)
@@ -37,6 +39,8 @@ class Slots:
         self._task = spec.task
         self._width = find_task(spec.task).width
         self._failures = Failures()
+        self._watched = False
+        self._shown: Slot | None = None
         self._slots: list[Slot] = []
         try:
             for number in range(count):
@@ -95,6 +99,21 @@ class Slots:
         for slot in idle + ahead:
             if work := backlog.take(self._width):
                 slot.submit(work)
+        if self._watched and self._shown is not None and not self._shown.running:
+            self._show_another()
+
+    def show(self, wanted: bool) -> None:
+        """Have one of them show its episodes, or none."""
+        self._watched = wanted
+        if self._shown is not None:
+            self._shown.show(False)
+            self._shown = None
+        if wanted:
+            self._show_another()
+
+    def work_of(self, number: int, life: int, seen: Seen) -> Work | None:
+        """The job of which a slot showed a step; `None` of one that is over."""
+        return self._slots[number].work_of(life, seen)
 
     def handle(self, event: SlotEvent) -> tuple[Result, ...]:
         """Take a slot's event; the results that it brings."""
@@ -130,3 +149,12 @@ class Slots:
         """End all children."""
         for slot in self._slots:
             slot.stop()
+
+    def _show_another(self) -> None:
+        """The first that runs shows its next turns in place of one that rests."""
+        another = next((slot for slot in self._slots if slot.running), self._shown or self._slots[0])
+        if another is not self._shown:
+            if self._shown is not None:
+                self._shown.show(False)
+            another.show(True)
+            self._shown = another

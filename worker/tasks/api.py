@@ -98,8 +98,8 @@ class Onlooker(Protocol):
     def due(self) -> bool:
         """Whether the present step is to be shown: far fewer are than are made."""
 
-    def see(self, episode: int, glimpse: Glimpse) -> None:
-        """Be shown a step of one of the episodes that are scored together, by its place among them."""
+    def see(self, episode: int, look: Callable[[], Glimpse]) -> None:
+        """Look at a step of one of the episodes that are scored together, by its place among them."""
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ class Eyes:
         self._asked += 1
         return self._asked % self._every == 0
 
-    def see(self, episode, glimpse):
-        self.seen.append((episode, glimpse))
+    def see(self, episode, look):
+        self.seen.append((episode, look()))
 
 
 def parameters(size, seed=0):

@@ -1,0 +1,199 @@
+"""Looking on while a worker scores: its live frames, the newest one alone, whoever else watches.
+
+>>> with Client(("tcp/127.0.0.1:7447",)) as client, LiveView(client, "night") as view:  # doctest: +SKIP
+...     for sight in view:
+...         print(sight.worker, sight.frame.generation, sight.frame.candidate, sight.frame.step)
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from time import monotonic
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from dreamfleet.common import keys
+from dreamfleet.common.client import Client
+from dreamfleet.common.codec import Inbox, MalformedError
+from dreamfleet.common.errors import ConnectionFailedError, UsageError
+from dreamfleet.common.messages import ViewFrame
+from dreamfleet.common.pictures import picture_of
+from dreamfleet.common.status import WorkerStatus
+
+LOOK = 1.0  # seconds between looks for a worker, where there is none
+QUIET = 2.0  # seconds without a frame after which the run is asked whether the worker is still there
+PRESENT = "present"  # a worker's state
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A frame that was looked at: of whom it is, and what is in it, as arrays; `None` is what it does not hold."""
+
+    worker: str  # name/life
+    frame: ViewFrame
+    picture: NDArray[np.uint8] | None = field(repr=False)  # (height, width, 3)
+    latent: Floats | None = field(repr=False)
+    state: Floats | None = field(repr=False)
+    parameters: Floats | None = field(repr=False)
+
+    @classmethod
+    def of(cls, worker: str, frame: ViewFrame) -> Sight:
+        """`MalformedError` for a frame whose contents are not what it says."""
+        numbers = (_floats(each) for each in (frame.latent, frame.state, frame.parameters))
+        return cls(worker, frame, picture_of(frame), *numbers)
+
+
+class LiveView:
+    """The newest frame of one worker of a run; use it in a `with`.
+
+    Each worker that somebody subscribes to publishes, so a view subscribes to one, and to another where that one goes.
+    """
+
+    def __init__(self, client: Client, run: str | None = None, worker: str | None = None) -> None:
+        """`run` may be left out where only one is live; `worker` is its name, or `name/life`, or whoever works.
+
+        `UsageError` names the workers where there is none of this name.
+        """
+        self.status = client.status(run)  # as it was asked last
+        self.dropped = Inbox()
+        self._client, self._wanted = client, worker
+        self._newest = _Newest()
+        self._subscriber: Any = None
+        self._followed = ""
+        self._quiet_since = self._look_at = monotonic()
+        if worker is not None and self._choose() is None:
+            known = ", ".join(each.worker for each in self._present()) or "none yet"
+            raise UsageError(f"run {self.run} has no worker {worker!r}: it has {known}")
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        self._leave()
+
+    def __iter__(self) -> Iterator[Sight]:
+        """Every sight that there is time for, until the run is over."""
+        while not self.over:
+            if (sight := self.next(QUIET)) is not None:
+                yield sight
+
+    @property
+    def run(self) -> str:
+        """The run's name."""
+        return self.status.run
+
+    @property
+    def over(self) -> bool:
+        """Whether the run ended or was left, as far as is known."""
+        return self.status.over
+
+    def next(self, timeout: float) -> Sight | None:
+        """The newest frame that was not taken yet, waited for until `timeout`; `None` if there is none, or none yet.
+
+        Of frames that come faster than they are taken only the newest is kept. After a silence the run is asked:
+        `ConnectionFailedError` where its coordinator is gone, where the named worker is, or where it is another run.
+        """
+        if self._subscriber is None and monotonic() >= self._look_at:
+            self._follow()
+        sample = self._newest.take(timeout)
+        now = monotonic()
+        if sample is None:
+            if now - self._quiet_since > QUIET:
+                self._ask()
+            return None
+        sight = self._look(sample)
+        if sight is not None:
+            self._quiet_since = now
+        elif now - self._quiet_since > QUIET:  # what comes is of another run, or nobody's
+            self._ask()
+        return sight
+
+    def _look(self, sample: zenoh.Sample) -> Sight | None:
+        frame = self.dropped.decode(ViewFrame, sample.payload.to_bytes())
+        if frame is None:
+            return None
+        if frame.run_uid != self.status.run_uid:
+            self.dropped.dropped["foreign run"] += 1
+            return None
+        try:
+            return Sight.of(keys.worker_of(str(sample.key_expr)), frame)
+        except MalformedError as error:
+            self.dropped.dropped[error.args[0]] += 1
+            return None
+
+    def _ask(self) -> None:
+        """After a silence: is the run still the same, and is the worker still there."""
+        self._quiet_since = monotonic()
+        status = self._client.status(self.run)
+        if status.run_uid != self.status.run_uid:
+            raise ConnectionFailedError(f"run {self.run} is another run now; watch it by the same command")
+        self.status = status
+        if not self.over and self._followed not in {each.worker for each in self._present()}:
+            self._leave()
+            if self._wanted is not None and self._choose() is None:
+                raise ConnectionFailedError(
+                    f"worker {self._wanted} has left run {self.run}: name another with --worker, or none for any"
+                )
+
+    def _follow(self) -> None:
+        """Subscribe to a worker, if there is one."""
+        self._look_at = monotonic() + LOOK
+        chosen = self._choose()
+        if chosen is None:
+            return
+        self._followed, self._quiet_since = chosen, monotonic()
+        take = zenoh.handlers.Callback(self._newest.put, indirect=False)
+        self._subscriber = self._client.session.declare_subscriber(keys.view(self.run, chosen), take)
+
+    def _leave(self) -> None:
+        if self._subscriber is not None:
+            self._subscriber.undeclare()
+            self._subscriber, self._followed = None, ""
+
+    def _choose(self) -> str | None:
+        """The wanted worker, or the busiest."""
+        name = self._wanted
+        found = [each for each in self._present() if name is None or name in (each.worker, each.worker.split("/")[0])]
+        return max(found, key=lambda each: each.leases).worker if found else None
+
+    def _present(self) -> list[WorkerStatus]:
+        known = self._client.workers(self.run)
+        return [each for each in known if each.state == PRESENT and keys.is_worker(each.worker)]
+
+
+class _Newest:
+    """One place: what is put replaces what was not taken."""
+
+    def __init__(self) -> None:
+        self._kept: deque[zenoh.Sample] = deque(maxlen=1)
+        self._there = threading.Event()
+
+    def put(self, sample: zenoh.Sample) -> None:
+        self._kept.append(sample)
+        self._there.set()
+
+    def take(self, timeout: float) -> zenoh.Sample | None:
+        self._there.wait(timeout)
+        self._there.clear()
+        return self._kept.popleft() if self._kept else None
+
+
+def _floats(data: bytes) -> Floats | None:
+    if not data:
+        return None
+    if len(data) % 4:
+        raise MalformedError("wrong length")
+    found = np.frombuffer(data, "<f4").astype(np.float32)
+    if not np.isfinite(found).all():
+        raise MalformedError("not finite")
+    return found
