@@ -72,51 +72,26 @@ class Moment:
     mind: Mind | None = None
 
 
-class Canvas:
-    """Lays a moment out as one frame."""
+class Board:
+    """A surface on which pictures, words and bars of actions are laid out."""
 
-    def __init__(self, seed: int, layout: Layout = AWAKE, actions: tuple[str, ...] = ()) -> None:
+    def __init__(self, size: tuple[int, int], actions: tuple[str, ...] = ()) -> None:
         """`actions` names what the bars show."""
         pygame.font.init()
-        self._seed = seed
-        self._layout = layout
         self._actions = actions
         self._large = pygame.font.Font(None, 30)
         self._small = pygame.font.Font(None, 22)
-        self._surface = pygame.Surface(layout.size)
+        self._surface = pygame.Surface(size)
 
-    def draw(self, moment: Moment) -> Frame:
-        """The frame `(height, width, 3)`."""
-        height = self._layout.track[1]
-        self._surface.fill(BACKGROUND)
-        self._picture(moment.track, (MARGIN, MARGIN), self._layout.track, smooth=True)
-        if moment.mind is not None:
-            self._draw_mind(moment.mind)
-        self._text(f"score {moment.score:7.1f}", (12, height + 24), self._large, INK)
-        self._text(f"step {moment.step}   seed {self._seed}", (12, height + 52), self._small, FAINT)
-        self._draw_action(moment.action)
-        return pixels(self._surface)
-
-    def _draw_mind(self, mind: Mind) -> None:
-        column = [("what the model sees", mind.seen), ("what it decodes", mind.decoded)]
-        if mind.dreamt is not None:
-            column.append((f"dreaming since step {mind.dreamt.since}", mind.dreamt.picture))
-        for row, (label, picture) in enumerate(column):
-            left, top = self._layout.track[0] + 20, MARGIN + row * (LABEL + SIDE + GAP)
-            self._text(label, (left, top), self._small, FAINT)
-            self._picture(picture, (left, top + LABEL), (SIDE, SIDE))
-
-    def _draw_action(self, action: NDArray[Any]) -> None:
-        """Bars of continuous actions, as many as have room; a discrete one by its number."""
-        width, height = self._layout.track
+    def _draw_action(self, action: NDArray[Any], right: int, top: int) -> None:
+        """Bars of continuous actions, as many as have room left of `right`; a discrete one by its number."""
         if action.dtype.kind in "iu":
-            self._text(f"action {int(action[0])}", (width - BAR, height + 26), self._small, FAINT)
+            self._text(f"action {int(action[0])}", (right - 16 - BAR, top), self._small, FAINT)
             return
         shown = action[:MOST_BARS]
         names = self._actions or tuple(f"action {index}" for index in range(len(shown)))
         for index, (name, value) in enumerate(zip(names, shown, strict=False)):
-            corner = width + 16 - (len(shown) - index) * BAR, height + 26
-            self._bar(name, COLOURS[index], float(value), corner)
+            self._bar(name, COLOURS[index], float(value), (right - (len(shown) - index) * BAR, top))
 
     def _picture(self, picture: Frame, corner: Corner, size: tuple[int, int], *, smooth: bool = False) -> None:
         """The small pictures keep their pixels' edges; the track is a painting."""
@@ -137,6 +112,36 @@ class Canvas:
         start = box.left if pedal else box.centerx
         length = round(float(np.clip(value, -1, 1)) * (box.width if pedal else box.width / 2))
         pygame.draw.rect(self._surface, colour, (min(start, start + length), box.top, abs(length), box.height))
+
+
+class Canvas(Board):
+    """Lays a moment out as one frame."""
+
+    def __init__(self, seed: int, layout: Layout = AWAKE, actions: tuple[str, ...] = ()) -> None:
+        super().__init__(layout.size, actions)
+        self._seed = seed
+        self._layout = layout
+
+    def draw(self, moment: Moment) -> Frame:
+        """The frame `(height, width, 3)`."""
+        width, height = self._layout.track
+        self._surface.fill(BACKGROUND)
+        self._picture(moment.track, (MARGIN, MARGIN), self._layout.track, smooth=True)
+        if moment.mind is not None:
+            self._draw_mind(moment.mind)
+        self._text(f"score {moment.score:7.1f}", (12, height + 24), self._large, INK)
+        self._text(f"step {moment.step}   seed {self._seed}", (12, height + 52), self._small, FAINT)
+        self._draw_action(moment.action, width + 16, height + 26)
+        return pixels(self._surface)
+
+    def _draw_mind(self, mind: Mind) -> None:
+        column = [("what the model sees", mind.seen), ("what it decodes", mind.decoded)]
+        if mind.dreamt is not None:
+            column.append((f"dreaming since step {mind.dreamt.since}", mind.dreamt.picture))
+        for row, (label, picture) in enumerate(column):
+            left, top = self._layout.track[0] + 20, MARGIN + row * (LABEL + SIDE + GAP)
+            self._text(label, (left, top), self._small, FAINT)
+            self._picture(picture, (left, top + LABEL), (SIDE, SIDE))
 
 
 def pixels(surface: pygame.Surface) -> Frame:
