@@ -7,9 +7,9 @@ from pathlib import Path
 from dreamfleet.common.agent import TrainedAgent, is_agent
 from dreamfleet.common.bundle import Bundle, BundleStore, default_cache, find_bundle, pretrained
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.errors import BundleError, ControllerError, UsageError
+from dreamfleet.common.errors import BundleError, ControllerError, JournalError, UsageError
 from dreamfleet.common.files import is_file, is_there
-from dreamfleet.common.runs import BUNDLE, CONTROLLER, JOURNAL
+from dreamfleet.common.runs import BUNDLE, CONTROLLER, JOURNAL, open_run
 from dreamfleet.common.subspace import Subspace
 
 SUBSPACES = "subspaces"  # the folder of those that ship, each named as its world model
@@ -42,6 +42,19 @@ def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Pa
         )
     names = ", ".join(sorted(each.stem for each in pretrained().glob("*.npz"))) or "none"
     raise ControllerError(f"no controller {name!r}: give a file, a run, or one that ships: {names}")
+
+
+def find_mean(name: str, runs_dir: Path, generation: int) -> tuple[Controller, Path]:
+    """The evaluated mean of a run's generation, and the bundle beside it; `JournalError` names those that were."""
+    with open_run(runs_dir, name) as run:
+        evaluated = [each.generation for each in run.evaluations()]
+        if generation not in evaluated:
+            known = ", ".join(map(str, evaluated)) or "none yet"
+            raise JournalError(f"generation {generation} of run {name} was not evaluated; those that were: {known}")
+        spec, shape = run.spec, run.settings.controller
+        told = {"run_uid": run.uid, "generation": generation}
+        mean = Controller(shape, run.evaluated(generation), spec.task, spec.bundle, told, spec.options, spec.version)
+        return mean, run.bundle_path
 
 
 def bundle_for(controller: Controller | TrainedAgent, named: str | None, beside: Path | None = None) -> Bundle | None:

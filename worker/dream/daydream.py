@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,37 @@ class Daydream:
         )
         self._latent, self._state, self._over = dream.latent, dream.state, bool(dream.done[0] > 0.5)
         return dreamt
+
+
+class Onward:
+    """The dream that goes on from any moment of any controller's drive."""
+
+    def __init__(self, bundle: Bundle, temperature: float) -> None:
+        check_temperature(temperature)
+        self._step = DreamStep(bundle)
+        self._temperature = temperature
+
+    def fits(self, latent: Floats, state: Floats, parameters: Floats) -> bool:
+        """Whether these `(size,)` are of this world model and its controllers."""
+        sizes = self._step.latent_size, self._step.state_size, self._step.shape.size
+        return (len(latent), len(state), len(parameters)) == sizes
+
+    def dream(self, latent: Floats, state: Floats, parameters: Floats, seed: int) -> Iterator[Floats]:
+        """The latent `(1, latent)` after each step from there, until the model says that it is over.
+
+        All three `(size,)`; `state` is what was remembered before the action at `latent`.
+        """
+        noise = Noise(seed, self._step.chance)
+        latent, state, parameters = latent[None], state[None], parameters[None]
+        while True:
+            draw = noise.next()
+            dream = self._step.step(
+                latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask
+            )  # fmt: skip
+            latent, state = dream.latent, dream.state
+            if dream.done[0] > 0.5:
+                return
+            yield latent
 
 
 def can_dream(bundle: Bundle) -> bool:

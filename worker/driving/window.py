@@ -42,7 +42,7 @@ class Window:
         width = max(self._size[0], NARROWEST)
         self._left = (width - self._size[0]) // 2
         self._name = name
-        self._screen = _open((width, self._size[1] + BAR))
+        self._screen = open_display((width, self._size[1] + BAR), "drive where there is one, or through `ssh -X`")
         pygame.font.init()
         self._large, self._small = pygame.font.Font(None, 30), pygame.font.Font(None, 22)
         self._clock = pygame.time.Clock()
@@ -84,18 +84,21 @@ class Window:
         self._screen.blit(font.render(text, True, colour), (12, top))
 
 
-def _open(size: tuple[int, int]) -> pygame.Surface:
-    """The window's surface; one that nobody sees is none, unless `$SDL_VIDEODRIVER` asks for it."""
+def open_display(size: tuple[int, int], remedy: str) -> pygame.Surface:
+    """The window's surface; one that nobody sees is none, unless `$SDL_VIDEODRIVER` asks for it.
+
+    `NoDisplayError` with the `remedy` where no window can be opened.
+    """
     try:
         with _plain_display():
             pygame.display.init()
             driver = pygame.display.get_driver()
             if driver in INVISIBLE and os.environ.get("SDL_VIDEODRIVER") != driver:
                 pygame.display.quit()
-                raise NoDisplayError("no display: no screen answers; drive where there is one, or through `ssh -X`")
+                raise NoDisplayError(f"no display: no screen answers; {remedy}")
             return pygame.display.set_mode(size)
     except pygame.error as error:
-        raise NoDisplayError(f"no display: {error}; drive where there is a screen, or through `ssh -X`") from error
+        raise NoDisplayError(f"no display: {error}; {remedy}") from error
 
 
 @contextmanager

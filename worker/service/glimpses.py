@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from time import perf_counter
+from time import perf_counter, thread_time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,9 +44,11 @@ class Sampler:
     """An onlooker who samples the present while `wanted`, and tells what he sees."""
 
     def __init__(
-        self, tell: Callable[[Seen], object], wanted: Callable[[], bool], clock: Callable[[], float] = perf_counter
-    ) -> None:
-        self._tell, self._wanted, self._clock = tell, wanted, clock
+        self, tell: Callable[[Seen], object], wanted: Callable[[], bool], clock: Callable[[], float] = perf_counter,
+        spent: Callable[[], float] = thread_time,
+    ) -> None:  # fmt: skip
+        """`spent` are the processor's seconds: what others take of a busy host is no cost of showing."""
+        self._tell, self._wanted, self._clock, self._spent = tell, wanted, clock, spent
         self._turn, self._next = 0, 0.0
 
     def of(self, turn: int) -> Sampler:
@@ -60,10 +62,10 @@ class Sampler:
 
     def see(self, episode: int, look: Callable[[], Glimpse]) -> None:
         """Show a step; what goes wrong with it is nobody's failure."""
-        began = self._clock()
+        began, before = self._clock(), self._spent()
         with suppress(Exception):
             self._tell(_seen(self._turn, episode, look()))
-        self._next = began + max(INTERVAL, (self._clock() - began) / SHARE)
+        self._next = began + max(INTERVAL, (self._spent() - before) / SHARE)
 
 
 def _seen(turn: int, episode: int, glimpse: Glimpse) -> Seen:

@@ -180,7 +180,7 @@ class Clock:
 
 def test_showing_takes_no_more_than_a_hundredth_of_the_time_however_dear_a_picture_is():
     clock, told = Clock(), []
-    sampler = Sampler(told.append, lambda: True, clock)
+    sampler = Sampler(told.append, lambda: True, clock, clock)
 
     def look():
         clock.now += 0.05
@@ -196,7 +196,7 @@ def test_showing_takes_no_more_than_a_hundredth_of_the_time_however_dear_a_pictu
 
 def test_cheap_pictures_come_ten_a_second_and_none_where_nobody_wants_them_any_more():
     clock, told, wanted = Clock(), [], [True]
-    sampler = Sampler(told.append, lambda: wanted[0], clock)
+    sampler = Sampler(told.append, lambda: wanted[0], clock, clock)
     while clock.now < 10:
         if sampler.due():
             sampler.see(0, lambda: Glimpse(0, 0.0, ACTION))
