@@ -1,0 +1,163 @@
+"""Watching a live run: real coordinator, real workers, viewers that come, stay too long, and lie."""
+
+import json
+import signal
+import subprocess
+from contextlib import ExitStack
+
+import pytest
+
+from dreamfleet.common import keys
+from dreamfleet.common.client import Client
+from dreamfleet.common.codec import encode
+from dreamfleet.common.errors import ConnectionFailedError, UsageError
+from dreamfleet.common.live import LiveView
+from dreamfleet.common.messages import ViewFrame
+from dreamfleet.common.parts import read_parts
+from dreamfleet.common.processes import command
+from dreamfleet.common.runs import open_run
+from tests.support import tasks
+from tests.support.processes import DEADLINE, environment
+from tests.support.samples import MSGPACK
+
+pytestmark = pytest.mark.timeout(150)
+
+
+@pytest.fixture
+def settings(random_bundle):
+    return ("--bundle", random_bundle.path, "--population", 8, "--episodes", 1, "--evaluate-every", 0,
+            "--task", tasks.PAINTED)  # fmt: skip
+
+
+@pytest.fixture
+def run(processes, settings):
+    """A run with a worker of one slot; its coordinator."""
+    coordinator = processes.coordinator(*settings, "--generations", 1000)
+    processes.worker("--task", tasks.PAINTED, "--name", "first")
+    return coordinator
+
+
+def sights(view, count):
+    """So many, waited for."""
+    seen = []
+    while len(seen) < count:
+        if (sight := view.next(1.0)) is not None:
+            seen.append(sight)
+    return seen
+
+
+def test_a_view_follows_a_worker_and_another_where_that_one_is_killed(processes, run):
+    with Client((processes.endpoint,)) as client, LiveView(client) as view:
+        seen = sights(view, 5)
+        assert {each.worker.split("/")[0] for each in seen} == {"first"}
+        assert all((each.picture == each.frame.step).all() for each in seen)
+        second = processes.worker("--task", tasks.PAINTED, "--name", "second")
+        while len(client.workers("test")) < 2:
+            pass
+        with LiveView(client, "test", "second") as other:
+            assert sights(other, 2)[0].worker.startswith("second/"), "it has what the first one has not"
+            second.popen.kill()
+            with pytest.raises(ConnectionFailedError, match="worker second has left run test"):
+                sights(other, 1000)
+        assert sights(view, 1)[0].worker.startswith("first/")
+
+
+def test_a_view_of_any_worker_turns_to_one_that_is_there(processes, run):
+    with Client((processes.endpoint,)) as client, LiveView(client) as view:
+        sights(view, 1)
+        processes._started[1].popen.kill()
+        processes.worker("--task", tasks.PAINTED, "--name", "second")
+        while not sights(view, 1)[0].worker.startswith("second/"):
+            pass
+
+
+def test_who_is_not_there_is_named_and_a_coordinator_that_is_killed_is_missed(processes, run):
+    with Client((processes.endpoint,)) as client:
+        with pytest.raises(ConnectionFailedError, match="no coordinator of run 'other'"):
+            LiveView(client, "other")
+        with LiveView(client) as view:
+            worker = sights(view, 1)[0].worker
+            with pytest.raises(UsageError, match=f"no worker 'nobody': it has {worker}"):
+                LiveView(client, "test", "nobody")
+            run.popen.kill()
+            with pytest.raises(ConnectionFailedError, match="no coordinator of run 'test'"):
+                sights(view, 1000)
+
+
+def test_hostile_frames_are_dropped_and_counted(processes, run):
+    with Client((processes.endpoint,)) as client, LiveView(client) as view:
+        (sight,) = sights(view, 1)
+        own = {**vars(MSGPACK["view"]), "run_uid": sight.frame.run_uid, "incarnation": 1}
+        payloads = {
+            "oversize": bytes(60_000), "not msgpack": b"\xc1", "foreign run": encode(MSGPACK["view"]),
+            "wrong length": encode(ViewFrame(**{**own, "height": 200, "width": 200})),
+            "not deflated": encode(ViewFrame(**{**own, "packed": True})),
+            "not finite": encode(ViewFrame(**{**own, "latent": b"\0\0\xc0\x7f"})),
+        }  # fmt: skip
+        for reason, payload in payloads.items():
+            while not view.dropped.dropped[reason]:  # the worker's own frames come between
+                client.session.put(keys.view("test", sight.worker), payload)
+                view.next(0.05)
+        assert len(sights(view, 3)) == 3
+
+
+def test_fifty_views_one_of_which_never_looks_leave_the_run_as_it_is(processes, settings, tmp_path):
+    plain = processes.coordinator(*settings, "--generations", 1, "--seed", 3, name="plain")
+    processes.worker("--task", tasks.PAINTED, "--run", "plain")
+    assert plain.finish()[0] == 0
+    watched = processes.coordinator(*settings, "--generations", 1, "--seed", 3, name="watched")
+    with ExitStack() as stack:
+        clients = [stack.enter_context(Client((processes.endpoint,))) for _ in range(50)]
+        processes.worker("--task", tasks.PAINTED, "--run", "watched")
+        while not clients[0].workers("watched"):
+            pass
+        views = [stack.enter_context(LiveView(client, "watched")) for client in clients]
+        for view in views:
+            view.next(0.0)  # it subscribes
+        assert [len(sights(view, 2)) for view in views[1:]] == [2] * 49
+        assert watched.finish()[0] == 0
+    told = []
+    for name in ("plain", "watched"):
+        with open_run(processes.runs, name) as journal:
+            told.append([journal.fitness(0, number) for number in range(8)])
+            assert journal.result_count() == 8
+    assert told[0] == told[1]
+
+
+def test_the_verb_streams_to_whoever_reads_it_and_ends_with_him(processes, run):
+    words = command("live", "--connect", processes.endpoint, "--out", "-")
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment(processes.cache)
+    ) as live:
+        parts = read_parts(live.stdout)
+        facts = [next(parts)[1] for _ in range(5)]
+        assert {each["run"] for each in facts} == {"test"}
+        assert facts[0]["worker"].startswith("first/")
+        live.stdout.close()
+        assert live.wait(DEADLINE) == 0
+        assert b"Traceback" not in live.stderr.read()
+
+
+def test_the_verb_writes_what_it_saw_when_it_is_told_to_end(processes, run, tmp_path):
+    live = processes.start("live", "--connect", processes.endpoint, "--out", tmp_path / "stills", "--json")
+    live.wait_for("watching run test")
+    while len(list((tmp_path / "stills").glob("*.png"))) < 3:
+        pass
+    live.popen.send_signal(signal.SIGINT)
+    code, out = live.finish()
+    assert code == 0
+    assert json.loads(out)["pictures"] >= 3
+
+
+def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
+    for flags, said in (
+        (("--controller", "tiny"), "write a file by --out"),
+        (("--controller", "tiny", "--run", "x", "--out", tmp_path / "a"), "give either --run"),
+        (("--generation", 3, "--out", tmp_path / "a"), "name it with --controller"),
+        (("--fps", 0), "--fps must be 1 to 50"),
+        (("--controller", "nothing", "--out", tmp_path / "a"), "no controller 'nothing'"),
+        (("--controller", "gone", "--generation", 3, "--out", tmp_path / "a"), "no run 'gone'"),
+        (("--connect", "tcp/127.0.0.1:9", "--out", tmp_path / "a"), "nobody answers"),
+    ):
+        code, _, err = processes.call("live", "--runs-dir", processes.runs, *flags)
+        assert (code != 0, said in err.splitlines()[-1], "Traceback" in err) == (True, True, False), err

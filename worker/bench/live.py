@@ -1,0 +1,140 @@
+"""What the live view costs: the loop that nobody watches against one that knows of none, and a watched slot's turn."""
+
+from __future__ import annotations
+
+import hashlib
+import queue
+import socket
+from contextlib import ExitStack
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from dreamfleet.common import keys
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.messages import Intervals, Job, TaskSpec
+from dreamfleet.common.session import Network, open_session
+from dreamfleet.worker.bench.blocks import Measured, alternate
+from dreamfleet.worker.scoring.episode import score
+from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.service.admission import Admission
+from dreamfleet.worker.service.glimpses import Seen
+from dreamfleet.worker.service.slot import Slot
+from dreamfleet.worker.service.turn import Work
+from dreamfleet.worker.service.viewing import Viewing
+from dreamfleet.worker.tasks.api import Assignment
+from dreamfleet.worker.tasks.registry import find_task
+
+RUN, WORKER = "bench", "bench/00000000"
+TASKS = {"car-racing": 1, "dream": 256}  # jobs of a turn
+HORIZON = 200  # steps of an episode: a turn lasts some tenths of a second, in which a few frames are shown
+SEED = 2**20
+ADMISSION = Admission(RUN, "0" * 32, 1, "bench", TaskSpec("car-racing", "", HORIZON, 0), Intervals())
+Figures = dict[str, Any]
+Floats = NDArray[np.float32]
+
+
+def bench_live(bundle: Bundle) -> Figures:
+    """For each task the time of a turn over that of the same turn without.
+
+    `unwatched`: a slot's scorer over the task's bare loop. `watched`: a real slot whose frames go through a router to a
+    subscriber, over the same slot while nobody subscribes; `frames_per_second` are those that arrived meanwhile.
+    """
+    figures: Figures = {}
+    for task, rows in TASKS.items():
+        spec = TaskSpec(task, bundle.sha256, HORIZON, 0, temperature=1.0 if task == "dream" else None)
+        vectors = np.random.default_rng(0).normal(0, 0.1, (rows, bundle.controller_shape.size)).astype(np.float32)
+        bare = alternate(_bare(spec, bundle, vectors))
+        with WatchedSlot(spec, bundle, vectors) as slot:
+            seconds = alternate({"unwatched": slot.score, "watched": slot.score_watched})
+        figures[task] = {
+            "unwatched": round(bare["scorer"] / bare["loop"], 4),
+            "watched": round(seconds["watched"] / seconds["unwatched"], 4),
+            "frames_per_second": round(slot.frames / slot.watched, 1),
+        }
+    return figures
+
+
+def _bare(spec: TaskSpec, bundle: Bundle, vectors: Floats) -> dict[str, Measured]:
+    """A turn by a slot's scorer, and by the loop alone, as it was before there was a live view."""
+    scorer, task, assignment = Scorer(spec, bundle), find_task(spec.task), Assignment(spec, bundle)
+    jobs = [("score", vector, SEED) for vector in vectors]
+
+    def whole() -> object:
+        return scorer.score_all(jobs, lambda _made: None)  # type: ignore[arg-type]
+
+    if len(vectors) > 1:
+        batch = task.make_batch(assignment)  # type: ignore[attr-defined]
+        episodes = [(vector, SEED) for vector in vectors]
+        return {"loop": lambda: batch.score(episodes, lambda _made: None), "scorer": whole}
+    environment, policy = task.make_environment(assignment), task.make_policy(assignment)
+    course = scorer.course("score", SEED)
+    return {"loop": lambda: score(environment, policy, vectors[0], course), "scorer": whole}
+
+
+class WatchedSlot:
+    """A slot as a worker has it, whose frames go through a router to one subscriber; use it in a `with`."""
+
+    def __init__(self, spec: TaskSpec, bundle: Bundle, vectors: Floats) -> None:
+        self.frames, self.watched = 0, 0.0  # that arrived, and the seconds of turns that were watched
+        self._spec, self._bundle = spec, bundle
+        self._work = [_work(spec, vector, number) for number, vector in enumerate(vectors)]
+        self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+
+    def __enter__(self) -> WatchedSlot:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+        with ExitStack() as stack:
+            sessions = []
+            for network in (Network(listen=(endpoint,)), Network(connect=(endpoint,)), Network(connect=(endpoint,))):
+                sessions.append(open_session(network))
+                stack.callback(sessions[-1].close)
+            _, worker, viewer = sessions
+            viewer.declare_subscriber(keys.view(RUN, WORKER), zenoh.handlers.Callback(self._count, indirect=False))
+            self._viewing = Viewing(worker, RUN, WORKER, lambda _status: None)
+            self._slot = Slot(0, self._spec, self._bundle.path, self._events, (self._spec.task,))
+            stack.callback(self._slot.stop)
+            while not self._slot.ready:
+                self._slot.handle(self._events.get()[1])
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._stack.close()
+
+    def score(self) -> None:
+        """One turn while nobody subscribes."""
+        self._slot.show(False)
+        self._turn()
+
+    def score_watched(self) -> None:
+        """One turn while somebody does."""
+        self._slot.show(True)
+        began = perf_counter()
+        self._turn()
+        self.watched += perf_counter() - began
+
+    def _turn(self) -> None:
+        self._slot.submit(self._work)
+        while True:
+            event = self._events.get()[1]
+            if isinstance(event.word, Seen):
+                work = self._slot.work_of(event.life, event.word)
+                assert work is not None  # the only turn's
+                self._viewing.show(ADMISSION, 0, work, event.word)
+            elif self._slot.handle(event):
+                return
+
+    def _count(self, _sample: object) -> None:
+        self.frames += 1
+
+
+def _work(spec: TaskSpec, vector: Floats, number: int) -> Work:
+    data = vector.astype("<f4").tobytes()
+    digest = spec.digest("score", hashlib.sha256(data).digest(), (SEED,))
+    job = Job("score", spec.task, 0, number, 0, (SEED,), hashlib.sha256(data).digest(), digest, 0.0)
+    return job, data
