@@ -22,7 +22,7 @@ STRIP = EDGE + LABEL + BIG + 10  # where the dream's row begins
 FOOT = STRIP + LABEL + SMALL + 16  # where the words begin
 WHOLE = SIZE[0] - 2 * EDGE, FOOT - EDGE - LABEL - 10  # the room of a picture alone
 AHEAD = (10, 25, 50, 100)  # steps on: by two seconds a dream has left the track that is driven
-NAME = 32  # characters of a name that have room
+NAME = 28  # characters of a name that have room
 Corner = tuple[int, int]
 
 

@@ -21,7 +21,7 @@ from dreamfleet.worker.tools.glass import Shown
 if TYPE_CHECKING:  # of the extra `views`
     from dreamfleet.worker.tools.video import Video
 
-VIDEOS = (".mp4", ".gif")
+VIDEO = ".mp4"
 
 
 Show = Callable[[Shown | None], bool]
@@ -34,14 +34,14 @@ def outlet(out: str, rate: int, stdout: BinaryIO) -> Iterator[Show]:
     path = Path(out)
     if out == "-":
         yield lambda shown: shown is None or _stream(stdout, shown)
-    elif path.suffix in VIDEOS:
+    elif path.suffix == VIDEO:
         from dreamfleet.worker.tools.video import Video
 
         check_out(path)
         with Video(path, rate) as video:
             yield lambda shown: shown is None or _frame(video, shown)
     elif path.suffix or path.is_file():
-        raise UsageError(f"--out {out}: name an .mp4, a .gif, a folder for pictures, or - for a stream of them")
+        raise UsageError(f"--out {out}: name an .mp4, a folder for pictures, or - for a stream of them")
     else:
         with told(path):
             path.mkdir(parents=True, exist_ok=True)

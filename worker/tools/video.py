@@ -14,7 +14,7 @@ from dreamfleet.common.errors import DatasetError
 
 
 class Video:
-    """An mp4, or a gif, that grows picture by picture; use it in a `with`. What came until an end can be played."""
+    """An mp4 that grows picture by picture; use it in a `with`. What came until an end can be played."""
 
     def __init__(self, out: Path, frames_per_second: int) -> None:
         self._out, self._rate = out, frames_per_second
@@ -40,10 +40,9 @@ class Video:
         self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
 
     def _open_stream(self, width: int, height: int) -> Any:
-        gif = self._out.suffix == ".gif"
-        stream = self._container.add_stream("gif" if gif else "libx264", rate=self._rate)
+        stream = self._container.add_stream("libx264", rate=self._rate)
         stream.width, stream.height = width, height
-        stream.pix_fmt = "rgb8" if gif else "yuv420p"
+        stream.pix_fmt = "yuv420p"
         stream.time_base = Fraction(1, self._rate)
-        stream.options = {} if gif else {"crf": "23", "preset": "veryfast"}
+        stream.options = {"crf": "23", "preset": "veryfast"}
         return stream

@@ -47,7 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed", type=int, default=TEST.start, help=f"of --best and --controller: first track (default {TEST.start})"
     )
-    parser.add_argument("--out", help="no window: an .mp4, a .gif, a folder for PNGs, or - for a stream of JPEGs")
+    parser.add_argument("--out", help="no window: an .mp4, a folder for PNGs, or - for a stream of JPEGs")
     parser.add_argument("--bundle", help="of --controller: the world model (default: the one that it names)")
     parser.add_argument("--temperature", type=float, default=1.0, help="of the dream (default 1.0)")
     offer(parser, "runs_dir")

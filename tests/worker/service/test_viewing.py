@@ -4,15 +4,18 @@ import multiprocessing
 import queue
 from time import monotonic
 
+import numpy as np
 import pytest
 import zenoh
 
 from dreamfleet.common import keys
 from dreamfleet.common.codec import decode
-from dreamfleet.common.messages import Intervals, ViewFrame
+from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.messages import Intervals, TaskSpec, ViewFrame
 from dreamfleet.common.pictures import picture_of
 from dreamfleet.common.session import Network, open_session
 from dreamfleet.worker.service.glimpses import INTERVAL, SHARE, Sampler
+from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.tasks.api import Glimpse
 from tests.support import tasks
 from tests.support.hand import DEADLINE, tag
@@ -169,6 +172,30 @@ def test_a_child_that_nobody_watches_says_nothing_but_its_result(slot):
     slot.slot.show(False)
     assert shown_by(slot) == ([], fitness)
     assert same == fitness
+
+
+@pytest.mark.parametrize("task", ["car-racing", "dream", "gym:CartPole-v1"])
+def test_a_real_slot_gives_the_same_bits_watched_and_not(random_bundle, task):
+    events, announced = queue.SimpleQueue(), ("car-racing", "dream", "gym")
+    sha256, path = ("", None) if task.startswith("gym") else (random_bundle.sha256, random_bundle.path)
+    shape = ControllerShape(4, 2) if path is None else random_bundle.controller_shape
+    spec = TaskSpec(task, sha256, 60, 0, controller=None if path else shape)
+    vector = np.random.default_rng(0).normal(0, 0.1, shape.size).astype("<f4").tobytes()
+    slot = Slot(0, spec, path, events, announced)
+    told, frames = [], 0
+    while not slot.ready:
+        slot.handle(events.get(timeout=DEADLINE)[1])
+    for shown in (False, True, False):
+        slot.show(shown)
+        slot.submit([(job(row, spec=spec), vector) for row in range(3 if task == "dream" else 1)])
+        while not (results := slot.handle(event := events.get(timeout=DEADLINE)[1])):
+            assert shown
+            frames += slot.work_of(event.life, event.word) is not None
+        told.append([(each.fitness, each.steps, each.error) for each in results])
+    slot.stop()
+    assert told[0] == told[1] == told[2]
+    assert told[0][0][2] is None
+    assert frames >= 1
 
 
 class Clock:

@@ -122,13 +122,12 @@ def test_stills_lie_in_a_folder_beside_what_they_show(tmp_path):
     assert json.loads((tmp_path / "new" / "stills" / "000001.json").read_text()) == {"step": 200}
 
 
-@pytest.mark.parametrize(("name", "codec"), [("live.mp4", "h264"), ("live.gif", "gif")])
-def test_a_video_has_every_picture(tmp_path, name, codec):
-    with outlet(str(tmp_path / name), 10, io.BytesIO()) as show:
+def test_a_video_has_every_picture(tmp_path):
+    with outlet(str(tmp_path / "live.mp4"), 10, io.BytesIO()) as show:
         assert all(show(each) for each in PICTURES)
-    with av.open(str(tmp_path / name)) as container:
+    with av.open(str(tmp_path / "live.mp4")) as container:
         stream = container.streams.video[0]
-        assert (stream.codec_context.name, stream.width, stream.height) == (codec, 60, 40)
+        assert (stream.codec_context.name, stream.width, stream.height) == ("h264", 60, 40)
         assert len(list(container.decode(stream))) == 3
 
 
