@@ -7,9 +7,11 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections import deque
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from time import monotonic
 from types import TracebackType
@@ -25,7 +27,8 @@ from dreamfleet.common.codec import Inbox, MalformedError
 from dreamfleet.common.errors import ConnectionFailedError, UsageError
 from dreamfleet.common.messages import ViewFrame
 from dreamfleet.common.pictures import picture_of
-from dreamfleet.common.status import WorkerStatus
+from dreamfleet.common.session import enqueue_into
+from dreamfleet.common.status import WorkerStatus, read_document, read_status
 
 LOOK = 1.0  # seconds between looks for a worker, where there is none
 QUIET = 2.0  # seconds without a frame after which the run is asked whether the worker is still there
@@ -66,6 +69,7 @@ class LiveView:
         self.dropped = Inbox()
         self._client, self._wanted = client, worker
         self._newest = _Newest()
+        self._farewells: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._subscriber: Any = None
         self._followed = ""
         self._quiet_since = self._look_at = monotonic()
@@ -74,11 +78,14 @@ class LiveView:
             raise UsageError(f"run {self.run} has no worker {worker!r}: it has {known}")
 
     def __enter__(self) -> LiveView:
+        heard = enqueue_into(self._farewells, "status", most=1)
+        self._leaving: Any = self._client.session.declare_subscriber(keys.event_status(self.run), heard)
         return self
 
     def __exit__(
         self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
     ) -> None:
+        self._leaving.undeclare()
         self._leave()
 
     def __iter__(self) -> Iterator[Sight]:
@@ -108,7 +115,8 @@ class LiveView:
         sample = self._newest.take(timeout)
         now = monotonic()
         if sample is None:
-            if now - self._quiet_since > QUIET:
+            self._hear_farewell()
+            if not self.over and now - self._quiet_since > QUIET:
                 self._ask()
             return None
         sight = self._look(sample)
@@ -130,6 +138,12 @@ class LiveView:
         except MalformedError as error:
             self.dropped.dropped[error.args[0]] += 1
             return None
+
+    def _hear_farewell(self) -> None:
+        """As the coordinator leaves it says how the run is; nobody answers for it afterwards."""
+        with suppress(queue.Empty):
+            _, sample = self._farewells.get_nowait()
+            self.status = read_status(read_document(sample.payload.to_bytes()))
 
     def _ask(self) -> None:
         """After a silence: is the run still the same, and is the worker still there."""

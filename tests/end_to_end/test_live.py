@@ -10,12 +10,13 @@ import pytest
 from dreamfleet.common import keys
 from dreamfleet.common.client import Client
 from dreamfleet.common.codec import encode
-from dreamfleet.common.errors import ConnectionFailedError, UsageError
+from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
 from dreamfleet.common.live import LiveView
 from dreamfleet.common.messages import ViewFrame
 from dreamfleet.common.parts import read_parts
 from dreamfleet.common.processes import command
 from dreamfleet.common.runs import open_run
+from dreamfleet.common.shelf import find_mean
 from tests.support import tasks
 from tests.support.processes import DEADLINE, environment
 from tests.support.samples import MSGPACK
@@ -115,6 +116,9 @@ def test_fifty_views_one_of_which_never_looks_leave_the_run_as_it_is(processes, 
         for view in views:
             view.next(0.0)  # it subscribes
         assert [len(sights(view, 2)) for view in views[1:]] == [2] * 49
+        while not views[1].over:
+            views[1].next(0.1)
+        assert (views[1].status.state, views[1].status.why) == ("ended", "1 generations")
         assert watched.finish()[0] == 0
     told = []
     for name in ("plain", "watched"):
@@ -149,6 +153,17 @@ def test_the_verb_writes_what_it_saw_when_it_is_told_to_end(processes, run, tmp_
     assert json.loads(out)["pictures"] >= 3
 
 
+def test_the_verb_ends_with_the_run_and_says_how_that_ended(processes, settings, tmp_path):
+    coordinator = processes.coordinator(*settings, "--generations", 1)
+    live = processes.start("live", "--connect", processes.endpoint, "--out", tmp_path / "live.mp4")
+    live.wait_for("watching run test")
+    processes.worker("--task", tasks.PAINTED)
+    assert coordinator.finish()[0] == 0
+    live.wait_for("run test ended: 1 generations")
+    code, out = live.finish()
+    assert (code, (tmp_path / "live.mp4").stat().st_size > 1000) == (0, True), out
+
+
 def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
     for flags, said in (
         (("--controller", "tiny"), "write a file by --out"),
@@ -161,3 +176,23 @@ def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
     ):
         code, _, err = processes.call("live", "--runs-dir", processes.runs, *flags)
         assert (code != 0, said in err.splitlines()[-1], "Traceback" in err) == (True, True, False), err
+
+
+def test_an_old_generations_mean_is_found_in_the_journal_and_one_that_was_not_evaluated_is_named(
+    processes, random_bundle
+):
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--task", tasks.TOY, "--generations", 3,
+        "--evaluate-every", 2, "--evaluation-episodes", 2, "--confirm-episodes", 0,
+    )  # fmt: skip
+    processes.worker("--task", tasks.TOY)
+    assert coordinator.finish()[0] == 0
+    with open_run(processes.runs, "test") as run:
+        (evaluated, *_) = (each.generation for each in run.evaluations())
+        mean, beside = find_mean("test", processes.runs, evaluated)
+        assert (mean.parameters == run.evaluated(evaluated)).all()
+        assert (mean.bundle, beside) == (random_bundle.sha256, run.bundle_path)
+    with pytest.raises(
+        JournalError, match=f"generation 77 of run test was not evaluated; those that were: {evaluated}"
+    ):
+        find_mean("test", processes.runs, 77)

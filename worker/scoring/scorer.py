@@ -115,8 +115,10 @@ class Scorer:
         return self._batch_for(spec)
 
     def close(self) -> None:
-        """Release the environment."""
+        """Release the environments."""
         self._environment.close()
+        if (shown := self.__dict__.get("_shown")) is not None:  # nobody may have looked on
+            shown.close()
 
     def _drive(
         self, episode: int, parameters: NDArray[np.float32], course: Course, on_step: Callable[[int], None],
@@ -127,7 +129,8 @@ class Scorer:
             return score(self._environment, self._policy, parameters, course, on_step, rollout)
         shown = self._shown
         policy = WatchedPolicy(self._policy, self.onlooker, episode, None if shown is None else shown.render)
-        return score(shown or self._environment, policy, parameters, course, on_step, rollout)
+        environment = self._environment if shown is None else shown
+        return score(environment, policy, parameters, course, on_step, rollout)
 
     @cached_property
     def _shown(self) -> gymnasium.Env[Any, Any] | None:

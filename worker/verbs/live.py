@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.printable import one_line
 from dreamfleet.common.seeds import TEST
 from dreamfleet.common.site import offer
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 SUMMARY = "watch what a worker scores, the best mean, or a controller: its drive, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")  # a window needs only the first
 FASTEST = 50  # pictures a second
+LONGEST = 20  # seconds of pictures in files, unless told otherwise
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +44,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--fps", type=int, default=10, help="pictures a second (default 10)")
     parser.add_argument(
-        "--seconds", type=float, help="end after so many seconds of pictures (default: when you close it)"
+        "--seconds",
+        type=float,
+        help=f"end after so many seconds of pictures (default: {LONGEST} in files, else when you close it)",
     )
     parser.add_argument(
         "--seed", type=int, default=TEST.start, help=f"of --best and --controller: first track (default {TEST.start})"
@@ -66,14 +70,15 @@ def run(args: argparse.Namespace) -> int:
         show = stack.enter_context(_outlet(args))  # what cannot be shown is said before anything is asked
         pictures = stack.enter_context(_pictures(args))
         stop = stack.enter_context(heeding_signals())
-        most = None if args.seconds is None else max(1, round(args.seconds * args.fps))
+        seconds = LONGEST if args.seconds is None and _in_files(args) else args.seconds
+        most = None if seconds is None else max(1, round(seconds * args.fps))
         made = 0
         for shown in pictures:
             wanted = show(shown)
             made += shown is not None
             if not wanted or stop() or made == most:
                 break
-    if args.out not in (None, "-"):
+    if _in_files(args):
         answer(args, f"{args.out}: {made} pictures", out=args.out, pictures=made)
     return 0
 
@@ -85,6 +90,11 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("give either --run, to watch a live run, or --controller, which needs none")
     if args.generation is not None and not args.controller:
         raise UsageError("--generation is of a run on this disk: name it with --controller")
+
+
+def _in_files(args: argparse.Namespace) -> bool:
+    """Whether nobody looks while it runs."""
+    return args.out not in (None, "-")
 
 
 def _outlet(args: argparse.Namespace) -> AbstractContextManager[Show]:
@@ -140,6 +150,8 @@ def _watched(args: argparse.Namespace, client: Client) -> Iterator[Iterator[Show
             glass = Glass(view.run, _action_names(spec, fitting), Imagination(fitting, args.temperature))
         print(f"watching run {view.run}; its workers: {view.status.workers.present}", file=sys.stderr)
         yield watched(view, glass, args.fps)
+        if view.over:
+            print(f"run {view.run} {view.status.state}: {one_line(view.status.why)}", file=sys.stderr)
 
 
 def _action_names(spec: TaskSpec, bundle: Bundle) -> tuple[str, ...]:
@@ -157,7 +169,7 @@ def _drives(args: argparse.Namespace, driver: Callable[[], Driver]) -> Iterator[
     from dreamfleet.worker.tools.live import driven, paced
 
     pictures = driven(driver, DaydreamConfig(args.temperature), args.fps, args.seed)
-    return paced(pictures, args.fps) if args.out in (None, "-") else pictures
+    return pictures if _in_files(args) else paced(pictures, args.fps)
 
 
 def _best(client: Client, run: str) -> Driver:
