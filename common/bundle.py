@@ -11,7 +11,6 @@ import io
 import json
 import os
 import re
-import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -28,6 +27,7 @@ from dreamfleet.common.controller import Controller, ControllerShape
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.fields import OPTIONAL, written
 from dreamfleet.common.files import is_there, open_growing, open_regular, read_regular, write_aside
+from dreamfleet.common.lean import SUFFIX, Lean, put_together, read_lean, write_lean, write_stored
 from dreamfleet.common.messages import Between, Word
 from dreamfleet.common.tensors import UnfitError, check_fit, is_empty, read_array, weights_finite
 from dreamfleet.common.variants import PLAIN, WORLD, Variant
@@ -40,7 +40,6 @@ RECORDED = "recorded_states.npy"  # where recorded drives were: only in bundles 
 LINEAR, LAYERED = "controller-linear.onnx", "controller-hidden.onnx"  # controllers of any size, a row each
 WEIGHTS = "weights.safetensors"  # only in bundles that training goes on from
 REQUIRED = (ENCODER, DECODER, POLICY, INITIAL)
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 MAX_BUNDLE = 256 << 20  # bytes, of the file and of all that it holds: the largest known is 16 MB
 _LIMITS = Limits(MAX_BUNDLE)
 _MAX_MANIFEST = 1_000_000
@@ -200,10 +199,15 @@ def write_bundle(path: Path, manifest: Manifest, parts: Mapping[str, bytes]) -> 
     text = json.dumps({**written(manifest), "parts": hashes}, indent=1, sort_keys=True)
     if len(text) > _MAX_MANIFEST:
         raise BundleError(f"the manifest of {path} would have {len(text)} bytes, and {_MAX_MANIFEST} are read")
-    with write_aside(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in [(MANIFEST, text.encode()), *sorted(parts.items())]:
-            archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+    with write_aside(path) as file:
+        write_stored(file, [(MANIFEST, text.encode()), *sorted(parts.items())])
     return Bundle.open(path)
+
+
+def ship_lean(bundle: Bundle, base: str, path: Path) -> None:
+    """Write the bundle as one that ships beside the one of the name `base`, without the parts that it has in common."""
+    lean = Lean(bundle.sha256, base, (MANIFEST, *sorted(bundle.manifest.parts)))
+    write_lean(path, lean, bundle.path, shipped_bundles()[base], _LIMITS)
 
 
 class BundleStore:
@@ -214,16 +218,38 @@ class BundleStore:
 
     def find(self, sha256: str) -> Bundle | None:
         """The verified bundle of this hash; a damaged cached copy is removed, so that it is fetched again."""
-        cached = self._path(sha256)
-        for path in (cached, *shipped_bundles().values()):
-            if (data := _bytes_of(path)) is None:
-                continue
-            if hashlib.sha256(data).hexdigest() == sha256:
+        if (cached := self._cached(sha256)) is not None:
+            return cached
+        for path in shipped_bundles().values():
+            if (data := _bytes_of(path)) is not None and hashlib.sha256(data).hexdigest() == sha256:
                 return Bundle._of(path, data, sha256)
-            if path == cached:  # looked at, and wrong; one that another process completes meanwhile must stay
-                with suppress(OSError):
-                    path.unlink(missing_ok=True)
+        return next((self.grow(path) for path, lean in _leans() if lean.sha256 == sha256), None)
+
+    def _cached(self, sha256: str) -> Bundle | None:
+        path = self._path(sha256)
+        if (data := _bytes_of(path)) is None:
+            return None
+        if hashlib.sha256(data).hexdigest() == sha256:
+            return Bundle._of(path, data, sha256)
+        with suppress(OSError):  # looked at, and wrong; one that another process completes meanwhile must stay
+            path.unlink(missing_ok=True)
         return None
+
+    def grow(self, path: Path) -> Bundle:
+        """The whole bundle of a lean file that ships; put together here once."""
+        lean = read_lean(path, _LIMITS)
+        base = shipped_bundles().get(lean.base)
+        if base is None:
+            raise BundleError(f"{path} needs the bundle {lean.base}, which does not ship: install dreamfleet again")
+        with self.downloading(lean.sha256) as partial:
+            if (found := self._cached(lean.sha256)) is not None:
+                return found
+            try:
+                with partial.open("wb") as file:
+                    put_together(path, base, file, _LIMITS)
+            except OSError as error:
+                raise self.unwritable(error) from error
+            return self.complete(lean.sha256)
 
     @contextmanager
     def downloading(self, sha256: str) -> Iterator[Path]:
@@ -292,8 +318,19 @@ def pretrained() -> Path:
 
 
 def shipped_bundles() -> dict[str, Path]:
-    """The bundles that ship, by name."""
+    """The bundles that ship whole, by name."""
     return {path.stem: path for path in sorted(pretrained().glob("*.zip"))}
+
+
+def _leans() -> Iterator[tuple[Path, Lean]]:
+    """The lean files that ship."""
+    for path in sorted(pretrained().glob(f"*{SUFFIX}")):
+        yield path, read_lean(path, _LIMITS)
+
+
+def shipped_names() -> tuple[str, ...]:
+    """The names of all bundles that ship."""
+    return (*shipped_bundles(), *(path.stem for path, _ in _leans()))
 
 
 def find_bundle(name: str) -> Bundle:
@@ -301,8 +338,11 @@ def find_bundle(name: str) -> Bundle:
     shipped = shipped_bundles()
     if name in shipped:
         return Bundle.open(shipped[name])
+    for path, _ in _leans():
+        if path.stem == name:
+            return BundleStore(default_cache()).grow(path)
     if not is_there(Path(name)):
-        raise BundleError(f"no bundle {name!r}: give a file, or one that ships: {', '.join(shipped) or 'none'}")
+        raise BundleError(f"no bundle {name!r}: give a file, or one that ships: {', '.join(shipped_names()) or 'none'}")
     return Bundle.open(Path(name))
 
 

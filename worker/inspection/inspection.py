@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from dreamfleet.common.bundle import Bundle, find_bundle, shipped_bundles
+from dreamfleet.common.bundle import Bundle, find_bundle, shipped_names
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, DatasetError, JournalError
 from dreamfleet.common.files import is_file
@@ -41,13 +41,13 @@ class Subject:
 @contextmanager
 def find_subject(name: str, runs_dir: Path) -> Iterator[Subject]:
     """A bundle by file or shipped name, else a run by name."""
-    if is_file(Path(name)) or name in shipped_bundles():
+    if is_file(Path(name)) or name in shipped_names():
         yield Subject(find_bundle(name))
         return
     try:
         run = open_run(runs_dir, name)
     except JournalError as error:
-        shipped = ", ".join(shipped_bundles()) or "none"
+        shipped = ", ".join(shipped_names()) or "none"
         raise BundleError(f"no bundle {name!r} (a file, or one that ships: {shipped}), and {error}") from error
     with run:
         if not run.spec.bundle:
