@@ -21,7 +21,7 @@ from dreamfleet.common.fields import known
 from dreamfleet.common.messages import ControlReply
 from dreamfleet.common.session import Network, enqueue_into, open_session
 from dreamfleet.common.status import OVER, Event, Population, Status, WorkerStatus, read_document, read_status
-from dreamfleet.common.stored import StoredGeneration
+from dreamfleet.common.stored import StoredEvaluation, StoredGeneration
 
 QUERY_TIMEOUT = 3.0
 PATIENCE = 1.0  # seconds without an answer after which a watched run counts as left
@@ -53,11 +53,15 @@ class Client:
 
     def runs(self) -> list[str]:
         """Names of the live runs."""
-        return sorted(str(document["run"]) for document in self._ask(keys.status("*")) if "run" in document)
+        return sorted(str(document["run"]) for document in self.statuses() if "run" in document)
 
     def status(self, run: str | None = None) -> Status:
         """How `run` is, or the only live run; `MalformedError` if its version is not understood."""
         return read_status(self.document(run))
+
+    def statuses(self, timeout: float = QUERY_TIMEOUT) -> list[dict[str, Any]]:
+        """How every live run is, as the wire has it, in no order: what answers within `timeout` seconds."""
+        return [read_document(payload) for payload in ask_all(self.session, [keys.status("*")], timeout)]
 
     def document(self, run: str | None = None, part: str = "", parameters: str = "") -> dict[str, Any]:
         """What answers for `run`, or for the only live run, as the wire has it; `part` is one of `status.PARTS`."""
@@ -124,6 +128,11 @@ class Client:
             raise MalformedError("the run's coordinator tells no story: install a newer dreamfleet there")
         return [from_plain(Event, known(Event, row)) for row in rows], int(document.get("total", len(rows)))
 
+    def evaluations(self, run: str) -> list[StoredEvaluation]:
+        """All finished evaluations of `run`, oldest first; a coordinator from before this part does not answer."""
+        rows = self.pages("evaluations", run)
+        return [from_plain(StoredEvaluation, known(StoredEvaluation, row)) for row in rows]
+
     def candidates(self, run: str, generation: int) -> list[Population]:
         """All candidates of the open generation of `run`, or of the one before it, in parts; the open one otherwise."""
         parts: list[Population] = []
@@ -149,9 +158,8 @@ class Client:
                 about = self._controller_part(run, len(data) // 4)
         raise ControllerError(f"the controller of run {run} changes faster than it can be fetched; ask again")
 
-    def pages(self, part: str, run: str) -> Iterator[dict[str, Any]]:
-        """All rows of a paged part as the wire has them: `workers` or `history`."""
-        offset = 0
+    def pages(self, part: str, run: str, offset: int = 0) -> Iterator[dict[str, Any]]:
+        """All rows from `offset` on of a paged part as the wire has them: `workers`, `history` or `evaluations`."""
         while True:
             document = self.document(run, part, f"offset={offset}")
             yield from document[part]

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 
 from dreamfleet.common.bounds import finite, saturated
-from dreamfleet.common.fields import OPTIONAL
+from dreamfleet.common.codec import MalformedError, from_plain
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.fields import OPTIONAL, known
 from dreamfleet.common.messages import Count
 from dreamfleet.common.tasks import DREAM
+
+START_EFFORT = "start_effort"  # the name of a run's fact
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,14 @@ class GenerationEffort:
     generation: int
     confirming: bool
     effort: Effort
+
+
+def start_effort(kept: str | None) -> Effort | None:
+    """What had been spent on a run's start, by the fact that is kept of it; `None` where that is not known."""
+    try:
+        return None if kept is None else from_plain(Effort, known(Effort, json.loads(kept)))
+    except (ValueError, MalformedError) as error:
+        raise JournalError(f"what the journal tells of the run's start is damaged: {error}; restore it") from error
 
 
 def counted(steps: int) -> str:

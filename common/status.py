@@ -1,7 +1,7 @@
 """How a run is, as one document: what a coordinator answers under `status`, and what every view reads.
 
 It is one consistent moment. What may be long comes as its head, with the total beside it, so that the answer stays
-under the message limit; the parts `workers`, `history` and `candidates` give the rest page by page.
+under the message limit; the parts `workers`, `history`, `evaluations` and `candidates` give the rest page by page.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dreamfleet.common.messages import MAX_MESSAGE, Count, Length, Seconds, Text
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 
 SCHEMA = 2
-PARTS = ("", "generation", "workers", "history", "candidates", "best", "story")
+PARTS = ("", "generation", "workers", "history", "evaluations", "candidates", "best", "story")
 OVER = ("ended", "left")  # the states in which a coordinator leaves
 Long = Annotated[str, Length(0, 10_000)]
 

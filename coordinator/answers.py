@@ -12,7 +12,7 @@ from dreamfleet.common.codec import encode_json
 from dreamfleet.common.fields import written
 from dreamfleet.common.messages import MAX_MESSAGE
 from dreamfleet.common.status import SCHEMA, Event, Population, WorkerStatus
-from dreamfleet.common.stored import StoredGeneration
+from dreamfleet.common.stored import StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.generation import Standing
 from dreamfleet.coordinator.status import Snapshot, status_of
 from dreamfleet.coordinator.story import Happening
@@ -24,7 +24,7 @@ PARAMETERS = 4_000  # parameters of a controller in one answer: 21 KB in base64
 
 
 T = TypeVar("T")
-Row = TypeVar("Row", WorkerStatus, StoredGeneration)
+Row = TypeVar("Row", WorkerStatus, StoredGeneration, StoredEvaluation)
 
 
 class Parameters(Protocol):
@@ -35,7 +35,7 @@ class Parameters(Protocol):
 
 
 def answer(snapshot: Snapshot, part: str, parameters: Parameters) -> bytes:
-    """The JSON of one part: `workers`, `history` and `candidates` by page, `best` with part of the parameters.
+    """The JSON of one part, a page of those that may be long, and of `best` part of the parameters.
 
     Of the `story` as many of the last events as one answer holds.
     """
@@ -46,6 +46,7 @@ def answer(snapshot: Snapshot, part: str, parameters: Parameters) -> bytes:
         "generation": lambda: _generation(snapshot),
         "workers": lambda: _workers(snapshot, offset, limit),
         "history": lambda: _history(snapshot, offset, limit),
+        "evaluations": lambda: _evaluations(snapshot, offset, limit),
         "candidates": lambda: _candidates(snapshot, parameters.get("generation"), offset, limit),
         "best": lambda: _best(snapshot, offset),
         "story": lambda: _story(snapshot, parameters.get("worker") or "", parameters.get("job") or ""),
@@ -89,6 +90,12 @@ def _workers(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
 def _history(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
     rows = _head(snapshot.history.part(offset, min(limit, PAGE)), PAGE_BYTES)
     return {"offset": offset, "total": len(snapshot.history), "history": [asdict(each) for each in rows]}
+
+
+def _evaluations(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
+    found = snapshot.evaluations
+    rows = _head(found[offset : offset + min(limit, PAGE)], PAGE_BYTES)
+    return {"offset": offset, "total": len(found), "evaluations": [asdict(each) for each in rows]}
 
 
 def _candidates(snapshot: Snapshot, generation: str | None, offset: int, limit: int) -> dict[str, Any]:

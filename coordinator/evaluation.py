@@ -42,21 +42,21 @@ class Evaluations:
     def __init__(self, finished: Iterable[StoredEvaluation] = ()) -> None:
         self.finished: dict[int, StoredEvaluation] = {}
         self._open: dict[int, OpenEvaluation] = {}
-        self._rows: list[StoredEvaluation] = []  # by generation
+        self.rows: tuple[StoredEvaluation, ...] = ()  # the finished ones by generation: never changed, but replaced
         self._bests: list[StoredEvaluation] = []  # the best of each row and those before it
         for each in finished:
             self.add(each)
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.rows)
 
     def add(self, each: StoredEvaluation) -> None:
         """Take a finished evaluation; they finish nearly in the order of their generations."""
-        place = bisect(self._rows, each.generation, key=lambda row: row.generation)
-        self._rows.insert(place, each)
+        place = bisect(self.rows, each.generation, key=lambda row: row.generation)
+        self.rows = (*self.rows[:place], each, *self.rows[place:])
         self.finished[each.generation] = each
         del self._bests[place:]
-        for row in self._rows[place:]:
+        for row in self.rows[place:]:
             best = self._bests[-1] if self._bests else row
             self._bests.append(row if row.mean > best.mean else best)
 
@@ -108,7 +108,7 @@ class Evaluations:
     @property
     def last(self) -> StoredEvaluation | None:
         """The finished one of the latest generation."""
-        return self._rows[-1] if self._rows else None
+        return self.rows[-1] if self.rows else None
 
     @property
     def best(self) -> StoredEvaluation | None:
@@ -120,7 +120,7 @@ class Evaluations:
 
         That is how a dream that is being exploited looks: fitness in the dream goes on rising, reality falls.
         """
-        if len(self._rows) <= count:
+        if len(self.rows) <= count:
             return False
         best = self._bests[-count - 1]
-        return all(each.behind(best) for each in self._rows[-count:])
+        return all(each.behind(best) for each in self.rows[-count:])

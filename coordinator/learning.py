@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.effort import Effort
+from dreamfleet.common.effort import START_EFFORT, Effort, start_effort
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.stored import StoredConfirmation, StoredEvaluation
 from dreamfleet.common.tasks import DREAM
-from dreamfleet.coordinator.start import EFFORT, effort_of, start_effort
+from dreamfleet.coordinator.start import effort_of
 
 CAR_RACING = "car-racing"
 
@@ -70,7 +70,7 @@ PAPER = (Mark(2.6e7, 823), Mark(1.0e8, 867), Mark(7.8e8, 895), Mark(1.7e9, 900.5
 
 def _points(run: RunFolder) -> Iterator[Point]:
     """Each evaluation, with all that was spent up to the generation whose mean it judged."""
-    spent = start_effort(run.fact(EFFORT)) or Effort()
+    spent = start_effort(run.fact(START_EFFORT)) or Effort()
     efforts = deque(each for each in run.efforts() if not each.confirming)
     for evaluation in run.evaluations():
         while efforts and efforts[0].generation <= evaluation.generation:

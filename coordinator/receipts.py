@@ -5,12 +5,13 @@ from __future__ import annotations
 import platform
 from functools import cache
 
+from dreamfleet.common.effort import START_EFFORT, start_effort
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.common.receipt import Receipt, StartReceipt, validation_uses
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.journal import Journal
 from dreamfleet.coordinator.kept import NETWORK, is_mixed
-from dreamfleet.coordinator.start import EFFORT, MEAN, SOURCE, SUBSPACE, start_effort
+from dreamfleet.coordinator.start import MEAN, SOURCE, SUBSPACE
 
 DECIDING = ("dreamfleet", "numpy", "cma", "cmaes")  # packages whose versions decide what is asked for
 
@@ -28,7 +29,7 @@ def _start(journal: Journal) -> StartReceipt | None:
     source, mean = journal.fact(SOURCE), journal.fact(MEAN)
     if source is None or mean is None:
         return None
-    return StartReceipt.of(source, mean, start_effort(journal.fact(EFFORT)))
+    return StartReceipt.of(source, mean, start_effort(journal.fact(START_EFFORT)))
 
 
 @cache

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.codec import MalformedError, from_plain
-from dreamfleet.common.effort import Effort
+from dreamfleet.common.effort import START_EFFORT, Effort, start_effort
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
-from dreamfleet.common.fields import known, written
+from dreamfleet.common.fields import written
 from dreamfleet.common.files import is_file, is_there
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.receipt import receipt_of
@@ -27,7 +26,7 @@ from dreamfleet.coordinator.checkpoint import Checkpoint
 from dreamfleet.coordinator.config import RunConfig
 from dreamfleet.coordinator.journal import Journal
 
-SOURCE, MEAN, EFFORT = "start", "start_mean", "start_effort"  # the facts' names
+SOURCE, MEAN = "start", "start_mean"  # the facts' names
 SUBSPACE = "subspace"
 
 
@@ -52,7 +51,7 @@ class Start:
     def facts(self) -> dict[str, str]:
         """What the journal keeps of it, whole: the file that it came from may be gone when the run is continued."""
         mean = base64.b64encode(self.mean.astype("<f8").tobytes()).decode()
-        spent = {} if self.effort is None else {EFFORT: json.dumps(written(self.effort))}
+        spent = {} if self.effort is None else {START_EFFORT: json.dumps(written(self.effort))}
         return {SOURCE: self.source, MEAN: mean, **spent}
 
     def check(self, settings: RunSettings) -> None:
@@ -114,15 +113,7 @@ def start_of(stored: RunFolder) -> Start:
 
 def effort_of(stored: RunFolder) -> Effort:
     """What a run took so far, and what had been spent on its start."""
-    return sum((each.effort for each in stored.efforts()), start_effort(stored.fact(EFFORT)) or Effort())
-
-
-def start_effort(kept: str | None) -> Effort | None:
-    """What had been spent on a run's start, by the fact that is kept of it; `None` where that is not known."""
-    try:
-        return None if kept is None else from_plain(Effort, known(Effort, json.loads(kept)))
-    except (ValueError, MalformedError) as error:
-        raise JournalError(f"what the journal tells of the run's start is damaged: {error}; restore it") from error
+    return sum((each.effort for each in stored.efforts()), start_effort(stored.fact(START_EFFORT)) or Effort())
 
 
 def latest(stored: RunFolder) -> tuple[NDArray[np.float64], float]:

@@ -24,6 +24,7 @@ from dreamfleet.common.status import (
     WorkerCount,
     WorkerStatus,
 )
+from dreamfleet.common.stored import StoredEvaluation
 from dreamfleet.coordinator.failure import Failure, shorten
 from dreamfleet.coordinator.generation import Standing
 from dreamfleet.coordinator.history import HistoryView
@@ -44,6 +45,7 @@ class Snapshot:
     status: Status
     workers: tuple[WorkerStatus, ...]
     history: HistoryView
+    evaluations: tuple[StoredEvaluation, ...]  # the finished ones
     standing: Standing
     last: Standing | None
     reported: Reported | None
@@ -56,7 +58,8 @@ def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float
     workers = tuple(_worker(member, now) for member in run.exchange.members)
     standing = run.generation.standing()
     status = replace(_status(run, name, standing, now), uptime=round(uptime, 1), dropped=dict(dropped))
-    return Snapshot(status, workers, run.history.view(), standing, run.last, run.slack.report.current,
+    evaluations = run.slack.evaluations.rows
+    return Snapshot(status, workers, run.history.view(), evaluations, standing, run.last, run.slack.report.current,
                     run.fleet.story.view(), now)  # fmt: skip
 
 

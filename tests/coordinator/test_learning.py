@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common import cli
-from dreamfleet.common.effort import Effort
+from dreamfleet.common.effort import START_EFFORT, Effort
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs import open_run
 from dreamfleet.coordinator.learning import PAPER, LearningCurve, Point
 from dreamfleet.coordinator.plot import PAPERS_NAME, plot_learning
-from dreamfleet.coordinator.start import EFFORT
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 FIRST, LAST = Effort(10**5, 10**4, 0, 10**9), Effort(2 * 10**5, 9 * 10**4, 0, 3 * 10**9)
@@ -57,7 +56,7 @@ def test_each_evaluation_stands_over_all_that_was_spent_up_to_it(runs, name, kin
 def test_what_was_spent_on_its_start_counts_for_a_run(runs):
     before = curve_of(runs, "reality")
     with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal, journal:
-        journal.execute("INSERT INTO run VALUES (?, ?)", (EFFORT, '{"driven": 1000, "dreamt": 7}'))
+        journal.execute("INSERT INTO run VALUES (?, ?)", (START_EFFORT, '{"driven": 1000, "dreamt": 7}'))
     after = curve_of(runs, "reality")
     assert after.points[0].effort == before.points[0].effort + Effort(1000, 0, 7)
     assert after.total == before.total + Effort(1000, 0, 7)

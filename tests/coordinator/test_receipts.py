@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.effort import Effort
+from dreamfleet.common.effort import START_EFFORT, Effort
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.messages import Result
 from dreamfleet.common.receipt import receipt_of, settings_in
@@ -17,7 +17,7 @@ from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.journal import Journal
 from dreamfleet.coordinator.kept import facts_of
 from dreamfleet.coordinator.repetition import Repetition
-from dreamfleet.coordinator.start import EFFORT, Start, find_start
+from dreamfleet.coordinator.start import Start, find_start
 from tests.coordinator.test_report import EVALUATED, Reporting
 
 
@@ -88,7 +88,7 @@ def test_a_start_is_in_it_whole_with_what_had_been_spent(make, tmp_path):
     assert found.total == start.effort + found.effort
     follower = find_start(str(bench.path / CONTROLLER), tmp_path)
     assert follower.effort == found.total
-    assert json.loads(follower.facts[EFFORT])["driven"] == found.total.driven
+    assert json.loads(follower.facts[START_EFFORT])["driven"] == found.total.driven
 
 
 def test_a_start_of_unknown_origin_has_no_effort(tmp_path, random_bundle):
@@ -96,7 +96,7 @@ def test_a_start_of_unknown_origin_has_no_effort(tmp_path, random_bundle):
     Controller(shape, np.zeros(shape.size, np.float32), "dream", random_bundle.sha256).save(tmp_path / "a.npz")
     start = find_start(str(tmp_path / "a.npz"), tmp_path)
     assert start.effort is None
-    assert EFFORT not in start.facts
+    assert START_EFFORT not in start.facts
 
 
 def test_what_ships_can_be_begun_again_as_it_was(tmp_path):

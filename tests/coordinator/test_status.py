@@ -10,7 +10,7 @@ import pytest
 from dreamfleet.common.codec import from_plain
 from dreamfleet.common.messages import MAX_MESSAGE, MAX_OPTIONS, Result
 from dreamfleet.common.status import PARTS, Population, WorkerStatus, read_document, read_status
-from dreamfleet.common.stored import StoredGeneration
+from dreamfleet.common.stored import StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator import answers
 from dreamfleet.coordinator.generation import Standing
 from dreamfleet.coordinator.history import History
@@ -75,6 +75,10 @@ def rows(count):
     return [dataclasses.replace(CLOSED, number=number, mean=-123.4567890123456 - number) for number in range(count)]
 
 
+def looks(count):
+    return tuple(StoredEvaluation(number, 16, 120.5 + number, 30.25) for number in range(count))
+
+
 def large(population, workers, generations, text="x"):
     """A snapshot of an unusual run."""
     standing = Standing(
@@ -92,7 +96,8 @@ def large(population, workers, generations, text="x"):
     story = Story()
     for number in range(3 * workers):
         story.add(number / 10, "accepted", fleet[number % workers].worker)
-    return Snapshot(status, fleet, History(rows(generations)).view(), standing, last, None, story.view(), 1e6)
+    told = History(rows(generations)).view(), looks(generations)
+    return Snapshot(status, fleet, *told, standing, last, None, story.view(), 1e6)
 
 
 @pytest.mark.parametrize(("population", "workers", "generations"), [(4, 1, 1), (100_000, 2000, 5000)])
@@ -127,6 +132,8 @@ def test_pages_together_are_everything_and_come_from_the_same_moment():
         each.worker for each in snapshot.workers
     ]
     assert [from_plain(StoredGeneration, each) for each in collected(snapshot, "history", "history")] == rows(250)
+    told = collected(snapshot, "evaluations", "evaluations")
+    assert tuple(from_plain(StoredEvaluation, each) for each in told) == looks(250)
     for standing in (snapshot.standing, snapshot.last):
         asked = {"generation": standing.generation}
         assert collected(snapshot, "candidates", "fitness", **asked) == standing.fitness
@@ -164,7 +171,7 @@ def touched(bench, generations):
         dataclasses.replace(STATUS.best, generation=number, mean=float(number % 7)) for number in range(generations)
     )
     bench.run.history._rows = Rows(bench.run.history._rows)
-    evaluations._rows, evaluations._bests = Rows(evaluations._rows), Rows(evaluations._bests)
+    evaluations.rows, evaluations._bests = Rows(evaluations.rows), Rows(evaluations._bests)
     bench.run.limits = dataclasses.replace(
         bench.run.limits, generations=10**6, steps=10**12, minutes=1e6, target=1e6, parted=3
     )
