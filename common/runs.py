@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import NoneType
@@ -146,6 +146,17 @@ class RunFolder:
         """Every closed generation, oldest first."""
         query = "SELECT number, mean, std, best, worst, sigma, steps, seconds FROM generation WHERE closed IS NOT NULL"
         return [_generation(*row) for row in self._typed(self._all(query + " ORDER BY number"), "iFFFFfiF")]
+
+    def quartiles(self, generations: Iterable[int]) -> dict[int, tuple[float, float]]:
+        """The lower and upper quartile of the candidates' fitness in each of these generations that is closed."""
+        query = "SELECT fitness FROM candidate WHERE generation = ? AND fitness IS NOT NULL"
+        found = {}
+        for number in generations:
+            rows = self._typed(self._all(query, number), "f")
+            if rows:
+                low, high = np.percentile([finite(fitness) for (fitness,) in rows], (25, 75))
+                found[number] = float(low), float(high)
+        return found
 
     def evaluations(self) -> list[StoredEvaluation]:
         """Every finished evaluation of a mean, oldest first."""

@@ -1,0 +1,1 @@
+"""A read-only web page about live runs, over Zenoh, and past ones, from their journals on this disk."""

@@ -1,0 +1,88 @@
+"""What is answered under which path. Only GET, and nothing that is answered changes anything."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp
+
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.printable import printable
+from dreamfleet.coordinator.dashboard import past
+from dreamfleet.coordinator.dashboard.config import DashboardConfig
+from dreamfleet.coordinator.dashboard.feed import Feed
+from dreamfleet.coordinator.dashboard.files import Files
+from dreamfleet.coordinator.dashboard.guard import Guard
+from dreamfleet.coordinator.dashboard.plain import written
+from dreamfleet.coordinator.dashboard.watching import event
+
+FOR_EVER = "private, max-age=31536000, immutable"
+
+
+def make_app(feed: Feed, runs_dir: Path, config: DashboardConfig) -> ASGIApp:
+    """The page, behind its guard; `ModuleNotFoundError` where a package of the extra is missing."""
+    answers = _Answers(feed, runs_dir, Files())
+    routes = [
+        Route("/", answers.index), Route("/files/{digest}/{name}", answers.file), Route("/live", answers.live),
+        Route("/runs", answers.runs), Route("/runs/{name}", answers.run),
+    ]  # fmt: skip
+    return Guard(Starlette(routes=routes), config.token, is_loopback=config.is_loopback)
+
+
+class _Answers:
+    """Those that are no `async def` run in a thread: they read disks."""
+
+    def __init__(self, feed: Feed, runs_dir: Path, files: Files) -> None:
+        self._feed = feed
+        self._runs_dir = runs_dir
+        self._files = files
+
+    def index(self, _request: Request) -> Response:
+        return HTMLResponse(self._files.index)
+
+    def file(self, request: Request) -> Response:
+        found = self._files.find(request.path_params["digest"], request.path_params["name"])
+        if found is None:
+            return PlainTextResponse("there is no such file; load the page anew\n", 404)
+        headers = {"cache-control": FOR_EVER, "vary": "accept-encoding"}
+        if "gzip" in request.headers.get("accept-encoding", ""):
+            return Response(found.packed, 200, {**headers, "content-encoding": "gzip"}, found.kind)
+        return Response(found.data, 200, headers, found.kind)
+
+    async def live(self, request: Request) -> Response:
+        if self._feed.is_full:
+            return PlainTextResponse("too many pages are open: close some\n", 503)
+        return StreamingResponse(self._events(request.query_params.get("run")), media_type="text/event-stream")
+
+    def runs(self, _request: Request) -> Response:
+        return _json({"runs": past.listed(self._runs_dir), "folder": printable(str(self._runs_dir))})
+
+    def run(self, request: Request) -> Response:
+        try:
+            return _json(past.one(self._runs_dir, request.path_params["name"]))
+        except DreamfleetError as error:
+            return _json({"error": printable(str(error))}, 404)
+
+    async def _events(self, run: str | None) -> AsyncIterator[bytes]:
+        """A frame for each picture, and the curves of its run whenever they are others."""
+        yield event("hello", {"digest": self._files.digest})
+        drawn = None
+        async for picture in self._feed.pictures():
+            shown = picture.of(run)
+            if shown is None:
+                yield picture.absent
+                continue
+            yield shown.frame
+            if shown.drawn != drawn:
+                drawn = shown.drawn
+                yield shown.curves
+
+
+def _json(document: Mapping[str, Any], status: int = 200) -> Response:
+    return Response(written(document), status, media_type="application/json")

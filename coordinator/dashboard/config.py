@@ -1,0 +1,46 @@
+"""Where the page is, and who may look at it."""
+
+from __future__ import annotations
+
+import ipaddress
+from dataclasses import dataclass, field
+
+from dreamfleet.common.config import option
+from dreamfleet.common.errors import UsageError
+
+LOCALHOST = "localhost"
+LEAST_TOKEN = 12  # characters: whoever can reach the port can guess
+
+
+@dataclass(frozen=True)
+class DashboardConfig:
+    """Its address, and a token."""
+
+    host: str = option("127.0.0.1", "listen here; on any other address than this computer's own a token is needed")
+    port: int = option(8420, "port; 0: any that is free")
+    token: str | None = field(
+        default=None, repr=False,
+        metadata={"help": "only who knows it may look; $DREAMFLEET_DASHBOARD_TOKEN stands in no list of processes"},
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65535:
+            raise UsageError(f"--port must be from 0 to 65535, not {self.port}")
+        if self.token is not None and len(self.token) < LEAST_TOKEN:
+            raise UsageError(f"--token must have at least {LEAST_TOKEN} characters: `openssl rand -hex 16` makes one")
+        if self.token is None and not self.is_loopback:
+            raise UsageError(
+                f"--host {self.host} shows the page to others: give a --token that they must know, or leave --host out"
+            )
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether this computer alone reaches the page."""
+        try:
+            return self.host == LOCALHOST or ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+    def address(self, port: int) -> str:
+        """Where a browser finds it."""
+        return f"http://{f'[{self.host}]' if ':' in self.host else self.host}:{port}/"

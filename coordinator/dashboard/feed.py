@@ -1,0 +1,91 @@
+"""One picture a second for everybody who looks, and none while nobody does."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable
+
+from dreamfleet.common.mishaps import Mishaps
+from dreamfleet.coordinator.dashboard.watching import Picture, Watcher
+
+REFRESH = 1.0  # seconds
+LINGER = 5.0  # seconds that it looks on after the last viewer has gone: perhaps the page is only loaded anew
+MOST_VIEWERS = 500
+log = logging.getLogger(__name__)
+
+
+class Feed:
+    """Looks in a thread of its own, one look at a time.
+
+    Viewers take the latest picture as fast as each can: who is slow misses some, and holds back nobody.
+    """
+
+    def __init__(self, watcher: Watcher, refresh: float = REFRESH, linger: float = LINGER) -> None:
+        self._watcher = watcher
+        self._refresh = refresh
+        self._linger = linger
+        self._mishaps = Mishaps(log)
+        self._viewers = 0
+        self._latest: Picture | None = None
+        self._changed = asyncio.Event()  # set, and replaced, as a picture becomes the latest
+        self._polling: asyncio.Task[None] | None = None
+        self._closed = False
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no room for another viewer."""
+        return self._viewers >= MOST_VIEWERS
+
+    @property
+    def is_looking(self) -> bool:
+        """Whether anybody is asked anything."""
+        return self._polling is not None
+
+    async def pictures(self) -> AsyncIterator[Picture]:
+        """The latest one, then each that is newer, until the feed is closed."""
+        self._viewers += 1
+        if self._polling is None:
+            self._polling = asyncio.create_task(self._poll())
+        seen = None
+        try:
+            while not self._closed:
+                changed = self._changed
+                if self._latest is not None and self._latest is not seen:
+                    seen = self._latest
+                    yield seen
+                else:
+                    await changed.wait()
+        finally:
+            self._viewers -= 1
+
+    def close(self) -> None:
+        """Let every viewer go."""
+        self._closed = True
+        self._tell()
+
+    async def _poll(self) -> None:
+        clock = asyncio.get_running_loop().time
+        left = clock() + self._linger  # when it stops, if nobody comes
+        try:
+            while not self._closed and clock() < left:
+                began = clock()
+                await self._look(self._watcher.look)
+                if self._viewers:
+                    left = clock() + self._linger
+                await asyncio.sleep(max(began + self._refresh - clock(), 0.0))
+        finally:
+            self._latest, self._polling = None, None
+        await asyncio.to_thread(self._watcher.rest)
+
+    async def _look(self, look: Callable[[], Picture]) -> None:
+        try:
+            self._latest = await asyncio.to_thread(look)
+        except Exception as error:  # a look that fails costs that look alone
+            self._mishaps.note("look", error, "at live runs")
+            return
+        self._tell()
+
+    def _tell(self) -> None:
+        self._changed.set()
+        self._changed = asyncio.Event()

@@ -1,0 +1,204 @@
+"""What the page shows of a live run, apart from its curves: one document a refresh, in words and columns. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dreamfleet.common.effort import counted
+from dreamfleet.common.eta import Eta, duration, eta_of, sentence
+from dreamfleet.common.printable import printable
+from dreamfleet.common.status import Population, Status, WorkerStatus
+from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+
+LIVE, LOST, OVER = "live", "lost", "over"
+NONE = "-"
+Facts = list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Look:
+    """A run as it was when it was last heard of."""
+
+    status: Status
+    workers: Sequence[WorkerStatus]
+    lanes: Sequence[str]  # of each worker, by `lanes.Lanes`
+    population: Sequence[Population]  # the open generation's candidates, in parts
+    heard: float  # seconds since 1970
+    lost: float | None = None  # since then nobody answers
+
+
+def frame(look: Look) -> dict[str, Any]:
+    """The document; texts of others are printable, and whoever shows them takes them for text."""
+    status = look.status
+    link = OVER if status.over else LIVE if look.lost is None else LOST
+    eta = eta_of(status)
+    return {
+        "run": status.run,
+        "uid": status.run_uid,
+        "link": link,
+        "state": {LOST: "coordinator lost", LIVE: status.state}.get(link, _over(status)),
+        "sentence": _lost(status) if link == LOST else printable(sentence(status)),
+        "lost": look.lost if link == LOST else None,
+        "heard": look.heard,
+        "eta": _eta(eta) if link == LIVE else None,
+        "task": printable(_task(status)),
+        "tiles": _tiles(status, eta),
+        "candidates": _candidates(look.population, status),
+        "evaluation": _progress(status),
+        "search": _search(status),
+        "waste": _waste(status),
+        "troubles": _troubles(status),
+        "fleet": _fleet(status),
+        "workers": _workers(look),
+    }
+
+
+def _over(status: Status) -> str:
+    return "finished" if status.state == "ended" else "left open"
+
+
+def _lost(status: Status) -> str:
+    return (
+        "nobody answers for it: its coordinator was killed, or the network is cut. The page goes on once it is back; "
+        f"after a kill: dreamfleet coordinator --resume {status.run}"
+    )
+
+
+def _eta(eta: Eta) -> dict[str, Any]:
+    bounds = [{"told": each.told, "share": round(each.share, 4)} for each in eta.bounds]
+    return {"told": eta.told, "bounds": bounds}
+
+
+def _task(status: Status) -> str:
+    settings, stage = status.settings, status.generation.stage
+    size = settings if stage is None else stage
+    horizon = settings.task.horizon if stage is None else stage.horizon
+    parts = [settings.task.task, f"{size.population} candidates x {size.episodes} episodes", f"{horizon:,} steps"]
+    if stage is not None:
+        parts.append(f"stage {stage.number} of {stage.total}")
+    return ", ".join(parts)
+
+
+def _tiles(status: Status, eta: Eta) -> list[dict[str, str]]:
+    """The few figures that stand large: name, value, and what stands small beneath."""
+    reported = status.confirmed or status.best
+    spent = status.throughput
+    pace = "" if eta.pace is None else f"{duration(eta.pace)} each"
+    last = status.last
+    return [
+        _tile("generation", f"{status.generation.number:,}", pace),
+        _tile("last generation", NONE if last is None else f"{last.mean:,.1f}", _beneath_last(last)),
+        _tile("reported", NONE if reported is None else score(reported), _beneath(reported)),
+        _tile("throughput", f"{counted(round(spent.steps_per_second))} steps/s",
+              f"{counted(spent.environment_steps)} steps in all"),
+        _tile("fleet", f"{status.workers.present} workers", f"{status.slots} slots"),
+    ]  # fmt: skip
+
+
+def _tile(name: str, value: str, beneath: str) -> dict[str, str]:
+    return {"name": name, "value": value, "beneath": beneath}
+
+
+def score(found: StoredEvaluation | StoredConfirmation) -> str:
+    """A mean with its standard error."""
+    return f"{found.mean:,.1f} ± {found.error:,.1f}"
+
+
+def _beneath_last(last: StoredGeneration | None) -> str:
+    return "none is closed yet" if last is None else f"mean; {last.worst:,.1f} to {last.best:,.1f}"
+
+
+def _beneath(reported: StoredEvaluation | StoredConfirmation | None) -> str:
+    if reported is None:
+        return "no evaluation yet"
+    kind = "confirmed" if isinstance(reported, StoredConfirmation) else "provisional"
+    return f"{kind}, generation {reported.generation}, {reported.episodes} episodes"
+
+
+def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
+    """Columns, a cell each: episodes done and wanted, fitness so far."""
+    return {
+        "generation": status.generation.number,
+        "total": max((each.total for each in parts), default=0),
+        "done": [done for each in parts for done in each.done],
+        "wanted": [wanted for each in parts for wanted in each.wanted],
+        "fitness": [None if value is None else float(f"{value:.5g}") for each in parts for value in each.fitness],
+    }
+
+
+def _progress(status: Status) -> list[dict[str, Any]]:
+    """What is driven beside the candidates."""
+    parts = {
+        "evaluation of the mean": status.evaluating, "confirmation": status.confirming,
+        "kept rollouts": status.collecting,
+    }  # fmt: skip
+    return [
+        {"name": name, "done": each.episodes_done, "wanted": each.episodes}
+        for name, each in parts.items()
+        if each.episodes > each.episodes_done
+    ]
+
+
+def _search(status: Status) -> Facts:
+    open_one, settings = status.generation, status.settings
+    facts = [("step size", f"{open_one.sigma:.4g}"), ("optimiser", optimiser(settings))]
+    if open_one.temperature is not None:
+        facts.append(("temperature", f"{open_one.temperature:g}"))
+    if status.last is not None:
+        facts.append(("spread of the last generation", f"{status.last.std:,.1f} (standard deviation)"))
+    return facts
+
+
+def optimiser(settings: RunSettings) -> str:
+    """In words, with its covariance matrix where it has that choice."""
+    return printable(f"CMA-ES, {settings.covariance}" if settings.optimiser == "cma" else settings.optimiser)
+
+
+def _waste(status: Status) -> Facts:
+    """What was done twice or for nothing."""
+    waste = status.waste
+    return [
+        ("share of steps", f"{waste.share:.1%}"), ("discarded steps", f"{waste.discarded_steps:,}"),
+        ("jobs issued again", f"{waste.reissued:,}"), ("recalled", f"{waste.recalled:,}"),
+        ("copied at a generation's end", f"{waste.copied:,}"), ("duplicate results", f"{waste.duplicate:,}"),
+        ("obsolete results", f"{waste.obsolete:,}"), ("errors", f"{waste.errors:,}"),
+        ("batches sent again", f"{waste.resent_batches:,}"), ("silences", f"{waste.silences:,}"),
+        *((f"dropped: {printable(why)}", f"{count:,}") for why, count in status.dropped.items() if count),
+    ]  # fmt: skip
+
+
+def _troubles(status: Status) -> list[str]:
+    """What somebody may want to do something about."""
+    found = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
+    for failure in status.failures:
+        for worker, error in failure.errors.items():
+            times = failure.attempts.get(worker, 1)
+            found.append(f"candidate {failure.candidate} failed on {worker} ({times}x): {error}")
+    return [printable(each) for each in found]
+
+
+def _fleet(status: Status) -> str:
+    counts = status.workers
+    gone = counts.known - counts.present
+    told = f"{counts.present} present, {status.slots} slots"
+    return f"{told}, {gone} gone" if gone else told
+
+
+def _workers(look: Look) -> dict[str, list[Any]]:
+    """Columns, a row for each worker, those of one host together."""
+    order = sorted(range(len(look.workers)), key=lambda index: look.workers[index].worker)
+    rows = [look.workers[index] for index in order]
+    return {
+        "worker": [printable(each.worker) for each in rows],
+        "state": [printable(each.state) for each in rows],
+        "slots": [each.slots for each in rows],
+        "leases": [each.leases for each in rows],
+        "finished": [each.finished for each in rows],
+        "rate": [round(each.steps_per_second) for each in rows],
+        "load": [each.load for each in rows],
+        "heard": [round(each.heard, 1) for each in rows],
+        "picture": [printable(each.drawn_by) for each in rows],
+        "lane": [look.lanes[index] for index in order],
+    }

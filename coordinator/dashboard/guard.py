@@ -1,0 +1,110 @@
+"""Who may see what the page shows: in front of every answer, and the headers that each one has."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+from collections.abc import Mapping
+from html import escape
+from http.cookies import CookieError, SimpleCookie
+
+from starlette.datastructures import Headers, MutableHeaders, QueryParams
+from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+COOKIE = "dreamfleet"
+# Scripts come from this server's own files alone. The charts' library sets styles on its elements, which is harmless.
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "x-frame-options": "DENY",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+}
+_OURS = re.compile(r"(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?", re.IGNORECASE)
+ASKING = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>dreamfleet: token</title><style>body{{font:16px/1.5 system-ui,sans-serif;margin:15vh auto;max-width:26rem;
+padding:0 1rem;color-scheme:light dark}}input,button{{font:inherit;padding:.4rem .6rem}}</style>
+<h1>dreamfleet</h1><p>{text}</p><form method="get" action="/"><label>Token
+<input name="token" type="password" autocomplete="current-password" required autofocus></label>
+<button>Look</button></form></html>"""
+
+
+class Guard:
+    """Lets through what may be answered: GET, asked of an own name, by somebody who knows the token if there is one."""
+
+    def __init__(self, app: ASGIApp, token: str | None, *, is_loopback: bool) -> None:
+        self._app = app
+        self._token = token
+        self._is_loopback = is_loopback
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        if scope["type"] != "http":
+            return  # a websocket: refused without a word
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+                headers.setdefault("cache-control", "no-store")
+            await send(message)
+
+        answer = self._refusal(scope) or self._app
+        await answer(scope, receive, with_headers)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        headers = Headers(scope=scope)
+        if scope["method"] not in ("GET", "HEAD"):
+            return PlainTextResponse("this page is only looked at: GET\n", 405, {"allow": "GET, HEAD"})
+        if self._is_loopback and not is_own_host(headers.get("host", "")):
+            # Else a page of somebody's own, whose name is made to lead here, could read along (DNS rebinding).
+            return PlainTextResponse("ask for this page as http://127.0.0.1, with its port\n", 421)
+        if self._token is None:
+            return None
+        given = QueryParams(scope["query_string"]).get("token")
+        if given is not None and equal(given, self._token):
+            answer = RedirectResponse("/", 303)  # without the token, which an address bar would show
+            answer.set_cookie(COOKIE, proof(self._token), httponly=True, samesite="lax", path="/")
+            return answer
+        if self._is_known(headers):
+            return None
+        text = "This is not the token." if given is not None else "Who looks at these runs must know their token."
+        told = {"www-authenticate": 'Bearer realm="dreamfleet"'}
+        return HTMLResponse(ASKING.format(text=escape(text)), 401, told)
+
+    def _is_known(self, headers: Mapping[str, str]) -> bool:
+        assert self._token is not None
+        kind, _, told = headers.get("authorization", "").partition(" ")
+        if kind.lower() == "bearer":
+            return equal(told.strip(), self._token)
+        try:
+            cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+        except CookieError:
+            return False
+        return cookie is not None and equal(cookie.value, proof(self._token))
+
+
+def is_own_host(host: str) -> bool:
+    """Whether a Host header names this computer, as nobody else's page can."""
+    return bool(_OURS.fullmatch(host))
+
+
+def equal(given: str, wanted: str) -> bool:
+    """Whether two texts are the same, in a time that tells nothing of where they differ."""
+    return hmac.compare_digest(*(hashlib.sha256(each.encode(errors="replace")).digest() for each in (given, wanted)))
+
+
+def proof(token: str) -> str:
+    """What a browser keeps: it shows that the token was known, and is not it."""
+    return hmac.new(token.encode(errors="replace"), b"dreamfleet dashboard", hashlib.sha256).hexdigest()

@@ -1,0 +1,57 @@
+"""What each worker did over the last minutes: a character for each stretch of time, newest last. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from dreamfleet.common.status import WorkerStatus
+
+STRETCH = 5.0  # seconds of one character
+LENGTH = 60  # characters: five minutes
+UNKNOWN, LOST, SILENT, IDLE = " ", "x", "?", "."  # and 1 to 9: how fast, 9 being the fleet's fastest slot
+
+
+@dataclass
+class _Stretch:
+    began: float
+    states: dict[str, tuple[str, float]] = field(default_factory=dict)  # by worker: a sign, or a slot's steps a second
+
+
+class Lanes:
+    """Remembers what was seen; a stretch that nobody looked at is unknown."""
+
+    def __init__(self) -> None:
+        self._stretches: deque[_Stretch] = deque(maxlen=LENGTH)
+
+    def take(self, workers: Sequence[WorkerStatus], now: float) -> None:
+        """What was seen at `now`, in seconds of any clock."""
+        began = now - now % STRETCH
+        if self._stretches:
+            missing = round((began - self._stretches[-1].began) / STRETCH)
+            for behind in range(min(missing, LENGTH) - 1, 0, -1):
+                self._stretches.append(_Stretch(began - behind * STRETCH))
+        if not self._stretches or self._stretches[-1].began < began:
+            self._stretches.append(_Stretch(began))
+        self._stretches[-1].states |= {each.worker: _state(each) for each in workers}
+
+    def told(self, workers: Sequence[WorkerStatus]) -> list[str]:
+        """The lane of each of these workers, all equally long."""
+        fastest = max((rate for each in self._stretches for _, rate in each.states.values()), default=0.0)
+        signs = [
+            {worker: sign or _speed(rate, fastest) for worker, (sign, rate) in each.states.items()}
+            for each in self._stretches
+        ]
+        return ["".join(each.get(worker.worker, UNKNOWN) for each in signs).rjust(LENGTH) for worker in workers]
+
+
+def _state(worker: WorkerStatus) -> tuple[str, float]:
+    if worker.state != "present":
+        return (SILENT if worker.state == "silent" else LOST), 0.0
+    rate = worker.steps_per_second / max(worker.slots, 1)
+    return ("", rate) if rate > 0 else (IDLE, 0.0)
+
+
+def _speed(rate: float, fastest: float) -> str:
+    return str(min(max(round(9 * rate / fastest), 1), 9))

@@ -1,0 +1,242 @@
+// The page of a live run: a frame a second fills it, and curves are drawn anew when a generation was closed.
+
+import * as charts from "./charts.js";
+import { colour, facts, fill, make, open, say } from "./dom.js";
+
+const TONES = {
+  running: "good", evaluating: "busy", paused: "bad", "waiting for workers": "wait", "coordinator lost": "bad",
+  finished: "done", "left open": "wait", "no coordinator": "wait",
+};
+const COLUMNS = [
+  ["state", "state"], ["slots", "slots"], ["rate", "steps/s"], ["leases", "leases"], ["finished", "finished"],
+  ["load", "load"], ["heard", "heard"], ["picture", "picture"],
+];
+const LEFT = new Set(["state", "picture"]);
+
+let page = null; // the parts, once they stand
+let curves = null;
+let lanes = null; // which rows are in sight
+
+export const show = () => {
+  page = open("live");
+  page.body.hidden = page.tiles.hidden = true;
+  curves = null;
+  lanes?.disconnect();
+  lanes = new IntersectionObserver((seen) => {
+    for (const each of seen) {
+      each.target.inSight = each.isIntersecting;
+      if (each.isIntersecting) paintLane(each.target);
+    }
+  });
+  say(page.run, "dreamfleet");
+  say(page.sentence, "Asking the coordinator…");
+  page.state.hidden = true;
+};
+
+export const drawCurves = (document) => {
+  curves = document;
+  if (!page || page.body.hidden) return;
+  charts.fitness(page.fitness, curves);
+  charts.search(page.search, curves);
+  const last = curves.generation.length - 1;
+  const every = curves.step > 1 ? `Every ${curves.step}th generation is drawn. ` : "";
+  const told = last < 0 ? "No generation is closed yet." : `${every}Generation ${curves.generation[last]}: mean ${curves.mean[last]}, best ${curves.best[last]}.`;
+  say(page["fitness-caption"], told);
+  page.fitness.setAttribute("aria-label", `Fitness by generation. ${told}`);
+  page.search.setAttribute("aria-label", `Step size by generation${last < 0 ? "" : `, now ${curves.sigma[last]}`}`);
+};
+
+export const fillFrame = (frame, wanted) => {
+  if (!page) return;
+  page.state.hidden = false;
+  choose(frame, wanted);
+  if (frame.link === "absent") return fillAbsent(frame, wanted);
+  const first = page.body.hidden;
+  page.body.hidden = page.tiles.hidden = false;
+  document.title = `${frame.run}: ${frame.state}`;
+  say(page.run, frame.run);
+  say(page.state, frame.lost ? `${frame.state} since ${clock(frame.lost)}` : frame.state);
+  page.state.dataset.tone = TONES[frame.state] ?? "done";
+  say(page.sentence, frame.sentence);
+  say(page.eta, frame.eta ? frame.eta.told : "");
+  fill(page.bounds, frame.eta ? frame.eta.bounds : [], () => bar(), (each, row) => setBar(each, row.share, row.told));
+  say(page.task, frame.task);
+  fill(page.tiles, frame.tiles, tile, (each, row) => {
+    say(each.children[0], row.name);
+    say(each.children[1], row.value);
+    say(each.children[2], row.beneath);
+  });
+  page.troubles.hidden = !frame.troubles.length;
+  fill(page.troubles, frame.troubles, () => make("li"), say);
+  fillPopulation(frame);
+  facts(page["search-facts"], frame.search);
+  facts(page.waste, frame.waste);
+  say(page.fleet, frame.fleet);
+  fillWorkers(frame);
+  if (first && curves) drawCurves(curves);
+};
+
+const fillAbsent = (frame, wanted) => {
+  page.body.hidden = page.tiles.hidden = true;
+  page.troubles.hidden = !frame.trouble;
+  fill(page.troubles, frame.trouble ? [frame.trouble] : [], () => make("li"), say);
+  const run = wanted || frame.only;
+  document.title = "dreamfleet: no live run";
+  say(page.run, run || "No live run");
+  say(page.state, "no coordinator");
+  page.state.dataset.tone = TONES["no coordinator"];
+  say(page.sentence, `No coordinator ${run ? `of ${run} ` : ""}answers at ${frame.address}. This page shows it as soon as one does; a command that starts one:`);
+  fill(page.bounds, [], make, say);
+  say(page.eta, "");
+  page.task.replaceChildren(make("code", `dreamfleet coordinator --run ${run || "NAME"} --listen ${frame.address.split(",")[0]}`));
+};
+
+// Where several runs are live, one of them.
+const choose = (frame, wanted) => {
+  const names = frame.live.length > 1 || (wanted && frame.live.length && !frame.live.includes(wanted)) ? frame.live : [];
+  page.chooser.hidden = !names.length;
+  fill(page.chooser, names, () => make("a"), (each, name) => {
+    say(each, name);
+    each.setAttribute("href", `#/live/${encodeURIComponent(name)}`);
+    if (name === frame.run) each.setAttribute("aria-current", "true");
+    else each.removeAttribute("aria-current");
+  });
+};
+
+const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString("en-GB");
+
+const bar = () => {
+  const whole = make("div", "", { class: "bound", role: "progressbar", "aria-valuemin": "0", "aria-valuemax": "100" });
+  whole.append(make("i"));
+  return whole;
+};
+
+const setBar = (element, share, told) => {
+  element.title = told;
+  element.setAttribute("aria-label", told);
+  element.setAttribute("aria-valuenow", String(Math.round(100 * share)));
+  element.firstChild.style.width = `${100 * share}%`;
+};
+
+const tile = () => {
+  const whole = make("div", "", { class: "tile" });
+  whole.append(make("span"), make("b"), make("span"));
+  return whole;
+};
+
+// A cell a candidate: it fills with its episodes, and its colour says how it does among the others.
+const fillPopulation = ({ candidates, evaluation }) => {
+  const { generation, total, done, wanted, fitness } = candidates;
+  const known = fitness.filter((each) => each !== null);
+  const [low, high] = [Math.min(...known), Math.max(...known)];
+  const finished = done.filter((each, index) => each >= wanted[index]).length;
+  const rest = total > done.length ? `, the first ${done.length} are shown` : "";
+  say(page["population-told"], `Generation ${generation}: ${finished} of ${total} candidates are scored${rest}.`);
+  page.cells.style.setProperty("--cell", total > 400 ? "9px" : total > 120 ? "14px" : "22px");
+  fill(page.cells, done, () => make("div", "", { class: "cell" }), (cell, episodes, index) => {
+    const value = fitness[index];
+    const share = value === null ? 0 : high > low ? (value - low) / (high - low) : 1;
+    const key = `${episodes}/${wanted[index]}/${value === null ? "" : share.toFixed(2)}`;
+    const told = `candidate ${generation}/${index}: ${episodes} of ${wanted[index]} episodes${value === null ? "" : `, fitness ${value}`}`;
+    if (cell.told !== told) cell.title = cell.told = told;
+    if (cell.key === key) return;
+    cell.key = key;
+    cell.style.setProperty("--done", wanted[index] ? `${(100 * episodes) / wanted[index]}%` : "0%");
+    cell.style.setProperty("--fill", value === null ? "var(--line-strong)" : shade(share));
+  });
+  page.cells.setAttribute("aria-label", `${finished} of ${total} candidates of generation ${generation} are scored`);
+  say(page.scale, known.length ? `fitness so far: ${low} to ${high}` : "");
+  fill(page.evaluation, evaluation, beside, (each, row) => {
+    say(each.firstChild, `${row.name}: ${row.done} of ${row.wanted} episodes`);
+    setBar(each.lastChild, row.done / row.wanted, row.name);
+  });
+};
+
+const shade = (share) =>
+  share < 0.5
+    ? `hsl(${214 - 48 * share} ${45 + 20 * share}% ${72 - 48 * share}%)`
+    : `hsl(${190 - 100 * (share - 0.5)} ${55 + 10 * (share - 0.5)}% ${48 - 24 * (share - 0.5)}%)`;
+
+const beside = () => {
+  const whole = make("div", "", { class: "beside" });
+  whole.append(make("span"), bar());
+  return whole;
+};
+
+const fillWorkers = (frame) => {
+  const { workers } = frame;
+  const count = workers.worker.length;
+  page["no-workers"].hidden = count > 0;
+  say(page["worker-command"], `dreamfleet worker --run ${frame.run} --connect tcp/COORDINATOR:7447`);
+  const fleet = page.workers;
+  while (fleet.children.length > count) {
+    lanes.unobserve(fleet.lastElementChild);
+    fleet.lastElementChild.remove();
+  }
+  let before = "";
+  for (let index = 0; index < count; index += 1) {
+    if (!fleet.children[index]) fleet.append(workerRow());
+    const row = fleet.children[index];
+    const [host, life] = split(workers.worker[index]);
+    row.dataset.state = workers.state[index];
+    row.classList.toggle("same", host === before);
+    before = host;
+    say(row.name.firstChild, host);
+    say(row.name.lastChild, life);
+    if (row.lane !== workers.lane[index]) {
+      row.lane = workers.lane[index];
+      if (row.inSight) paintLane(row);
+    }
+    COLUMNS.forEach(([key], at) => say(row.cells[at + 2], cell(key, workers[key][index])));
+  }
+};
+
+const split = (worker) => {
+  const at = worker.lastIndexOf("/");
+  return at < 0 ? [worker, ""] : [worker.slice(0, at), worker.slice(at)];
+};
+
+const cell = (key, value) =>
+  key === "heard" ? `${value.toFixed(1)} s ago` : key === "load" ? value.toFixed(2) : typeof value === "number" ? value.toLocaleString("en") : value;
+
+const workerRow = () => {
+  const row = make("tr");
+  row.name = make("td", "", { class: "name" });
+  row.name.append(make("b"), make("small"));
+  const lane = make("td", "", { class: "lane" });
+  row.canvas = make("canvas", "", { width: "480", height: "32", "aria-hidden": "true" });
+  lane.append(row.canvas);
+  row.append(row.name, lane);
+  for (const [key, label] of COLUMNS)
+    row.append(make("td", "", { "data-label": label, class: key === "state" ? "tag" : LEFT.has(key) ? "" : "n" }));
+  lanes.observe(row);
+  return row;
+};
+
+const paintLane = ({ canvas, lane }) => {
+  if (!lane) return;
+  const paper = canvas.getContext("2d");
+  const wide = canvas.width / lane.length;
+  const inks = { x: colour("red"), "?": colour("amber"), ".": colour("line-strong"), " ": colour("soft") };
+  const blue = colour("blue");
+  paper.fillStyle = inks[" "];
+  paper.fillRect(0, 0, canvas.width, canvas.height);
+  for (let at = 0; at < lane.length; at += 1) {
+    const sign = lane[at];
+    if (sign === " ") continue;
+    const speed = Number(sign);
+    paper.globalAlpha = inks[sign] ? 1 : 0.25 + 0.75 * (speed / 9);
+    paper.fillStyle = inks[sign] ?? blue;
+    paper.fillRect(at * wide, 0, wide - 1, canvas.height);
+  }
+  paper.globalAlpha = 1;
+};
+
+export const redraw = () => {
+  if (page) for (const row of page.workers.children) if (row.inSight) paintLane(row);
+};
+
+export const leave = () => {
+  page = null;
+  lanes?.disconnect();
+};

@@ -1,0 +1,289 @@
+"""Asking live runs how they are: what was heard of each, and one immutable picture of all of them a look."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeVar
+
+from dreamfleet.common import keys
+from dreamfleet.common.client import Client
+from dreamfleet.common.codec import MalformedError, from_plain
+from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
+from dreamfleet.common.fields import known
+from dreamfleet.common.printable import shortened
+from dreamfleet.common.runs import RunFolder, open_run
+from dreamfleet.common.session import enqueue_into
+from dreamfleet.common.status import Population, Status, WorkerStatus, read_document, read_status
+from dreamfleet.common.stored import StoredEvaluation, StoredGeneration
+from dreamfleet.coordinator.dashboard.curves import Course, curves, sampled
+from dreamfleet.coordinator.dashboard.frames import Look, frame
+from dreamfleet.coordinator.dashboard.lanes import Lanes
+from dreamfleet.coordinator.dashboard.past import quartiles_of
+from dreamfleet.coordinator.dashboard.plain import written
+
+ANSWER = 1.5  # seconds that an answer may take
+PATIENCE = 5.0  # seconds of slow answers after which a run counts as lost; where nobody is there it does at once
+MOST_RUNS = 32  # that are followed
+MOST_ROWS = 100_000  # generations, evaluations, workers of a run that are fetched
+
+T = TypeVar("T")
+UNREADABLE = (MalformedError, LookupError, TypeError, ValueError, ArithmeticError)  # of what another version may say
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What viewers of one run get: two server-sent events, ready to be written."""
+
+    frame: bytes
+    curves: bytes
+    drawn: tuple[str, int]  # the run's uid and how often its curves were drawn: others are others
+
+
+@dataclass(frozen=True)
+class Picture:
+    """All that is known at one moment."""
+
+    runs: Mapping[str, Shown]
+    chosen: str | None  # for whoever names no run
+    absent: bytes  # for whom there is none: the event that says so
+
+    def of(self, run: str | None) -> Shown | None:
+        """The run of that name, or the chosen one."""
+        return self.runs.get(run or self.chosen or "")
+
+
+class Watcher:
+    """Follows every live run, or one; called by one thread at a time."""
+
+    def __init__(self, connect: tuple[str, ...], run: str | None, runs_dir: Path) -> None:
+        self._connect = connect
+        self._only = None if run is None else keys.check_run_name(run)
+        self._runs_dir = runs_dir
+        self._client: Client | None = None
+        self._farewells: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._followed: dict[str, _Followed] = {}
+        self._trouble = ""  # what the last look could not read
+
+    def look(self) -> Picture:
+        """Ask, and tell. Never raises for what comes over the wire."""
+        self._trouble = ""
+        began, answered = time.monotonic(), self._ask()
+        slow = time.monotonic() - began >= ANSWER
+        now = time.time()
+        for name, document in answered.items():
+            with suppress(ConnectionFailedError):  # it left between two questions
+                self._take(name, document, now)
+        for each in self._followed.values():
+            if each.name not in answered and (not slow or now - each.heard > PATIENCE):
+                each.lost = each.lost or now
+        self._take_farewells(now)
+        self._forget()
+        return self._picture()
+
+    def rest(self) -> None:
+        """Nobody looks: leave the network, and forget what will be old by the next look."""
+        if self._client is not None:
+            self._client.__exit__(None, None, None)
+            self._client = None
+        self._followed.clear()
+
+    def _ask(self) -> dict[str, dict[str, Any]]:
+        """The answers of live runs by their names."""
+        try:
+            if self._client is None:
+                self._client = Client(self._connect)
+                heard = enqueue_into(self._farewells, "status", most=MOST_RUNS)
+                self._client.session.declare_subscriber(keys.event_status("*"), heard)
+            found = self._client.statuses(ANSWER)
+        except ConnectionFailedError:
+            return {}
+        except MalformedError as error:
+            self._trouble = str(error)
+            return {}
+        named = {str(document.get("run")): document for document in found}
+        return {name: named[name] for name in sorted(named)[:MOST_RUNS] if self._only in (None, name)}
+
+    def _take(self, name: str, document: dict[str, Any], now: float) -> None:
+        assert self._client is not None
+        try:
+            status = read_status(document)
+            followed = self._followed.get(name)
+            if followed is None or followed.uid != status.run_uid or followed.is_ahead_of(status):
+                self._followed.pop(name, None)  # so that the newest one stands last
+                followed = self._followed[name] = _Followed(status, self._runs_dir)
+            followed.take(status, self._client, now)
+        except UNREADABLE as error:
+            self._trouble = f"run {name}: {error}"
+
+    def _take_farewells(self, now: float) -> None:
+        with suppress(queue.Empty):
+            while True:
+                _, sample = self._farewells.get_nowait()
+                with suppress(MalformedError):
+                    status = read_status(read_document(sample.payload.to_bytes()))
+                    followed = self._followed.get(status.run)
+                    if followed is not None and followed.uid == status.run_uid:
+                        followed.take_last(status, now)
+
+    def _forget(self) -> None:
+        """The oldest of those that nobody serves any more, beyond what is kept."""
+        gone = [name for name, each in self._followed.items() if not each.is_live]
+        for name in gone[: max(len(self._followed) - MOST_RUNS, 0)]:
+            del self._followed[name]
+
+    def _picture(self) -> Picture:
+        live = [name for name, each in self._followed.items() if each.is_live]
+        chosen = next(reversed(live or list(self._followed)), None)
+        absent = {
+            "link": "absent",
+            "run": "",
+            "live": sorted(live),
+            "address": ", ".join(self._connect),
+            "trouble": shortened(self._trouble, 1000),
+            "only": self._only or "",
+        }
+        return Picture({name: each.shown(sorted(live)) for name, each in self._followed.items()}, chosen,
+                       event("frame", absent))  # fmt: skip
+
+
+@dataclass
+class _Followed:
+    """One run: what was heard of it so far."""
+
+    status: Status
+    runs_dir: Path
+    heard: float = 0.0  # seconds since 1970
+    lost: float | None = None
+    history: list[StoredGeneration] = field(default_factory=list)
+    evaluations: list[StoredEvaluation] = field(default_factory=list)
+    _workers: Sequence[WorkerStatus] = ()
+    _population: Sequence[Population] = ()
+    _lanes: Lanes = field(default_factory=Lanes)
+    _quartiles: dict[int, tuple[float, float]] | None = None  # `None`: its journal does not lie here
+    _drawn: tuple[Any, bytes, int] = (None, b"", 0)  # of what, the event, how often
+
+    def __post_init__(self) -> None:
+        with suppress(DreamfleetError), open_run(self.runs_dir, self.name) as stored:
+            if stored.uid == self.uid:
+                self._quartiles = {}
+
+    @property
+    def name(self) -> str:
+        """The run's."""
+        return self.status.run
+
+    @property
+    def uid(self) -> str:
+        """Of the run that was first heard of under that name."""
+        return self.status.run_uid
+
+    @property
+    def is_live(self) -> bool:
+        """Whether its coordinator answers."""
+        return self.lost is None and not self.status.over
+
+    def is_ahead_of(self, status: Status) -> bool:
+        """Whether it knows of generations that the run has not: an older copy of it is served now."""
+        return len(self.history) > status.generations
+
+    def take(self, status: Status, client: Client, now: float) -> None:
+        """What it answered, and the rest of what came as a head."""
+        self.status, self.heard, self.lost = status, now, None
+        self._workers, self._population = status.worker_list, (status.population,)
+        self._lanes_of(now)
+        self._extend(status, client)
+        if status.workers.known > len(status.worker_list):
+            self._workers = list(_rows(client, "workers", WorkerStatus, self.name))
+            self._lanes_of(now)
+        if status.population.total > len(status.population.done):
+            self._population = client.candidates(self.name, status.generation.number)
+
+    def take_last(self, status: Status, now: float) -> None:
+        """What its coordinator said as it left."""
+        self.status, self.heard, self.lost = status, now, None
+        self._workers, self._population = status.worker_list, (status.population,)
+        self._take_recent(status)
+
+    def shown(self, live: list[str]) -> Shown:
+        """As viewers get it."""
+        look = Look(
+            self.status, self._workers, self._lanes.told(self._workers), self._population, self.heard, self.lost
+        )
+        self._draw()
+        _, drawing, times = self._drawn
+        return Shown(event("frame", {**frame(look), "live": live}), drawing, (self.uid, times))
+
+    def _lanes_of(self, now: float) -> None:
+        self._lanes.take(self._workers, now)
+
+    def _extend(self, status: Status, client: Client) -> None:
+        """Closed generations and evaluations that are not known yet."""
+        self._take_recent(status)
+        if len(self.history) < min(status.generations, MOST_ROWS):
+            self._append(_rows(client, "history", StoredGeneration, self.name, len(self.history)))
+        if len(self.evaluations) != status.evaluations:
+            self._take_evaluations(status, client)
+
+    def _take_recent(self, status: Status) -> None:
+        if status.recent and status.recent[0].number <= len(self.history) < MOST_ROWS:
+            self._append(each for each in status.recent if each.number >= len(self.history))
+
+    def _append(self, rows: Iterable[StoredGeneration]) -> None:
+        for each in rows:
+            if each.number != len(self.history):
+                raise MalformedError(f"run {self.name} tells of generation {each.number} after {len(self.history) - 1}")
+            self.history.append(each)
+
+    def _take_evaluations(self, status: Status, client: Client) -> None:
+        last = status.evaluation
+        latest = self.evaluations[-1].generation if self.evaluations else -1
+        if last is not None and last.generation > latest and len(self.evaluations) + 1 == status.evaluations:
+            self.evaluations.append(last)
+            return
+        try:
+            found = list(_rows(client, "evaluations", StoredEvaluation, self.name))
+        except ConnectionFailedError:  # an earlier coordinator: what is seen while somebody looks
+            found = [*self.evaluations, *(each for each in (status.best, last) if each is not None)]
+        self.evaluations = sorted({each.generation: each for each in found}.values(), key=lambda each: each.generation)
+
+    def _draw(self) -> None:
+        """The curves, if there is anything new in them."""
+        of = len(self.history), tuple(self.evaluations[-1:]), len(self.evaluations), self.status.confirmed
+        if self._drawn[0] == of:
+            return
+        course = Course(self.status.settings, self.history, self.evaluations, self.status.confirmed)
+        self._read_quartiles()
+        self._drawn = of, event("curves", curves(course, self._quartiles)), self._drawn[2] + 1
+
+    def _read_quartiles(self) -> None:
+        """From the journal, if it lies here: those that are drawn and not known yet."""
+        read = self._quartiles
+        if read is None:
+            return
+        wanted = [each for each in sampled(self.history) if each.number not in read]
+        try:
+            with open_run(self.runs_dir, self.name) as stored:
+                found = self._missing(stored, wanted)
+        except DreamfleetError:
+            found = None
+        self._quartiles = None if found is None else {**read, **found}
+
+    def _missing(self, stored: RunFolder, wanted: list[StoredGeneration]) -> Mapping[int, tuple[float, float]] | None:
+        return quartiles_of(stored, self.status.settings, wanted) if stored.uid == self.uid else None
+
+
+def _rows(client: Client, part: str, kind: type[T], run: str, offset: int = 0) -> Iterator[T]:
+    """The rows of a paged part from `offset` on, as many as anybody wants to see."""
+    rows = islice(client.pages(part, run, offset), MOST_ROWS - offset)
+    return (from_plain(kind, known(kind, row)) for row in rows)
+
+
+def event(kind: str, document: Mapping[str, Any]) -> bytes:
+    """A server-sent event."""
+    return f"event: {kind}\ndata: {written(document)}\n\n".encode()

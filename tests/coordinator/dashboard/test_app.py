@@ -1,0 +1,192 @@
+"""What the page's server answers, and to whom."""
+
+import json
+import re
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from starlette.testclient import TestClient
+
+from dreamfleet.coordinator.dashboard.app import make_app
+from dreamfleet.coordinator.dashboard.config import DashboardConfig
+from dreamfleet.coordinator.dashboard.feed import Feed
+from dreamfleet.coordinator.dashboard.watching import Watcher
+
+RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
+HOME = "http://127.0.0.1:8420"
+TOKEN = "correct horse battery"
+PATHS = ("/", "/runs", "/runs/dream", "/live", "/files/0/main.js")
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for name in ("dream", "reality", "hidden"):
+        shutil.copytree(RUNS / name, tmp_path / "runs" / name)
+    return tmp_path / "runs"
+
+
+def client_of(runs, host="127.0.0.1", base=HOME, **config):
+    feed = Feed(Watcher(("tcp/127.0.0.1:1",), None, runs))
+    app = make_app(feed, runs, DashboardConfig(host=host, **config))
+    return TestClient(app, base_url=base, follow_redirects=False)
+
+
+def test_the_page_loads_what_it_names_and_a_browser_may_keep_that_for_ever(runs):
+    client = client_of(runs)
+    page = client.get("/")
+    assert page.headers["cache-control"] == "no-store"
+    found = re.findall(r'(?:src|href)="(files/[^"]+)"', page.text)
+    assert {Path(each).name for each in found} == {"icon.svg", "style.css", "theme.js", "plotly.min.js", "main.js"}
+    for each in found:
+        for packing in ("gzip", "identity"):
+            answer = client.get(f"/{each}", headers={"accept-encoding": packing})
+            assert answer.status_code == 200
+            assert "immutable" in answer.headers["cache-control"]
+            assert answer.headers.get("content-encoding", "identity") == packing
+    folder = next(each for each in found if each.endswith("main.js")).rpartition("/")[0]
+    for name in ("charts.js", "dom.js", "live.js", "runs.js"):
+        assert client.get(f"/{folder}/{name}").status_code == 200
+
+
+def test_the_page_holds_no_script_of_its_own_and_names_no_other_host(runs):
+    client = client_of(runs)
+    text = client.get("/").text
+    assert "http" not in text
+    assert not re.search(r"<script(?![^>]*\bsrc=)|\son\w+=|style=", text)
+    policy = client.get("/").headers["content-security-policy"]
+    assert "script-src 'self';" in policy
+    assert "default-src 'none'" in policy
+
+
+@pytest.mark.parametrize("path", ["/files/0/main.js", "/files/x/../../past.py", "/nothing", "/runs/nothing"])
+def test_what_is_not_there_is_404(runs, path):
+    assert client_of(runs).get(path).status_code == 404
+
+
+def test_past_runs_are_listed_with_what_is_wrong_with_them(runs):
+    (runs / "broken").mkdir()
+    (runs / "broken" / "journal.sqlite").write_text("no journal")
+    rows = {each["run"]: each for each in client_of(runs).get("/runs").json()["runs"]}
+    assert set(rows) == {"broken", "dream", "hidden", "reality"}
+    assert rows["broken"]["damaged"]
+    assert "cannot be read" in rows["broken"]["state"]
+    assert (rows["dream"]["task"], rows["dream"]["generations"]) == ("dream", 12)
+
+
+def test_an_empty_or_absent_runs_folder_is_an_empty_list(tmp_path):
+    assert client_of(tmp_path / "nothing").get("/runs").json()["runs"] == []
+
+
+def test_a_run_is_its_curves_facts_and_settings(runs):
+    told = client_of(runs).get("/runs/dream").json()
+    curves = told["curves"]
+    assert curves["generation"] == list(range(12))
+    assert curves["band"] == "the middle half of the candidates"
+    assert all(low <= high for low, high in zip(curves["low"], curves["high"], strict=True))
+    assert curves["steps"] == sorted(curves["steps"])
+    assert curves["core_hours"] == sorted(curves["core_hours"])
+    assert len(curves["evaluations"]["steps"]) == len(curves["evaluations"]["generation"]) > 0
+    assert curves["dreamt"]
+    assert ["task.task", "dream"] in told["settings"]
+    assert "spent" in dict(told["facts"])
+
+
+def test_a_run_that_closed_no_generation_is_shown(runs):
+    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
+        for table in ("generation", "candidate", "evaluation", "result", "strategy"):
+            journal.execute(f"DELETE FROM {table}")
+    told = client_of(runs).get("/runs/dream").json()
+    assert (told["curves"]["generation"], told["generations"]) == ([], [])
+
+
+def test_a_journal_whose_generations_are_far_apart_is_damaged_and_not_counted_through(runs):
+    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
+        journal.execute("UPDATE generation SET number = ? WHERE number = 3", (2**62,))
+    answer = client_of(runs).get("/runs/dream")
+    assert (answer.status_code, "damaged" in answer.json()["error"]) == (404, True)
+
+
+@pytest.mark.parametrize(
+    "name", ["..", "%2e%2e", "..%2f..%2fetc", "%2Fetc%2Fpasswd", "a%00b", "Dream", "x" * 300, "archive%2Fx"]
+)
+def test_no_name_leads_out_of_the_runs_folder(runs, name):
+    shutil.copytree(runs / "dream", runs.parent / "outside")
+    answer = client_of(runs).get(f"/runs/{name}")
+    assert answer.status_code in (404, 200)  # `..` is taken out of a path before it is asked for: that is the page
+    assert "curves" not in answer.text
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
+@pytest.mark.parametrize("path", PATHS)
+def test_it_is_only_looked_at(runs, method, path):
+    assert client_of(runs).request(method, path).status_code == 405
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:8420", "127.0.0.1.evil.example", "localhost.evil.example", ""]
+)
+@pytest.mark.parametrize("path", PATHS)
+def test_a_name_that_was_made_to_lead_here_is_refused(runs, host, path):
+    answer = client_of(runs).get(path, headers={"host": host})
+    assert (answer.status_code, "127.0.0.1" in answer.text) == (421, True)
+
+
+@pytest.mark.parametrize("host", ["localhost:8420", "127.0.0.1", "[::1]:8420", "LOCALHOST"])
+def test_own_names_are_answered(runs, host):
+    assert client_of(runs).get("/", headers={"host": host}).status_code == 200
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_without_the_token_there_is_a_page_that_asks_for_it(runs, path):
+    client = client_of(runs, "0.0.0.0", "http://night.example:8420", token=TOKEN)
+    wrong = (("authorization", "Bearer wrong"), ("authorization", f"Basic {TOKEN}"), ("cookie", "dreamfleet=wrong"),
+             ("cookie", f"dreamfleet={TOKEN}"))  # fmt: skip
+    for headers in ({}, *({name: value} for name, value in wrong)):
+        answer = client.get(path, headers=headers)
+        assert (answer.status_code, "must know their token" in answer.text) == (401, True)
+    answer = client.get(path, params={"token": "wrong<script>"})
+    assert (answer.status_code, "not the token" in answer.text, "<script>" in answer.text) == (401, True, False)
+
+
+def test_the_token_opens_by_bearer_and_by_an_address_that_leaves_a_cookie(runs):
+    client = client_of(runs, "0.0.0.0", "http://night.example:8420", token=TOKEN)
+    assert client.get("/runs", headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
+    answer = client.get("/", params={"token": TOKEN})
+    assert (answer.status_code, answer.headers["location"]) == (303, "/")
+    cookie = answer.headers["set-cookie"]
+    assert TOKEN not in cookie
+    assert "HttpOnly" in cookie
+    assert "samesite=lax" in cookie.lower()
+    assert client.get("/runs").status_code == 200
+
+
+def test_no_redirect_leads_elsewhere(runs):
+    client = client_of(runs, "0.0.0.0", "http://night.example:8420", token=TOKEN)
+    for path in ("/runs", "/%2F/evil.example", "/https:%2F%2Fevil.example"):
+        assert client.get(path, params={"token": TOKEN}).headers["location"] == "/"
+
+
+def test_every_answer_forbids_what_it_can(runs):
+    client = client_of(runs)
+    for path in ("/", "/runs", "/runs/nothing", "/nothing"):
+        headers = client.get(path).headers
+        assert headers["x-content-type-options"] == "nosniff"
+        assert "frame-ancestors 'none'" in headers["content-security-policy"]
+        assert headers["cross-origin-resource-policy"] == "same-origin"
+
+
+def test_numbers_that_json_does_not_have_stand_in_no_answer(runs):
+    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
+        journal.execute("UPDATE generation SET mean = 9e999, best = -9e999 WHERE number = 2")
+        journal.execute("UPDATE candidate SET fitness = 9e999 WHERE generation = 2")
+
+    def refuse(word):
+        raise AssertionError(word)
+
+    for path in ("/runs", "/runs/dream"):
+        answer = client_of(runs).get(path)
+        assert answer.status_code == 200
+        json.loads(answer.text, parse_constant=refuse)

@@ -1,0 +1,94 @@
+"""One look a refresh for however many viewers, the latest for each, none for nobody."""
+
+import asyncio
+import threading
+
+import pytest
+
+from dreamfleet.coordinator.dashboard.feed import Feed
+from dreamfleet.coordinator.dashboard.watching import Picture
+
+
+class Looks:
+    """Counts looks; each waits until it is let."""
+
+    def __init__(self):
+        self.count, self.rests = 0, 0
+        self.gate = threading.Event()
+        self.gate.set()
+
+    def look(self):
+        assert self.gate.wait(10)
+        self.count += 1
+        if self.count == 2:
+            raise ValueError("a look that fails")
+        return Picture({}, None, str(self.count).encode())
+
+    def rest(self):
+        self.rests += 1
+
+
+def run(coroutine):
+    asyncio.run(asyncio.wait_for(coroutine, 20))
+
+
+@pytest.fixture
+def looks():
+    return Looks()
+
+
+def test_every_viewer_gets_the_same_pictures_from_one_look_each(looks):
+    async def viewer(feed, pictures):
+        source = feed.pictures()
+        return [await anext(source) for _ in range(pictures)]
+
+    async def play():
+        feed = Feed(looks, refresh=0.01, linger=0.05)
+        found = await asyncio.gather(*(viewer(feed, 3) for _ in range(50)))
+        assert len({tuple(map(id, seen)) for seen in found}) == 1
+        assert looks.count <= 6, "the second failed, and cost itself alone"
+
+    run(play())
+
+
+def test_a_slow_viewer_misses_pictures_and_holds_back_nobody(looks):
+    async def play():
+        feed = Feed(looks, refresh=0.0, linger=0.05)
+        slow, fast = feed.pictures(), feed.pictures()
+        first = await anext(slow)
+        for _ in range(20):
+            last = await anext(fast)
+        assert int((await anext(slow)).absent) >= int(last.absent) > int(first.absent) + 10
+
+    run(play())
+
+
+def test_nobody_is_asked_while_nobody_looks_and_a_later_viewer_gets_no_old_picture(looks):
+    async def play():
+        feed = Feed(looks, refresh=0.01, linger=0.02)
+        async for _ in feed.pictures():
+            break
+        while looks.rests == 0:
+            await asyncio.sleep(0)
+        assert not feed.is_looking
+        before = looks.count
+        looks.gate.clear()
+        later = asyncio.ensure_future(anext(feed.pictures()))
+        while not feed.is_looking:
+            await asyncio.sleep(0)
+        assert not later.done()
+        looks.gate.set()
+        assert int((await later).absent) > before
+
+    run(play())
+
+
+def test_a_feed_that_closes_lets_every_viewer_go(looks):
+    async def play():
+        feed = Feed(looks, refresh=0.01, linger=10)
+        viewer = feed.pictures()
+        await anext(viewer)
+        feed.close()
+        assert [picture async for picture in viewer] == []
+
+    run(play())
