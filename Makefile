@@ -20,7 +20,7 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.demo: $(VENV)/bin/python $(SOURCES)
-	$(PIP) --editable '.[worker,views]'
+	$(PIP) --editable '.[worker,views,dashboard]'
 	touch $@
 
 $(VENV)/.dev: $(VENV)/bin/python $(SOURCES)

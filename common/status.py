@@ -55,6 +55,8 @@ class OpenGeneration:
     sigma: float  # the strategy's step size
     temperature: float | None  # at which it dreams; `None` where a task has none
     stage: StageStatus | None = field(default=None, metadata=OPTIONAL)  # `None` without a schedule
+    # The longest axis of the strategy's distribution by the shortest; `None` where the optimiser does not say.
+    axis_ratio: float | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import fmean, stdev
 
@@ -24,7 +25,7 @@ from rich.text import Text
 from dreamfleet.common.client import Client
 from dreamfleet.common.config import option
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
-from dreamfleet.common.processes import Child, ask, call, spoken
+from dreamfleet.common.processes import Child, ask, call, leash, spoken
 from dreamfleet.common.runs import CONTROLLER, open_run
 from dreamfleet.common.stored import best_of
 from dreamfleet.common.table import RunPanel
@@ -32,6 +33,7 @@ from dreamfleet.coordinator.config import NO_SUBSPACE
 
 REFRESH = 0.5
 START_SECONDS = 30.0
+PAGE_PACKAGES = ("plotly", "starlette", "uvicorn")
 PLOT, VIDEO = "fitness.png", "drive.mp4"
 DREAM_LOOKS, REAL_LOOKS = (2, 8), (3, 16)  # generations between evaluations, and tracks of each
 CONFIRMATION_TRACKS = 16  # on which what a stage reports is confirmed
@@ -60,6 +62,9 @@ class DemoConfig:
     tracks: int = option(16, "unseen tracks that the outcome is judged on")
     workers: int = option(0, "worker processes; 0: one a core")
     port: int = option(7447, "port of the embedded router")
+    page: bool = option(
+        True, "serve a web page about the runs while they go on, on this computer alone; it needs the extra `dashboard`"
+    )
 
     def __post_init__(self) -> None:
         if min(self.minutes, self.dream_minutes) < 0 or self.tracks < 1 or self.workers < 0:
@@ -89,8 +94,10 @@ class Demo:
 
     def play(self) -> None:
         """Evolve, judge, draw, record, and say what to try next."""
-        for stage in self._stages:
-            self._evolve(stage)
+        with ExitStack() as stack:
+            self._show_page(stack)
+            for stage in self._stages:
+                self._evolve(stage)
         best = max(reversed(self._stages), key=self._confirmed)  # of equals the last
         folder = self._runs_dir / best.run
         controller = folder / CONTROLLER
@@ -105,6 +112,15 @@ class Demo:
         self._say(f"recording the median of these drives ({score:.0f} on track {track}), and what the model dreams")
         call("record", "--controller", controller, "--out", folder / VIDEO, "--steps", 1000, "--seed", track)
         self._farewell(folder)
+
+    def _show_page(self, stack: ExitStack) -> None:
+        """Serve a page about the runs until the stack is left; without its packages, or a port, there is none."""
+        if not self._config.page or any(find_spec(package) is None for package in PAGE_PACKAGES):
+            return
+        where = ("--connect", self._endpoint, "--runs-dir", self._runs_dir)
+        page = stack.enter_context(Child("dashboard", *where, "--host", "127.0.0.1", "--port", 0, inside=leash()))
+        with suppress(DreamfleetError):
+            self._say(page.wait_for("the dashboard is at", timeout=START_SECONDS).strip())
 
     def _confirmed(self, stage: Stage) -> float:
         """A stage's confirmed score: in reality, on fresh tracks that are the same in every stage."""

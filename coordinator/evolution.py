@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -87,6 +88,13 @@ class Evolution:
     def sigma(self) -> float:
         """The overall step size, of a search in a subspace in its coordinates."""
         return float(self._optimiser.sigma)
+
+    @property
+    def axis_ratio(self) -> float | None:
+        """The longest axis of the distribution by the shortest; `None` where the optimiser does not say."""
+        with np.errstate(all="ignore"):
+            found = getattr(self._optimiser, "axis_ratio", None)
+        return float(found) if isinstance(found, (int, float)) and math.isfinite(found) else None
 
     def ask(self) -> NDArray[np.float64]:
         """The next population `(population, dimension)`; `DreamfleetError` if the optimiser breaks its contract."""

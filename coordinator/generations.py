@@ -47,6 +47,11 @@ class Generations:
         """The strategy's overall step size."""
         return self._strategy.sigma
 
+    @property
+    def axis_ratio(self) -> float | None:
+        """The longest axis of the strategy's distribution by the shortest; `None` where it does not say."""
+        return self._strategy.axis_ratio
+
     def prepare(self) -> None:
         """Work ahead while workers are busy."""
         self._strategy.prepare()

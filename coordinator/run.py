@@ -70,6 +70,11 @@ class Run:
         return self._generations.sigma
 
     @property
+    def axis_ratio(self) -> float | None:
+        """The longest axis of the strategy's distribution by the shortest; `None` where it does not say."""
+        return self._generations.axis_ratio
+
+    @property
     def terms(self) -> Terms:
         """Those of the open generation."""
         return self._generations.terms

@@ -126,6 +126,7 @@ def _open_generation(run: Run, now: float) -> OpenGeneration:
         sigma=run.sigma,
         temperature=run.generation.spec.temperature,
         stage=_stage(run),
+        axis_ratio=None if run.axis_ratio is None else round(run.axis_ratio, 3),
     )
 
 

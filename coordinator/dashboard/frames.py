@@ -93,7 +93,7 @@ def _tiles(status: Status, eta: Eta) -> list[dict[str, str]]:
         _tile("reported", NONE if reported is None else score(reported), _beneath(reported)),
         _tile("throughput", f"{counted(round(spent.steps_per_second))} steps/s",
               f"{counted(spent.environment_steps)} steps in all"),
-        _tile("fleet", f"{status.workers.present} workers", f"{status.slots} slots"),
+        _tile("fleet", _plural(status.workers.present, "worker"), _plural(status.slots, "slot")),
     ]  # fmt: skip
 
 
@@ -144,6 +144,8 @@ def _progress(status: Status) -> list[dict[str, Any]]:
 def _search(status: Status) -> Facts:
     open_one, settings = status.generation, status.settings
     facts = [("step size", f"{open_one.sigma:.4g}"), ("optimiser", optimiser(settings))]
+    if open_one.axis_ratio is not None:
+        facts.append(("axis ratio", f"{open_one.axis_ratio:,.4g}"))
     if open_one.temperature is not None:
         facts.append(("temperature", f"{open_one.temperature:g}"))
     if status.last is not None:
@@ -179,10 +181,14 @@ def _troubles(status: Status) -> list[str]:
     return [printable(each) for each in found]
 
 
+def _plural(count: int, noun: str) -> str:
+    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
 def _fleet(status: Status) -> str:
     counts = status.workers
     gone = counts.known - counts.present
-    told = f"{counts.present} present, {status.slots} slots"
+    told = f"{counts.present} present, {_plural(status.slots, 'slot')}"
     return f"{told}, {gone} gone" if gone else told
 
 

@@ -51,6 +51,9 @@ class Optimiser(Protocol):
 
     `requirement` is what pip installs to get these very bits, such as "cma==4.5.0". A state names it, and is continued
     by the same one alone. `options` says which options there are, and what each takes.
+
+    It may have one thing more, which is shown: `axis_ratio`, a float, how many times longer the longest axis of its
+    distribution is than the shortest.
     """
 
     requirement: ClassVar[str]

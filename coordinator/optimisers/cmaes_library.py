@@ -42,6 +42,13 @@ class CmaesOptimiser(ABC):
         variances = covariance if covariance.ndim == 1 else np.diag(covariance)
         return float(self._strategy._sigma * np.sqrt(np.median(variances)))
 
+    @property
+    def axis_ratio(self) -> float | None:
+        """The longest axis of the distribution by the shortest; `None` between tell and ask, when no axes are known."""
+        covariance = self._strategy._C
+        axes = np.sqrt(covariance) if covariance.ndim == 1 else self._strategy._D
+        return None if axes is None else float(np.max(axes) / np.min(axes))
+
     def ask(self) -> NDArray[np.float64]:
         """Sample the next population `(population, dimension)`."""
         self._asked = [self._strategy.ask() for _ in range(self._search.population)]

@@ -57,6 +57,12 @@ class Pycma:
         """
         return float(np.median(self._strategy.stds))
 
+    @property
+    def axis_ratio(self) -> float:
+        """The longest axis of the distribution by the shortest."""
+        axes = self._strategy.stds if self._diagonal else self._strategy.sm.D
+        return float(np.max(axes) / np.min(axes))
+
     def ask(self) -> NDArray[np.float64]:
         """Sample the next population `(population, dimension)` (equations 38 to 40)."""
         self._asked = [np.asarray(x, dtype=np.float64) for x in self._strategy.ask()]

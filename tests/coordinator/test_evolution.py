@@ -162,3 +162,16 @@ def test_a_state_is_not_taken_while_a_population_is_open():
 def test_impossible_settings_are_refused(changes):
     with pytest.raises(UsageError):
         config(**changes)
+
+
+@pytest.mark.parametrize("search", [{"covariance": "full"}, {"covariance": "diagonal"}, {"optimiser": "cmaes-sep"},
+                                    {"optimiser": "cmaes-lra"}])  # fmt: skip
+def test_the_axis_ratio_tells_how_far_from_round_a_search_is(search):
+    evolution = Evolution(config(dimension=4, population=16, **search))
+    evolution.ask()
+    assert evolution.axis_ratio == pytest.approx(1.0)
+    steep = np.array([1.0, 1.0, 1.0, 100.0])
+    for _ in range(150):
+        evolution.tell(-(steep * np.square(evolution.ask() - 1)).sum(axis=1))
+    evolution.ask()
+    assert 2 < evolution.axis_ratio < 1000

@@ -59,3 +59,4 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
     for made in (f"{best}/drive.mp4", "demo/fitness.png", "demo-dream/fitness.png"):
         assert (processes.runs / made).stat().st_size > 1000
     assert "evolving in the dream" in out
+    assert "the dashboard is at http://127.0.0.1:" in out

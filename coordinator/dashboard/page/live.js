@@ -88,7 +88,7 @@ const fillAbsent = (frame, wanted) => {
   say(page.sentence, `No coordinator ${run ? `of ${run} ` : ""}answers at ${frame.address}. This page shows it as soon as one does; a command that starts one:`);
   fill(page.bounds, [], make, say);
   say(page.eta, "");
-  page.task.replaceChildren(make("code", `dreamfleet coordinator --run ${run || "NAME"} --listen ${frame.address.split(",")[0]}`));
+  page.task.replaceChildren(make("code", `dreamfleet coordinator --run ${run || "NAME"} --listen ${frame.address.split(",")[0]}`), " ", make("a", "or look at past runs", { href: "#/runs" }));
 };
 
 // Where several runs are live, one of them.

@@ -1,0 +1,327 @@
+"""The page in a real browser, about real coordinators and workers."""
+
+import dataclasses
+import json
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.processes import command
+from tests.support import tasks
+from tests.support.browser import PATIENCE, chromium, tab
+from tests.support.processes import free_port
+from tests.support.served import WORKER, serving, snapshot
+
+pytestmark = pytest.mark.timeout(240)
+RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
+TOKEN = "correct horse battery"
+LEFT_OUT = ("Failed to load resource", "net::ERR")  # what a browser says by itself of a server that is gone
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as started:
+        yield started
+
+
+@pytest.fixture
+def settings(random_bundle):
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+            "--task", tasks.SLOW_TOY)  # fmt: skip
+
+
+@contextmanager
+def dashboard(processes, *flags, runs=None):
+    """Its process, and the address that it told."""
+    started = processes.start(
+        "dashboard", "--connect", processes.endpoint, "--runs-dir", runs or processes.runs, *flags
+    )
+    started.address = re.search(r"http://\S+", started.wait_for("the dashboard is at")).group()
+    yield started
+    started.end()
+
+
+@pytest.fixture
+def page(browser, processes):
+    with dashboard(processes, "--port", 0) as started, tab(browser) as page:
+        page.goto(started.address)
+        page.address = started.address
+        yield page
+
+
+def wait(page, text, part="state"):
+    page.wait_for_function(
+        "([part, text]) => document.querySelector(`[data-part=${part}]`)?.textContent.includes(text)", arg=[part, text],
+        timeout=PATIENCE,
+    )  # fmt: skip
+
+
+def part(page, name):
+    return page.locator(f"[data-part={name}]").first.inner_text()
+
+
+def without_absence(page):
+    page.said[:] = [each for each in page.said if not each.startswith(LEFT_OUT)]
+
+
+def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes, settings):
+    wait(page, "no coordinator")
+    assert processes.endpoint in part(page, "sentence")
+    assert "dreamfleet coordinator --run NAME" in part(page, "task")
+    coordinator = processes.coordinator(*settings, "--generations", 1000)
+    wait(page, "waiting for workers")
+    assert part(page, "run") == "test"
+    worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "alpha")
+    wait(page, "running")
+    wait(page, "Generation 1:", "fitness-caption")
+    assert page.locator("[data-part=fitness] .scatterlayer .trace").count() >= 3
+    assert page.locator("[data-part=cells] .cell").count() == 4
+    assert "of 1,000 generations" in part(page, "eta")
+    assert "alpha" in part(page, "workers")
+    worker.popen.kill()
+    page.wait_for_selector(".workers tr[data-state=present]", state="detached")
+    wait(page, "waiting for workers")
+    coordinator.popen.kill()
+    wait(page, "coordinator lost since")
+    assert "--resume test" in part(page, "sentence")
+    resumed = processes.start(
+        "coordinator",
+        "--resume",
+        "test",
+        "--runs-dir",
+        processes.runs,
+        "--listen",
+        processes.endpoint,
+        "--generations",
+        4,
+    )
+    processes.worker("--task", tasks.SLOW_TOY, "--name", "beta")
+    wait(page, "finished")
+    assert resumed.finish()[0] == 0
+    assert "4 generations" in part(page, "sentence")
+    wait(page, "Generation 3:", "fitness-caption")
+    without_absence(page)
+
+
+def test_a_run_that_is_paused_says_why_and_one_that_is_left_how_to_go_on(page, processes, settings):
+    coordinator = processes.coordinator(*settings, "--generations", 1000)
+    wait(page, "waiting")
+    assert processes.call("pause", "test", "--connect", processes.endpoint)[0] == 0
+    wait(page, "paused")
+    wait(page, "paused by hand", "sentence")
+    coordinator.popen.send_signal(signal.SIGTERM)
+    wait(page, "left open")
+    wait(page, "--resume test", "sentence")
+
+
+def test_the_dashboard_may_die_and_come_back(browser, processes, settings):
+    processes.coordinator(*settings, "--generations", 1000)
+    port = free_port()
+    with tab(browser) as page:
+        with dashboard(processes, "--port", port) as first:
+            page.goto(first.address)
+            wait(page, "waiting for workers")
+            first.popen.kill()
+            page.wait_for_selector("#silent:not([hidden])")
+            assert "No word from the dashboard" in page.inner_text("#silent")
+        with dashboard(processes, "--port", port):
+            page.wait_for_selector("#silent", state="hidden")
+            wait(page, "waiting for workers")
+            page.goto("about:blank")
+        without_absence(page)
+
+
+def test_hostile_names_and_errors_stay_text(browser, processes):
+    nasty = "<img src=x onerror=alert(1)><script>alert(2)</script>\x1b[31m\u202e"
+    hostile = snapshot(workers=1, why=nasty, state="paused", refused={nasty: nasty}, dropped={nasty: 7})
+    failure = dataclasses.replace(
+        snapshot().status.settings.task, task=nasty[:60]
+    )  # a task's name may hold anything that somebody's own program puts there
+    status = dataclasses.replace(hostile.status, settings=dataclasses.replace(hostile.status.settings, task=failure))
+    worker = dataclasses.replace(WORKER, worker=f"{nasty}/0a1b2c3d"[:120], drawn_by="<b>native</b>")
+    with serving(processes.endpoint, dataclasses.replace(hostile, status=status, workers=(worker,))), \
+            dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
+        page.on("dialog", lambda dialog: page.said.append(dialog.message))
+        page.goto(started.address)
+        wait(page, "paused")
+        assert "<img src=x onerror=alert(1)>" in part(page, "sentence")
+        assert "\\x1b[31m" in part(page, "sentence")
+        assert "<script>" in part(page, "workers")
+        assert page.locator("main img, main script").count() == 0
+
+
+def test_several_live_runs_can_be_chosen_among(browser, processes):
+    second = f"tcp/127.0.0.1:{free_port()}"
+    with serving(processes.endpoint, snapshot()), serving(second, snapshot(name="lucid")), tab(browser) as page:
+        started = processes.start(
+            "dashboard", "--connect", processes.endpoint, "--runs-dir", processes.runs, "--port", 0
+        )  # one router knows one of them; the other answers where both are joined, below
+        address = re.search(r"http://\S+", started.wait_for("the dashboard is at")).group()
+        page.goto(f"{address}#/live/night")
+        wait(page, "night", "run")
+        page.goto(f"{address}#/live/elsewhere")
+        wait(page, "elsewhere", "run")
+        wait(page, "no coordinator")
+        assert page.locator("[data-part=chooser] a").all_inner_texts() == ["night"]
+
+
+def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, processes, tmp_path):
+    for name in ("dream", "reality", "hidden"):
+        shutil.copytree(RUNS / name, tmp_path / "runs" / name)
+    (tmp_path / "runs" / "broken").mkdir()
+    (tmp_path / "runs" / "broken" / "journal.sqlite").write_text("no journal")
+    with dashboard(processes, "--port", 0, runs=tmp_path / "runs") as started, tab(browser) as page:
+        page.goto(f"{started.address}#/runs")
+        rows = page.locator("[data-part=rows] tr")
+        page.wait_for_selector("[data-part=rows] tr")
+        assert rows.count() == 4
+        page.focus("th button")
+        page.keyboard.press("Enter")
+        assert [each.split()[0] for each in rows.all_inner_texts()] == ["broken", "dream", "hidden", "reality"]
+        page.keyboard.press("Enter")
+        assert [each.split()[0] for each in rows.all_inner_texts()] == ["reality", "hidden", "dream", "broken"]
+        page.fill("[data-part=search]", "dream")
+        assert rows.count() == 1
+        page.fill("[data-part=search]", "nothing at all")
+        assert "No run has these words" in part(page, "none")
+        page.fill("[data-part=search]", "")
+        for name in ("dream", "reality"):
+            page.focus(f"input[aria-label='compare {name}']")
+            page.keyboard.press("Space")
+        page.focus("[data-part=compare]")
+        page.keyboard.press("Enter")
+        page.wait_for_selector("[data-part=chart] .scatterlayer .trace")
+        for over in ("steps", "core_hours"):
+            page.check(f"input[name=over][value={over}]")
+            assert page.locator("[data-part=chart] .scatterlayer .trace").count() == 2
+        page.check("input[name=of][value=candidates]")
+        assert "not scored alike" in part(page, "caption"), "dreamt fitness and driven one"
+        page.goto(f"{started.address}#/run/dream")
+        page.wait_for_selector("[data-part=fitness] .scatterlayer .trace")
+        assert page.locator("[data-part=generations] tr").count() == 12
+        page.goto(f"{started.address}#/run/broken")
+        page.wait_for_selector("text=This cannot be shown")
+        page.goto(f"{started.address}#/run/..%2F..%2Fetc")
+        page.wait_for_selector("text=the dashboard answered 404")
+        without_absence(page)  # a browser tells of each 404
+
+
+def test_an_empty_runs_folder_says_how_a_run_is_started(page):
+    page.goto(f"{page.address}#/runs")
+    page.wait_for_selector("text=No runs here yet")
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (390, "dark"), (1280, "dark")])
+def test_it_fits_a_phone_and_follows_the_systems_colours(browser, processes, width, scheme):
+    names = tuple(dataclasses.replace(WORKER, worker=f"{'a-rather-long-host-name-' * 2}{n}/0a1b2c3d") for n in range(3))
+    with serving(processes.endpoint, dataclasses.replace(snapshot(40), workers=names)), \
+            dashboard(processes, "--port", 0) as started, \
+            tab(browser, viewport={"width": width, "height": 844}, color_scheme=scheme) as page:  # fmt: skip
+        page.goto(started.address)
+        wait(page, "running")
+        wait(page, "Generation 39", "fitness-caption")
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        cut = "all => all.filter(each => each.scrollWidth > each.clientWidth + 1).length"
+        assert page.eval_on_selector_all("td.name, h1, .tile b", cut) == 0, "no name is cut"
+        page_colour = "getComputedStyle(document.documentElement).backgroundColor"
+        dark = page.evaluate(page_colour) == "rgb(14, 19, 26)"
+        assert dark == (scheme == "dark")
+        for _ in range(2 if scheme == "light" else 1):  # system, light, dark
+            page.click("#theme")
+        assert (page.evaluate(page_colour) == "rgb(14, 19, 26)") != dark
+        page.reload()
+        wait(page, "running")
+        assert (page.evaluate(page_colour) == "rgb(14, 19, 26)") != dark, "a choice is kept"
+
+
+def test_everything_can_be_reached_by_keyboard_and_the_focus_is_seen(page):
+    page.wait_for_selector("#theme")
+    reached = []
+    for _ in range(5):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate("document.activeElement.textContent.trim()"))
+        assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") != "none"
+    assert reached == ["Skip to the run", "dreamfleet", "Live", "Past runs", "Theme: system"]
+
+
+def test_five_thousand_generations_and_five_hundred_workers_are_shown(browser, processes):
+    with serving(processes.endpoint, snapshot(5000, workers=500, population=400)), \
+            dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
+        page.goto(started.address)
+        wait(page, "Generation 4999", "fitness-caption")
+        assert "Every 9th generation is drawn" in part(page, "fitness-caption")
+        page.wait_for_selector(".workers tbody tr:nth-child(500)", state="attached")
+        assert page.locator("[data-part=cells] .cell").count() == 400
+
+
+def test_another_coordinators_words_are_told_and_end_nothing(browser, processes):
+    strange = snapshot(3)
+    broken = dataclasses.replace(
+        strange, status=dataclasses.replace(strange.status, recent=(), generations=2**60, uptime=float("inf"))
+    )
+    with serving(processes.endpoint, strange) as served, dashboard(processes, "--port", 0) as started, \
+            tab(browser) as page:  # fmt: skip
+        page.goto(started.address)
+        wait(page, "running")
+        served.snapshot = broken
+        wait(page, "lost")
+        served.snapshot = strange
+        wait(page, "running")
+        without_absence(page)
+
+
+def test_the_token_is_asked_for_and_opens_the_page(browser, processes):
+    with dashboard(processes, "--host", "0.0.0.0", "--port", 0, "--token", TOKEN) as started, tab(browser) as page:
+        address = started.address.replace("0.0.0.0", "127.0.0.1")
+        page.goto(address)
+        page.fill("input[name=token]", "not this one")
+        page.click("button")
+        page.wait_for_selector("text=This is not the token")
+        page.fill("input[name=token]", TOKEN)
+        page.click("button")
+        wait(page, "no coordinator")
+        assert TOKEN not in page.url
+        without_absence(page)  # a browser tells of each 401
+
+
+def test_what_cannot_be_served_is_one_line(processes):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        code, _, err = processes.call("dashboard", "--port", taken.getsockname()[1])
+    assert (code, "is in use" in err, "--port" in err) == (1, True, True), err
+    code, _, err = processes.call("dashboard", "--host", "0.0.0.0")
+    assert (code, "give a --token" in err) == (2, True), err
+    code, _, err = processes.call("dashboard", "--run", "No Run")
+    assert (code, "cannot name a run" in err) == (2, True), err
+
+
+def test_without_its_packages_it_names_the_extra():
+    hidden = (
+        "import sys; sys.modules.update({'plotly': None}); from dreamfleet.common.cli import main; sys.exit(main())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", hidden, "dashboard", "--port", "0"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, "pip install 'dreamfleet[dashboard]'" in done.stderr) == (1, True), done.stderr
+    assert command("dashboard")[-1] == "dashboard"
+
+
+def test_it_leaves_at_once_although_pages_are_open(processes):
+    with dashboard(processes, "--port", 0) as started:
+        stream = urllib.request.urlopen(f"{started.address}live", timeout=30)
+        assert stream.readline().startswith(b"event: hello")
+        assert "digest" in json.loads(stream.readline().removeprefix(b"data: "))
+        started.popen.send_signal(signal.SIGTERM)
+        assert started.popen.wait(10) is not None
+        with pytest.raises(urllib.error.URLError):
+            urllib.request.urlopen(started.address, timeout=5)

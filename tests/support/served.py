@@ -1,0 +1,59 @@
+"""A coordinator's answers without a coordinator: any snapshot, over real Zenoh, and what comes of it a moment later."""
+
+import dataclasses
+from contextlib import contextmanager
+from logging import getLogger
+
+from dreamfleet.common.mishaps import Mishaps
+from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.status import WorkerCount
+from dreamfleet.common.stored import StoredEvaluation
+from dreamfleet.coordinator.generation import Standing
+from dreamfleet.coordinator.history import History
+from dreamfleet.coordinator.queryables import answer_status
+from dreamfleet.coordinator.status import Snapshot
+from tests.support.samples import CLOSED, STATUS
+
+WORKER = STATUS.worker_list[0]
+
+
+def snapshot(generations=8, workers=1, population=16, name="night", **changes):
+    """Of a run of so many closed generations and workers."""
+    history = History(
+        dataclasses.replace(CLOSED, number=number, mean=float(number % 300), best=50.0 + number % 300, sigma=0.1)
+        for number in range(generations)
+    )
+    looks = tuple(StoredEvaluation(number, 16, 100.0 + number % 300, 20.0) for number in range(4, generations, 5))
+    fleet = tuple(
+        dataclasses.replace(WORKER, worker=f"host-{index // 4:03d}/{index:08x}", steps_per_second=100.0 * (index % 9))
+        for index in range(workers)
+    )
+    half = population // 2
+    standing = Standing(
+        generations, [2] * half + [0] * (population - half), [2] * population,
+        [float(index) for index in range(half)] + [None] * (population - half),
+    )  # fmt: skip
+    status = dataclasses.replace(
+        STATUS, run=name, generation=dataclasses.replace(STATUS.generation, number=generations),
+        generations=generations, last=history.last, recent=(), worker_list=(), workers=WorkerCount(workers, workers),
+        population=dataclasses.replace(STATUS.population, generation=generations, total=population),
+        evaluation=looks[-1] if looks else None, best=looks[-1] if looks else None, evaluations=len(looks),
+        **{"failures": (), "failing": 0, "dropped": {}, **changes},
+    )  # fmt: skip
+    return Snapshot(status, fleet, history.view(), looks, standing, None, None)
+
+
+class Served:
+    """What is answered; a test sets another snapshot."""
+
+    def __init__(self, first):
+        self.snapshot = first
+
+
+@contextmanager
+def serving(endpoint, first):
+    """Answer for a run at `endpoint` until the end."""
+    served = Served(first)
+    with open_session(Network(listen=(endpoint,))) as session:
+        answer_status(session, first.status.run, lambda: served.snapshot, Mishaps(getLogger(__name__)))
+        yield served
