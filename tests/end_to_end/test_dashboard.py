@@ -253,14 +253,41 @@ def test_everything_can_be_reached_by_keyboard_and_the_focus_is_seen(page):
     assert reached == ["Skip to the run", "dreamfleet", "Live", "Past runs", "Theme: system"]
 
 
-def test_five_thousand_generations_and_five_hundred_workers_are_shown(browser, processes):
-    with serving(processes.endpoint, snapshot(5000, workers=500, population=400)), \
+def moved(fleet, by):
+    """The same workers a moment later."""
+    return tuple(
+        dataclasses.replace(
+            each, steps_per_second=float((7 * n + 13 * by) % 900), leases=(n + by) % 20, finished=by * n
+        )
+        for n, each in enumerate(fleet)
+    )
+
+
+def busy(page):
+    """Milliseconds that the page's main thread has worked, as its own clock has it, and updates that it painted."""
+    metrics = page.cdp.send("Performance.getMetrics")["metrics"]
+    seconds = next(each["value"] for each in metrics if each["name"] == "TaskDuration")
+    return 1000 * seconds, page.evaluate("performance.getEntriesByName('update').length")
+
+
+def test_five_thousand_generations_and_five_hundred_workers_are_painted_in_no_time(browser, processes):
+    with serving(processes.endpoint, snapshot(5000, workers=500, population=400)) as served, \
             dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
         page.goto(started.address)
         wait(page, "Generation 4999", "fitness-caption")
         assert "Every 9th generation is drawn" in part(page, "fitness-caption")
         page.wait_for_selector(".workers tbody tr:nth-child(500)", state="attached")
         assert page.locator("[data-part=cells] .cell").count() == 400
+        page.cdp = page.context.new_cdp_session(page)
+        page.cdp.send("Performance.enable", {"timeDomain": "threadTicks"})
+        began, painted = busy(page)
+        for by in range(1, 6):
+            served.snapshot = dataclasses.replace(served.snapshot, workers=moved(served.snapshot.workers, by))
+            page.wait_for_function(
+                "since => performance.getEntriesByName('update').length > since", arg=painted + by - 1
+            )
+        ended, updates = busy(page)
+        assert (ended - began) / (updates - painted) < 100, "milliseconds an update"
 
 
 def test_another_coordinators_words_are_told_and_end_nothing(browser, processes):

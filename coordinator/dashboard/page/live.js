@@ -200,15 +200,15 @@ const cell = (key, value) =>
   key === "heard" ? `${value.toFixed(1)} s ago` : key === "load" ? value.toFixed(2) : typeof value === "number" ? value.toLocaleString("en") : value;
 
 const workerRow = () => {
-  const row = make("tr");
-  row.name = make("td", "", { class: "name" });
+  const row = make("tr", "", { role: "row" }); // the roles that a grid would take from a table
+  row.name = make("td", "", { class: "name", role: "cell" });
   row.name.append(make("b"), make("small"));
-  const lane = make("td", "", { class: "lane" });
+  const lane = make("td", "", { class: "lane", role: "cell" });
   row.canvas = make("canvas", "", { width: "480", height: "32", "aria-hidden": "true" });
   lane.append(row.canvas);
   row.append(row.name, lane);
   for (const [key, label] of COLUMNS)
-    row.append(make("td", "", { "data-label": label, class: key === "state" ? "tag" : LEFT.has(key) ? "" : "n" }));
+    row.append(make("td", "", { "data-label": label, role: "cell", class: key === "state" ? "tag" : LEFT.has(key) ? "" : "n" }));
   lanes.observe(row);
   return row;
 };
