@@ -17,6 +17,8 @@ EXPECTED = (
     "dreamfleet/__main__.py",
     "dreamfleet/py.typed",
     "dreamfleet/common/pretrained/tiny.zip",
+    "dreamfleet/coordinator/dashboard/page/index.html",
+    "dreamfleet/coordinator/dashboard/page/main.js",
     "dreamfleet/coordinator/service.py",
     "dreamfleet/worker/service/worker.py",
 )

@@ -143,10 +143,9 @@ def test_the_dashboard_may_die_and_come_back(browser, processes, settings):
 def test_hostile_names_and_errors_stay_text(browser, processes):
     nasty = "<img src=x onerror=alert(1)><script>alert(2)</script>\x1b[31m\u202e"
     hostile = snapshot(workers=1, why=nasty, state="paused", refused={nasty: nasty}, dropped={nasty: 7})
-    failure = dataclasses.replace(
-        snapshot().status.settings.task, task=nasty[:60]
-    )  # a task's name may hold anything that somebody's own program puts there
-    status = dataclasses.replace(hostile.status, settings=dataclasses.replace(hostile.status.settings, task=failure))
+    settings = hostile.status.settings
+    task = dataclasses.replace(settings.task, task=nasty[:60])  # somebody's own program may say so
+    status = dataclasses.replace(hostile.status, settings=dataclasses.replace(settings, task=task))
     worker = dataclasses.replace(WORKER, worker=f"{nasty}/0a1b2c3d"[:120], drawn_by="<b>native</b>")
     with serving(processes.endpoint, dataclasses.replace(hostile, status=status, workers=(worker,))), \
             dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
@@ -160,18 +159,17 @@ def test_hostile_names_and_errors_stay_text(browser, processes):
 
 
 def test_several_live_runs_can_be_chosen_among(browser, processes):
-    second = f"tcp/127.0.0.1:{free_port()}"
-    with serving(processes.endpoint, snapshot()), serving(second, snapshot(name="lucid")), tab(browser) as page:
-        started = processes.start(
-            "dashboard", "--connect", processes.endpoint, "--runs-dir", processes.runs, "--port", 0
-        )  # one router knows one of them; the other answers where both are joined, below
-        address = re.search(r"http://\S+", started.wait_for("the dashboard is at")).group()
-        page.goto(f"{address}#/live/night")
+    with serving(processes.endpoint, snapshot(), snapshot(name="lucid")), \
+            dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
+        page.goto(f"{started.address}#/live/night")
         wait(page, "night", "run")
-        page.goto(f"{address}#/live/elsewhere")
+        wait(page, "running")
+        page.click("[data-part=chooser] a:text-is('lucid')")
+        wait(page, "lucid", "run")
+        page.goto(f"{started.address}#/live/elsewhere")
         wait(page, "elsewhere", "run")
         wait(page, "no coordinator")
-        assert page.locator("[data-part=chooser] a").all_inner_texts() == ["night"]
+        assert page.locator("[data-part=chooser] a").all_inner_texts() == ["lucid", "night"]
 
 
 def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, processes, tmp_path):

@@ -51,9 +51,12 @@ class Served:
 
 
 @contextmanager
-def serving(endpoint, first):
-    """Answer for a run at `endpoint` until the end."""
+def serving(endpoint, first, *others):
+    """Answer at `endpoint` until the end: for a run whose snapshot may be set, and for others."""
     served = Served(first)
     with open_session(Network(listen=(endpoint,))) as session:
-        answer_status(session, first.status.run, lambda: served.snapshot, Mishaps(getLogger(__name__)))
+        mishaps = Mishaps(getLogger(__name__))
+        answer_status(session, first.status.run, lambda: served.snapshot, mishaps)
+        for other in others:
+            answer_status(session, other.status.run, lambda other=other: other, mishaps)
         yield served
