@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -47,14 +48,14 @@ def one(runs_dir: Path, name: str) -> dict[str, Any]:
             "facts": _facts(run, course, total),
             "settings": flat(settings),
             "world": _world(run),
-            "curves": curves(course, quartiles_of(run, settings, history), spent),
+            "curves": curves(course, quartiles_of(run, settings, sampled(history)), spent),
             "generations": [_generation(each) for each in history[-LAST:][::-1]],
         }
 
 
-def quartiles_of(run: RunFolder, settings: RunSettings, history: list[StoredGeneration]) -> Quartiles | None:
+def quartiles_of(run: RunFolder, settings: RunSettings, drawn: Sequence[StoredGeneration]) -> Quartiles | None:
     """Those of the generations that are drawn; `None` where there would be too much to read."""
-    numbers = [each.number for each in sampled(history)]
+    numbers = [each.number for each in drawn]
     largest = max(each.population for each in stages_of(settings))
     if len(numbers) * largest * settings.controller.size * 4 > MOST_READ:
         return None

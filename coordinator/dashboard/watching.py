@@ -128,7 +128,7 @@ class Watcher:
                 with suppress(MalformedError):
                     status = read_status(read_document(sample.payload.to_bytes()))
                     followed = self._followed.get(status.run)
-                    if followed is not None and followed.uid == status.run_uid:
+                    if followed is not None and followed.is_of(status):
                         followed.take_last(status, now)
 
     def _forget(self) -> None:
@@ -139,6 +139,12 @@ class Watcher:
 
     def _picture(self) -> Picture:
         live = [name for name, each in self._followed.items() if each.is_live]
+        shown = {}
+        for name, each in self._followed.items():
+            try:
+                shown[name] = each.shown(sorted(live))
+            except UNREADABLE as error:  # numbers that are none, say
+                self._trouble = f"run {name}: {error}"
         chosen = next(reversed(live or list(self._followed)), None)
         absent = {
             "link": "absent",
@@ -148,8 +154,7 @@ class Watcher:
             "trouble": shortened(self._trouble, 1000),
             "only": self._only or "",
         }
-        return Picture({name: each.shown(sorted(live)) for name, each in self._followed.items()}, chosen,
-                       event("frame", absent))  # fmt: skip
+        return Picture(shown, chosen, event("frame", absent))
 
 
 @dataclass
@@ -187,6 +192,10 @@ class _Followed:
     def is_live(self) -> bool:
         """Whether its coordinator answers."""
         return self.lost is None and not self.status.over
+
+    def is_of(self, farewell: Status) -> bool:
+        """Whether that is its coordinator's, and not of an earlier life whose word came late."""
+        return farewell.run_uid == self.uid and farewell.incarnation >= self.status.incarnation
 
     def is_ahead_of(self, status: Status) -> bool:
         """Whether it knows of generations that the run has not: an older copy of it is served now."""
@@ -271,7 +280,7 @@ class _Followed:
             with open_run(self.runs_dir, self.name) as stored:
                 found = self._missing(stored, wanted)
         except DreamfleetError:
-            found = None
+            found = None  # it was moved away
         self._quartiles = None if found is None else {**read, **found}
 
     def _missing(self, stored: RunFolder, wanted: list[StoredGeneration]) -> Mapping[int, tuple[float, float]] | None:

@@ -66,7 +66,7 @@ def wait(page, text, part="state"):
 
 
 def part(page, name):
-    return page.locator(f"[data-part={name}]").first.inner_text()
+    return page.locator(f"[data-part={name}]").first.text_content()  # also of rows out of sight
 
 
 def without_absence(page):
