@@ -25,7 +25,9 @@ def test_quartiles_are_those_of_the_candidates_of_every_generation_that_is_drawn
         low, high = found[each.number]
         fitness = sorted(run.fitness(each.number, number) for number in range(run.settings.population))
         assert each.worst <= low <= high <= each.best
-        assert sum(value <= low for value in fitness) == sum(value >= high for value in fitness) == round(len(fitness) / 4)
+        assert (
+            sum(value <= low for value in fitness) == sum(value >= high for value in fitness) == round(len(fitness) / 4)
+        )
 
 
 def test_a_run_whose_candidates_are_too_much_to_read_has_none(run, monkeypatch):
