@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from dreamfleet.common.stages import Stage, begun_stages, in_turn
 from dreamfleet.common.tasks import DREAM
 from dreamfleet.coordinator.learning import LearningCurve, Mark, Point
 
+TITLE = 90  # characters of a line of it
 KINDS = (".png", ".svg")
 PAPERS_NAME = "Ha & Schmidhuber 2018, their public log (1024 tracks; of its time the end alone is known)"
 REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # names of an SVG's parts are drawn at random otherwise
@@ -32,7 +34,8 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     size = in_turn(f"{each.stage.population} candidates x {each.stage.episodes} episodes" for each in stages)
     steps = in_turn(_steps(each.stage, dreamt=settings.task.task == DREAM) for each in stages)
     axes.set_ylabel(f"fitness over {steps}")
-    axes.set_title(f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}", fontsize=11)
+    title = f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}"
+    axes.set_title("\n".join(textwrap.wrap(title, TITLE)), fontsize=11)
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     _save(figure, path)
 
