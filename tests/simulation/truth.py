@@ -25,7 +25,7 @@ STEPS = 100  # of every episode
 TASK = "simulated"
 SECOND_HORIZON, SECOND_PATIENCE, SECOND_SIGMA = 2 * STEPS, 7, 0.25  # of a second stage
 
-Named = tuple[float | None, int | None, int | None]
+Named = tuple[float | None, int | None, int | None, bool | None]  # nothing is driven where nothing dreams
 """Temperature, horizon and patience of a job where they are not the run's."""
 
 
@@ -135,13 +135,13 @@ def _truth(shape: Shape) -> Truth:
     truth, counted, second = Truth([], [], {}, {}, 0), set(), False
     for number in range(shape.generations):
         warm = terms_at(number, settings, (), truth.evaluations.values()).spec.temperature
-        named: Named = (None if warm == settings.task.temperature else warm, None, None)
+        named: Named = (None if warm == settings.task.temperature else warm, None, None, None)
         episodes, racing = shape.episodes, shape.racing
         if not second and _first_is_over(shape, number, truth.evaluations):
             second = True
             strategy = _second_search(shape, strategy) if shape.anew else strategy
         if second:
-            named, episodes, racing = (named[0], SECOND_HORIZON, SECOND_PATIENCE), episodes + 1, not racing
+            named, episodes, racing = (named[0], SECOND_HORIZON, SECOND_PATIENCE, None), episodes + 1, not racing
         vectors = tuple(row.astype("<f4").tobytes() for row in strategy.ask())
         seeds = [training_seed(shape.run_seed, number, episode) for episode in range(episodes)]
         scores = [[fitness_of(vector, seed, named) for seed in seeds] for vector in vectors]
@@ -154,7 +154,7 @@ def _truth(shape: Shape) -> Truth:
         mean = strategy.mean.astype("<f4").tobytes()
         if _due(shape.evaluate_every, number, last and shape.ends):
             tracks = validation_seeds(shape.evaluation_episodes)
-            values = np.array([fitness_of(mean, seed, (None, None, None)) for seed in tracks])
+            values = np.array([fitness_of(mean, seed, (None, None, None, None)) for seed in tracks])
             truth.evaluations[number] = StoredEvaluation(number, len(tracks), float(values.mean()), float(values.std()))
             counted |= {("evaluate", mean, seed) for seed in tracks}
         if _due(shape.collect_every, number, last and shape.ends):

@@ -12,6 +12,7 @@ from dreamfleet.coordinator.generation import Standing
 from dreamfleet.coordinator.history import History
 from dreamfleet.coordinator.queryables import answer_status
 from dreamfleet.coordinator.status import Snapshot
+from dreamfleet.coordinator.story import Story
 from tests.support.samples import CLOSED, STATUS
 
 WORKER = STATUS.worker_list[0]
@@ -40,7 +41,7 @@ def snapshot(generations=8, workers=1, population=16, name="night", **changes):
         evaluation=looks[-1] if looks else None, best=looks[-1] if looks else None, evaluations=len(looks),
         **{"failures": (), "failing": 0, "dropped": {}, **changes},
     )  # fmt: skip
-    return Snapshot(status, fleet, history.view(), looks, standing, None, None)
+    return Snapshot(status, fleet, history.view(), looks, standing, None, None, Story().view(), 0.0)
 
 
 class Served:
