@@ -12,6 +12,7 @@ import secrets
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
+from itertools import islice
 from time import monotonic
 from typing import Any
 
@@ -317,11 +318,12 @@ class Service:
             log.info("generation %d: mean %.1f, best %.1f", closed.number, closed.mean, closed.best,
                      extra={"facts": {"event": "generation", **asdict(closed)}})  # fmt: skip
         evaluations = self._run.slack.evaluations
-        if (last := evaluations.last) is not None and len(evaluations) > self._evaluations_told:
-            log.info("evaluation of generation %d's mean: %.1f ± %.1f (standard error), %d episodes",
-                     last.generation, last.mean, last.error, last.episodes,
-                     extra={"facts": {"event": "evaluation", **asdict(last), "error": last.error}})  # fmt: skip
-        self._evaluations_told = len(evaluations)
+        if len(evaluations) > self._evaluations_told:
+            for each in islice(evaluations.finished.values(), self._evaluations_told, None):  # as they finished
+                log.info("evaluation of generation %d's mean: %.1f ± %.1f (standard error), %d episodes",
+                         each.generation, each.mean, each.error, each.episodes,
+                         extra={"facts": {"event": "evaluation", **asdict(each), "error": each.error}})  # fmt: skip
+            self._evaluations_told = len(evaluations)
 
     def _take_snapshot(self) -> Snapshot:
         now = monotonic()
