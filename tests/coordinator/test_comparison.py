@@ -1,12 +1,8 @@
 """Runs beside each other: what differs, and what a difference is worth."""
 
 import json
-import shutil
 import sqlite3
 from contextlib import closing
-from pathlib import Path
-
-import pytest
 
 from dreamfleet.common import cli
 from dreamfleet.common.difference import Difference
@@ -14,16 +10,6 @@ from dreamfleet.common.runs import CONFIRMED, open_run
 from dreamfleet.common.seeds import CONFIRMING, VALIDATION
 from dreamfleet.common.stored import StoredConfirmation
 from dreamfleet.coordinator.comparison import Side, at_equal_spending, difference, differing
-
-FIXTURES = Path(__file__).parents[1] / "fixtures"
-
-
-@pytest.fixture
-def runs(tmp_path):
-    for name in ("dream", "reality", "hidden"):
-        shutil.copytree(FIXTURES / "runs" / name, tmp_path / "runs" / name)
-        shutil.copyfile(FIXTURES / "small.zip", tmp_path / "runs" / name / "bundle.zip")
-    return tmp_path / "runs"
 
 
 def confirm(runs, name, scores):

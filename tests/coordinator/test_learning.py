@@ -1,10 +1,8 @@
 """What runs learnt from what they spent, as data and as a picture."""
 
 import html
-import shutil
 import sqlite3
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 
@@ -15,18 +13,8 @@ from dreamfleet.common.runs import open_run
 from dreamfleet.coordinator.learning import PAPER, LearningCurve, Point
 from dreamfleet.coordinator.plot import PAPERS_NAME, plot_learning
 
-FIXTURES = Path(__file__).parents[1] / "fixtures"
 FIRST, LAST = Effort(10**5, 10**4, 0, 10**9), Effort(2 * 10**5, 9 * 10**4, 0, 3 * 10**9)
 CURVE = LearningCurve("night", "car-racing", (Point(FIRST, 310.0, 80.0),), Point(LAST, 680.0, 20.0), LAST)
-
-
-@pytest.fixture
-def runs(tmp_path):
-    """Recorded runs, each with its world model."""
-    for name in ("dream", "reality", "hidden"):
-        shutil.copytree(FIXTURES / "runs" / name, tmp_path / "runs" / name)
-        shutil.copyfile(FIXTURES / "small.zip", tmp_path / "runs" / name / "bundle.zip")
-    return tmp_path / "runs"
 
 
 def sums(runs, name, until):
