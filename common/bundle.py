@@ -5,16 +5,11 @@ The file's SHA-256 is its identity. Equal parts give equal files: entries are so
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import io
 import json
-import os
-import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,10 +19,10 @@ from numpy.typing import NDArray
 from dreamfleet.common.archives import Archive, DamagedError, Limits, open_archive
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.controller import Controller, ControllerShape
-from dreamfleet.common.errors import BundleError, ControllerError, UsageError
+from dreamfleet.common.errors import BundleError, ControllerError
 from dreamfleet.common.fields import OPTIONAL, written
-from dreamfleet.common.files import is_there, open_growing, open_regular, read_regular, write_aside
-from dreamfleet.common.lean import SUFFIX, Lean, put_together, read_lean, write_lean, write_stored
+from dreamfleet.common.files import open_regular, read_regular, write_aside
+from dreamfleet.common.lean import write_stored
 from dreamfleet.common.messages import Between, Word
 from dreamfleet.common.tensors import UnfitError, check_fit, is_empty, read_array, weights_finite
 from dreamfleet.common.variants import PLAIN, WORLD, Variant
@@ -41,10 +36,9 @@ LINEAR, LAYERED = "controller-linear.onnx", "controller-hidden.onnx"  # controll
 WEIGHTS = "weights.safetensors"  # only in bundles that training goes on from
 REQUIRED = (ENCODER, DECODER, POLICY, INITIAL)
 MAX_BUNDLE = 256 << 20  # bytes, of the file and of all that it holds: the largest known is 16 MB
-_LIMITS = Limits(MAX_BUNDLE)
+LIMITS = Limits(MAX_BUNDLE)
 _MAX_MANIFEST = 1_000_000
 MOST_RECORDED = 16_384  # states: 19 MB of the default layers'
-_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -92,10 +86,10 @@ class Bundle:
             raise BundleError(f"no bundle at {path}") from None
         except OSError as error:
             raise BundleError(f"{path} is not a whole bundle ({error.strerror}); fetch or build it again") from error
-        return cls._of(path, data, sha256)
+        return cls.of(path, data, sha256)
 
     @classmethod
-    def _of(cls, path: Path, data: bytes, wanted: str | None) -> Bundle:
+    def of(cls, path: Path, data: bytes, wanted: str | None) -> Bundle:
         """The bundle that these bytes of `path` are."""
         found = hashlib.sha256(data).hexdigest()
         if wanted is not None and found != wanted:
@@ -104,7 +98,7 @@ class Bundle:
                 "put the right one there; one in a cache may be deleted, and is fetched again"
             )
         try:
-            with open_archive(io.BytesIO(data), _LIMITS) as archive:
+            with open_archive(io.BytesIO(data), LIMITS) as archive:
                 manifest = _read_manifest(archive, path)
                 for name in {*REQUIRED, *manifest.parts}:
                     _look(path, manifest, name, _read_part(archive, path, manifest, name))
@@ -187,7 +181,7 @@ class Bundle:
         if name not in self.manifest.parts:
             raise BundleError(f"{self.path} holds no {name}")
         try:
-            with open_regular(self.path, MAX_BUNDLE) as file, open_archive(file, _LIMITS) as archive:
+            with open_regular(self.path, MAX_BUNDLE) as file, open_archive(file, LIMITS) as archive:
                 return _read_part(archive, self.path, self.manifest, name)
         except (OSError, DamagedError) as error:
             raise BundleError(f"{self.path} was changed while it was in use ({error}); fetch it again") from error
@@ -202,148 +196,6 @@ def write_bundle(path: Path, manifest: Manifest, parts: Mapping[str, bytes]) -> 
     with write_aside(path) as file:
         write_stored(file, [(MANIFEST, text.encode()), *sorted(parts.items())])
     return Bundle.open(path)
-
-
-def ship_lean(bundle: Bundle, base: str, path: Path) -> None:
-    """Write the bundle as one that ships beside the one of the name `base`, without the parts that it has in common."""
-    lean = Lean(bundle.sha256, base, (MANIFEST, *sorted(bundle.manifest.parts)))
-    write_lean(path, lean, bundle.path, shipped_bundles()[base], _LIMITS)
-
-
-class BundleStore:
-    """Bundles by hash in a cache folder; what ships with the package is found too."""
-
-    def __init__(self, root: Path) -> None:
-        self._folder = root / "bundles"
-
-    def find(self, sha256: str) -> Bundle | None:
-        """The verified bundle of this hash; a damaged cached copy is removed, so that it is fetched again."""
-        if (cached := self._cached(sha256)) is not None:
-            return cached
-        for path in shipped_bundles().values():
-            if (data := _bytes_of(path)) is not None and hashlib.sha256(data).hexdigest() == sha256:
-                return Bundle._of(path, data, sha256)
-        return next((self.grow(path) for path, lean in _leans() if lean.sha256 == sha256), None)
-
-    def _cached(self, sha256: str) -> Bundle | None:
-        path = self._path(sha256)
-        if (data := _bytes_of(path)) is None:
-            return None
-        if hashlib.sha256(data).hexdigest() == sha256:
-            return Bundle._of(path, data, sha256)
-        with suppress(OSError):  # looked at, and wrong; one that another process completes meanwhile must stay
-            path.unlink(missing_ok=True)
-        return None
-
-    def grow(self, path: Path) -> Bundle:
-        """The whole bundle of a lean file that ships; put together here once."""
-        lean = read_lean(path, _LIMITS)
-        base = shipped_bundles().get(lean.base)
-        if base is None:
-            raise BundleError(f"{path} needs the bundle {lean.base}, which does not ship: install dreamfleet again")
-        with self.downloading(lean.sha256) as partial:
-            if (found := self._cached(lean.sha256)) is not None:
-                return found
-            try:
-                with partial.open("wb") as file:
-                    put_together(path, base, file, _LIMITS)
-            except OSError as error:
-                raise self.unwritable(error) from error
-            return self.complete(lean.sha256)
-
-    @contextmanager
-    def downloading(self, sha256: str) -> Iterator[Path]:
-        """Hold the right to download: where the bundle grows; what is there already is its beginning.
-
-        Waits while another process of this host downloads it; look with `find` again before you do.
-        """
-        partial = self._partial(sha256)
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            lock = open_growing(partial.with_suffix(".lock"))
-        except OSError as error:
-            raise self.unwritable(error) from error
-        with lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield partial
-
-    def complete(self, sha256: str) -> Bundle:
-        """Verify a finished download and give it its name; a wrong one is removed."""
-        partial, path = self._partial(sha256), self._path(sha256)
-        try:
-            if (found := hash_file(partial)) != sha256:
-                partial.unlink()
-                raise BundleError(
-                    f"the bundle arrived damaged: its hash is {found[:12]}..., not {sha256[:12]}...; try again"
-                )
-            partial.replace(path)
-        except OSError as error:
-            raise self.unwritable(error) from error
-        return Bundle.open(path, sha256)
-
-    def unwritable(self, error: OSError) -> BundleError:
-        """What to say where the folder takes nothing."""
-        return BundleError(
-            f"cannot write in {self._folder}: {error.strerror}; make room there, or point $DREAMFLEET_CACHE elsewhere"
-        )
-
-    def _path(self, sha256: str) -> Path:
-        return self._folder / f"{_checked(sha256)}.zip"
-
-    def _partial(self, sha256: str) -> Path:
-        return self._folder / f"{_checked(sha256)}.part"
-
-
-def _checked(sha256: str) -> str:
-    """A hash that comes over the wire becomes part of a path: it must be one."""
-    if not _SHA256.fullmatch(sha256):
-        raise BundleError(f"{sha256!r} is no hash of a bundle: the run's specification is damaged")
-    return sha256
-
-
-def default_cache() -> Path:
-    """`$DREAMFLEET_CACHE`, else `dreamfleet` in the user's cache folder."""
-    given = os.environ.get("DREAMFLEET_CACHE")
-    if given:
-        return Path(given)
-    try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dreamfleet"
-    except RuntimeError as error:  # neither $HOME nor the user's entry names a folder
-        raise UsageError("this user has no home folder: point $DREAMFLEET_CACHE at one for the cache") from error
-
-
-def pretrained() -> Path:
-    """The folder of what ships: bundles as `NAME.zip`, controllers as `NAME.npz`."""
-    return Path(str(files("dreamfleet.common"))) / "pretrained"
-
-
-def shipped_bundles() -> dict[str, Path]:
-    """The bundles that ship whole, by name."""
-    return {path.stem: path for path in sorted(pretrained().glob("*.zip"))}
-
-
-def _leans() -> Iterator[tuple[Path, Lean]]:
-    """The lean files that ship."""
-    for path in sorted(pretrained().glob(f"*{SUFFIX}")):
-        yield path, read_lean(path, _LIMITS)
-
-
-def shipped_names() -> tuple[str, ...]:
-    """The names of all bundles that ship."""
-    return (*shipped_bundles(), *(path.stem for path, _ in _leans()))
-
-
-def find_bundle(name: str) -> Bundle:
-    """A shipped bundle by name, or any by path."""
-    shipped = shipped_bundles()
-    if name in shipped:
-        return Bundle.open(shipped[name])
-    for path, _ in _leans():
-        if path.stem == name:
-            return BundleStore(default_cache()).grow(path)
-    if not is_there(Path(name)):
-        raise BundleError(f"no bundle {name!r}: give a file, or one that ships: {', '.join(shipped_names()) or 'none'}")
-    return Bundle.open(Path(name))
 
 
 def hash_file(path: Path) -> str:
@@ -401,7 +253,7 @@ def _look_at_states(path: Path, manifest: Manifest, data: bytes) -> None:
         raise BundleError(f"{path}: {RECORDED} holds NaN or infinity; build the bundle again")
 
 
-def _bytes_of(path: Path) -> bytes | None:
+def bytes_of(path: Path) -> bytes | None:
     """What lies at a path; `None` if that is nothing, or nothing that can be read."""
     try:
         return read_regular(path, MAX_BUNDLE)

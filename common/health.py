@@ -10,9 +10,10 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
-from dreamfleet.common.bundle import Bundle, default_cache, shipped_bundles
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.fingerprint import package_version
+from dreamfleet.common.store import default_cache, shipped_bundles
 
 GROUP = "dreamfleet.checks"
 # What a role stands on, as findings name it; each extra installs the last part.

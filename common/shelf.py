@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from dreamfleet.common.agent import TrainedAgent, is_agent
-from dreamfleet.common.bundle import Bundle, BundleStore, default_cache, find_bundle, pretrained
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, ControllerError, JournalError, UsageError
 from dreamfleet.common.files import is_file, is_there
 from dreamfleet.common.runs import BUNDLE, CONTROLLER, JOURNAL, open_run
+from dreamfleet.common.store import BundleStore, default_cache, find_bundle, pretrained
 from dreamfleet.common.subspace import Subspace
 
 SUBSPACES = "subspaces"  # the folder of those that ship, each named as its world model

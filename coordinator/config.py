@@ -17,7 +17,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import COLDEST, HOTTEST, MAX_OPTIONS, TaskSpec
 from dreamfleet.common.network import address_of
-from dreamfleet.common.presets import check_preset, preset_help
+from dreamfleet.common.presets import preset_help
 from dreamfleet.common.stages import Stage, stages_of
 from dreamfleet.common.stored import NAMED, RunSettings, StageSettings
 from dreamfleet.common.subspace import Subspace
@@ -387,51 +387,3 @@ class NetworkConfig:
             raise UsageError(f"--beat must be from 0.05 to 60 seconds, not {self.beat}")
         if not 0 <= self.evaluation_share <= LARGEST_SHARE:
             raise UsageError(f"--evaluation-share must be from 0 to {LARGEST_SHARE}, not {self.evaluation_share}")
-
-
-# The paper's own settings, the article's, and what two cores do in minutes.
-PRESETS: dict[str, dict[str, Any]] = {
-    "paper": {"population": 64, "episodes": 16, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 1024},
-    "article": {"population": 32, "episodes": 4, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 100},
-    "dream": {
-        "task": "dream",
-        "population": 64,
-        "episodes": 16,
-        "sigma0": 0.1,
-        "covariance": "diagonal",
-        "horizon": 400,
-        "temperature": 1.5,
-        "evaluate_every": 5,
-        "evaluation_episodes": 16,
-        "confirm_episodes": 32,
-    },
-    "frugal": {"population": 32, "episodes": 2, "sigma0": 0.1, "covariance": "diagonal", "patience": 100},
-    # A few generations in the dream, then reality, in the features that ship; docs/results.md says what each is for.
-    "real": {
-        "task": "dream",
-        "bundle": "tiny",
-        "subspace": "tiny",
-        "population": 64,
-        "episodes": 16,
-        "sigma0": 0.3,
-        "covariance": "full",
-        "horizon": 400,
-        "temperature": 1.5,
-        "evaluate_every": 5,
-        "evaluation_episodes": 32,
-        "confirm_episodes": 64,
-        "stages": (
-            StageSettings(generations=5),
-            StageSettings(
-                steps=1_800_000, driven=1.0, horizon=1000, patience=100, population=24, episodes=4, sigma0=0.06
-            ),
-            StageSettings(steps=5_000_000, episodes=8),
-            StageSettings(episodes=16),
-        ),
-    },
-}
-
-
-def find_preset(name: str) -> dict[str, Any]:
-    """The preset of a run of that name; `UsageError` lists those that exist."""
-    return PRESETS[check_preset("run", name)]

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 
-from dreamfleet.common.bundle import Bundle, find_bundle
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import Intervals
 from dreamfleet.common.processes import spoken
 from dreamfleet.common.runs import ARCHIVE, BUNDLE, JOURNAL, open_run, run_lock
 from dreamfleet.common.session import Network
+from dreamfleet.common.store import find_bundle
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.custody import Custody

@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dreamfleet.common.actions import Continuous, Discrete
-    from dreamfleet.common.bundle import Bundle, find_bundle
+    from dreamfleet.common.bundle import Bundle
     from dreamfleet.common.client import Client
     from dreamfleet.common.controller import Controller
     from dreamfleet.common.errors import DreamfleetError
     from dreamfleet.common.evaluated import Evaluated
     from dreamfleet.common.messages import TaskSpec
     from dreamfleet.common.runs import RunFolder as Run
+    from dreamfleet.common.store import find_bundle
     from dreamfleet.common.tasks import Description
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Task, World

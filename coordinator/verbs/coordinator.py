@@ -16,7 +16,8 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.site import offer
 from dreamfleet.common.unblocked import unblock_stderr
-from dreamfleet.coordinator.config import NO_SUBSPACE, LimitsConfig, NetworkConfig, RunConfig, find_preset
+from dreamfleet.coordinator.config import NO_SUBSPACE, LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.presets import find_preset
 from dreamfleet.coordinator.schedule import find_schedule, unfold
 
 if TYPE_CHECKING:

@@ -106,7 +106,7 @@ def _flags_before(args: argparse.Namespace) -> tuple[str, ...]:
 
 def _check_run(config: IterateConfig, run: RunConfig, layout: Layout) -> None:
     """Whether a round's run could be begun: in the shipped world model, or in what the iteration goes on from."""
-    from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.common.store import find_bundle
     from dreamfleet.coordinator.iteration.phases import find_init
     from dreamfleet.coordinator.start import find_start
 

@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.seeds import TEST
+from dreamfleet.common.store import find_bundle
 from dreamfleet.common.stored import best_of
 from dreamfleet.common.threads import pin_thread_pools
 from tests.support.processes import processes_in

@@ -6,21 +6,9 @@ import numpy as np
 import onnx
 import pytest
 
-from dreamfleet.common.bundle import (
-    DECODER,
-    DREAM,
-    ENCODER,
-    LINEAR,
-    MANIFEST,
-    POLICY,
-    Bundle,
-    BundleStore,
-    find_bundle,
-    hash_file,
-    shipped_bundles,
-    write_bundle,
-)
+from dreamfleet.common.bundle import DECODER, DREAM, ENCODER, LINEAR, MANIFEST, POLICY, Bundle, hash_file, write_bundle
 from dreamfleet.common.errors import BundleError
+from dreamfleet.common.store import BundleStore, find_bundle, shipped_bundles
 from tests.support.bundles import states, write_random_bundle
 
 LARGEST_SHIPPED = 16_000_000

@@ -2,9 +2,10 @@
 
 import pytest
 
-from dreamfleet.common import bundle as bundles
-from dreamfleet.common.bundle import DREAM, Bundle, BundleStore, find_bundle, ship_lean, write_bundle
+from dreamfleet.common import store
+from dreamfleet.common.bundle import DREAM, Bundle, write_bundle
 from dreamfleet.common.errors import BundleError
+from dreamfleet.common.store import BundleStore, find_bundle, ship_lean
 from tests.support.bundles import states, write_random_bundle
 
 
@@ -13,7 +14,7 @@ def shelf(tmp_path, monkeypatch):
     """A folder of what ships: `base` whole, and `able` without what is equal there."""
     folder = tmp_path / "ships"
     folder.mkdir()
-    monkeypatch.setattr(bundles, "pretrained", lambda: folder)
+    monkeypatch.setattr(store, "pretrained", lambda: folder)
     monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "cache"))
     base = write_random_bundle(folder / "base.zip")
     other = write_random_bundle(tmp_path / "other.zip", recorded=states(5))
@@ -32,12 +33,12 @@ def test_it_is_the_bundle_that_was_frozen_to_the_byte(shelf):
     assert found.path.read_bytes() == whole.path.read_bytes()
     assert found.read(DREAM) == whole.read(DREAM)
     assert find_bundle("able").path == found.path, "it was put together once"
-    assert BundleStore(bundles.default_cache()).find(whole.sha256).path == found.path
+    assert BundleStore(store.default_cache()).find(whole.sha256).path == found.path
 
 
 def test_a_controller_finds_its_world_model_by_the_hash(shelf):
     _, whole = shelf
-    assert BundleStore(bundles.default_cache()).find(whole.sha256).sha256 == whole.sha256
+    assert BundleStore(store.default_cache()).find(whole.sha256).sha256 == whole.sha256
 
 
 def test_a_damaged_copy_in_the_cache_is_put_together_again(shelf):
@@ -78,5 +79,5 @@ def test_a_cache_that_takes_nothing_is_said(shelf, tmp_path, monkeypatch):
 
 
 def test_what_ships_lean_is_whole():
-    for name in bundles.shipped_names():
+    for name in store.shipped_names():
         assert isinstance(find_bundle(name), Bundle)

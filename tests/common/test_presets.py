@@ -4,13 +4,13 @@ import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.presets import NAMES, check_preset
-from dreamfleet.coordinator import config
+from dreamfleet.coordinator import presets as runs
 from dreamfleet.worker.baselines import presets as baselines
 from dreamfleet.worker.training import presets
 
 
 def test_the_names_are_those_that_each_side_has_settings_for():
-    assert set(NAMES["run"]) == set(config.PRESETS)
+    assert set(NAMES["run"]) == set(runs.PRESETS)
     assert set(NAMES["training"]) == set(presets.PRESETS)
     assert set(NAMES["baseline"]) == set(baselines.PRESETS)
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.archives import DamagedError, Limits, parse_array, read_arrays
-from dreamfleet.common.bundle import Bundle, BundleStore, Manifest, default_cache, find_bundle, write_bundle
+from dreamfleet.common.bundle import Bundle, Manifest, write_bundle
 from dreamfleet.common.config import load, read_toml
 from dreamfleet.common.controller import Controller, ControllerShape
 from dreamfleet.common.errors import BundleError, ControllerError, DreamfleetError, UsageError
+from dreamfleet.common.store import BundleStore, default_cache, find_bundle
 from tests.support.bundles import npy
 from tests.support.mutations import archives, mutate, packed, reworded
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from dreamfleet.common import shelf
-from dreamfleet.common.bundle import find_bundle, pretrained
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.shelf import find_subspace
+from dreamfleet.common.store import find_bundle, pretrained
 from dreamfleet.common.subspace import Subspace
 
 

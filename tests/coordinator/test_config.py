@@ -3,14 +3,15 @@ import json
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.errors import ControllerError, DreamfleetError, UsageError
 from dreamfleet.common.fields import written
 from dreamfleet.common.messages import TaskSpec
 from dreamfleet.common.shelf import find_subspace
+from dreamfleet.common.store import find_bundle
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.common.tasks import Description
-from dreamfleet.coordinator.config import PRESETS, RunConfig, settings_of
+from dreamfleet.coordinator.config import RunConfig, settings_of
+from dreamfleet.coordinator.presets import PRESETS
 from dreamfleet.coordinator.start import Start
 from dreamfleet.worker.tasks.api import Task
 from tests.support.bundles import states, write_random_bundle

@@ -12,10 +12,11 @@ from threading import Event
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import Bundle, find_bundle
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.stopping import never
+from dreamfleet.common.store import find_bundle
 from dreamfleet.common.subspace import Subspace
 from dreamfleet.common.variants import Variant
 from dreamfleet.coordinator.iteration.commands import Commands

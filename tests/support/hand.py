@@ -102,6 +102,11 @@ class Hand:
         batch = self.next(ResultBatch, lambda batch: of.digest in _digests(batch))
         return next(each for each in batch.results if each.digest == of.digest)
 
+    def failure(self):
+        """Wait for the next result that is an error."""
+        batch = self.next(ResultBatch, lambda batch: any(each.error for each in batch.results))
+        return next(each for each in batch.results if each.error)
+
     def results(self, *of):
         """Wait until each of these jobs has come; digests of all results that came meanwhile."""
         missing, came = {job.digest for job in of}, set()

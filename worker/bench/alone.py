@@ -21,7 +21,7 @@ def print_figures(measure: Callable[[Bundle], dict[str, Any]], args: argparse.Na
     """Measure a bundle and print what comes of it."""
     from multiprocessing import get_context
 
-    from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.common.store import find_bundle
     from dreamfleet.common.threads import forget_library_settings, pin_thread_pools
 
     bundle = find_bundle(args.bundle)

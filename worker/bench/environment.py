@@ -13,10 +13,11 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import Bundle, find_bundle, pretrained
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.seeds import VALIDATION
+from dreamfleet.common.store import find_bundle, pretrained
 from dreamfleet.worker.car_racing.check import Actions, Difference, compare, leap, make_car_racing
 from dreamfleet.worker.car_racing.preprocessing import BOX
 from dreamfleet.worker.car_racing.task import CarRacing, CarRacingPolicy, PictureObservation

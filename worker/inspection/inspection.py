@@ -7,12 +7,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from dreamfleet.common.bundle import Bundle, find_bundle, shipped_names
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, DatasetError, JournalError
 from dreamfleet.common.files import is_file
 from dreamfleet.common.runs import RunFolder, open_run
 from dreamfleet.common.stages import begun_stages, in_turn
+from dreamfleet.common.store import find_bundle, shipped_names
 from dreamfleet.worker.dream.daydream import can_dream
 from dreamfleet.worker.inspection import curves, memory, vision
 from dreamfleet.worker.inspection.page import Page

@@ -27,7 +27,7 @@ DRIVER = "controller"  # as a kept rollout names who drove
 class Scorer:
     """Scores a slot's jobs.
 
-    >>> from dreamfleet.common.bundle import find_bundle
+    >>> from dreamfleet.common.store import find_bundle
     >>> bundle = find_bundle("tiny")
     >>> scorer = Scorer(TaskSpec("car-racing", bundle.sha256, horizon=100, patience=0), bundle)  # doctest: +SKIP
     >>> scorer.score("score", np.zeros(867, np.float32), seed=2**20)  # doctest: +SKIP

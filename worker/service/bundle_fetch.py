@@ -11,12 +11,13 @@ import zenoh
 
 from dreamfleet.common import keys
 from dreamfleet.common.asking import ask_all
-from dreamfleet.common.bundle import MAX_BUNDLE, Bundle, BundleStore, default_cache
+from dreamfleet.common.bundle import MAX_BUNDLE, Bundle
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.files import open_growing
 from dreamfleet.common.messages import MAX_PART, BundlePart
+from dreamfleet.common.store import BundleStore, default_cache
 
 log = logging.getLogger(__name__)
 WINDOW = 8  # queries in flight: enough to fill a link with a long way

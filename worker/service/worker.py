@@ -13,10 +13,11 @@ from typing import Any
 import zenoh
 
 from dreamfleet.common import keys
-from dreamfleet.common.bundle import Bundle, BundleStore, default_cache
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.errors import ConnectionFailedError, RefusedError
 from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.store import BundleStore, default_cache
 from dreamfleet.worker.service.admission import Admission, ask, make_request, neediest
 from dreamfleet.worker.service.announced import check_world
 from dreamfleet.worker.service.bundle_fetch import obtain

@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure on one thread, or compare; exit 1 if anything differs."""
     from multiprocessing import get_context
 
-    from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.common.store import find_bundle
     from dreamfleet.common.threads import forget_library_settings, pin_thread_pools
 
     bundle = find_bundle(args.bundle)

@@ -17,7 +17,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, and print a line a task."""
-    from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.common.store import find_bundle
     from dreamfleet.common.threads import pin_thread_pools
 
     pin_thread_pools()

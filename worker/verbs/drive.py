@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     """Drive, and print each episode's score."""
     if not args.dream and (args.bundle is not None or args.temperature is not None):
         raise UsageError("--bundle and --temperature are of a dream: add --dream")
-    from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.common.store import find_bundle
     from dreamfleet.worker.driving.driving import DrivingConfig, drive, some_seed
     from dreamfleet.worker.driving.scene import Dream, Reality, Scene
 

@@ -132,9 +132,9 @@ def _pictures(args: argparse.Namespace) -> Iterator[Iterator[Shown | None]]:
 @contextmanager
 def _watched(args: argparse.Namespace, client: Client) -> Iterator[Iterator[Shown | None]]:
     """What a worker of the run does."""
-    from dreamfleet.common.bundle import BundleStore, default_cache
     from dreamfleet.common.codec import Inbox
     from dreamfleet.common.live import LiveView
+    from dreamfleet.common.store import BundleStore, default_cache
     from dreamfleet.common.variants import Variant
     from dreamfleet.worker.service.bundle_fetch import obtain
     from dreamfleet.worker.tools.glass import Glass, Imagination

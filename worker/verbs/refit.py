@@ -37,9 +37,9 @@ def run(args: argparse.Namespace) -> int:
     if args.episodes < 2:
         raise UsageError(f"--episodes must be at least 2, not {args.episodes}")
     check_out(args.out)
-    from dreamfleet.common.bundle import find_bundle
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.common.shelf import bundle_for, find_controller
+    from dreamfleet.common.store import find_bundle
     from dreamfleet.worker.training.refit import last_drives, outputs_of, refit
 
     controller, beside = find_controller(args.controller, args.runs_dir)

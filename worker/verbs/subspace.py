@@ -38,8 +38,8 @@ def run(args: argparse.Namespace) -> int:
     if args.views < 0:
         raise UsageError(f"--views must not be negative, not {args.views}")
     check_out(args.out)
-    from dreamfleet.common.bundle import find_bundle
     from dreamfleet.common.progress import progress_bar
+    from dreamfleet.common.store import find_bundle
     from dreamfleet.worker.training.refit import last_drives
     from dreamfleet.worker.training.subspace import find_subspace
 

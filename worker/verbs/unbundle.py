@@ -22,7 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write both checkpoints and say where they lie."""
-    from dreamfleet.common.bundle import find_bundle
+    from dreamfleet.common.store import find_bundle
     from dreamfleet.worker.training.unbundle import unbundle
 
     bundle = find_bundle(args.bundle)

@@ -8,8 +8,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import Bundle, find_bundle
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.store import find_bundle
 
 Floats = NDArray[np.float32]
 FEATURES = ("z", "zh")

@@ -10,7 +10,7 @@ import pytest
 from gymnasium.error import InvalidAction
 
 import dreamfleet.worker.car_racing  # noqa: F401 - registers the environment
-from dreamfleet.common.bundle import find_bundle
+from dreamfleet.common.store import find_bundle
 from dreamfleet.worker.bench.environment import completed_lap, discrete, policy_of
 from dreamfleet.worker.car_racing.check import compare, leap, make_car_racing, native_is_exact
 from dreamfleet.worker.car_racing.environment import GRASS, WHEEL, CarRacing, _native, available, score_text

@@ -2,8 +2,8 @@
 
 import pytest
 
-from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.shelf import find_controller
+from dreamfleet.common.store import find_bundle
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.shelf import find_controller
+from dreamfleet.common.store import find_bundle
 from dreamfleet.worker.inspection import probe
 from dreamfleet.worker.inspection.losses import LossConfig
 from dreamfleet.worker.inspection.measuring import Driving, dream_losses

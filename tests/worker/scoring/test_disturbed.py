@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.shelf import find_controller
+from dreamfleet.common.store import find_bundle
 from dreamfleet.worker.scoring.disturbance import Disturbance, pushed
 from dreamfleet.worker.scoring.disturbed import Disturbed
 from dreamfleet.worker.scoring.hand import ControllersHand

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import BundleStore, Manifest, default_cache, write_bundle
+from dreamfleet.common.bundle import Manifest, write_bundle
 from dreamfleet.common.messages import MAX_PART
+from dreamfleet.common.store import BundleStore, default_cache
 from tests.support.bundles import npy
 from tests.support.stage import Stage, listening
 

@@ -8,11 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import BundleStore, Manifest, write_bundle
+from dreamfleet.common.bundle import Manifest, write_bundle
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.messages import MAX_PART
 from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.store import BundleStore
 from dreamfleet.worker.service import bundle_fetch
 from dreamfleet.worker.service.bundle_fetch import WINDOW, obtain
 from tests.support import tasks

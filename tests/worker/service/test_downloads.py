@@ -2,9 +2,9 @@
 
 import pytest
 
-from dreamfleet.common.bundle import BundleStore, default_cache
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.messages import MAX_PART
+from dreamfleet.common.store import BundleStore, default_cache
 from tests.support.hand import DEADLINE
 from tests.support.stage import wait_for
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.evaluated import Drive
 from dreamfleet.common.shelf import find_controller
+from dreamfleet.common.store import find_bundle
 from dreamfleet.worker.scoring.agents import agent_of
 from dreamfleet.worker.scoring.episode import Course, Moment, score
 from dreamfleet.worker.tasks.api import Score, World

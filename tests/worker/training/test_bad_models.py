@@ -7,8 +7,9 @@ import numpy as np
 import onnx
 import pytest
 
-from dreamfleet.common.bundle import DREAM, INITIAL, POLICY, RECORDED, find_bundle, write_bundle
+from dreamfleet.common.bundle import DREAM, INITIAL, POLICY, RECORDED, write_bundle
 from dreamfleet.common.errors import BundleError, DatasetError
+from dreamfleet.common.store import find_bundle
 from dreamfleet.common.tensors import weights_finite
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble, graphs, manifest

@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import find_bundle
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
 from dreamfleet.common.shelf import find_controller
+from dreamfleet.common.store import find_bundle
 from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
 from dreamfleet.worker.car_racing.network import NetworkDriver
 from dreamfleet.worker.training.collect import collect, drive, episode_path

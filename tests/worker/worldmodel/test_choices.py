@@ -6,9 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import Bundle, find_bundle
+from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import act
 from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.common.store import find_bundle
 from dreamfleet.common.variants import Variant
 from dreamfleet.worker.worldmodel.inference import Controllers, DreamStep, Encoder, PolicyStep
 from tests.support.variants import VARIANTS, vectors

@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from dreamfleet.common.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.bundle import DREAM, find_bundle
+from dreamfleet.common.bundle import DREAM
 from dreamfleet.common.controller import act
 from dreamfleet.common.errors import BundleError
+from dreamfleet.common.store import find_bundle
 from dreamfleet.worker.worldmodel.inference import DreamStep, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import ARTICLE, ATTENTIVE, NOTEBOOK, PAPER, REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
