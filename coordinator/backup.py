@@ -1,0 +1,118 @@
+"""A second copy of a run's folder, whole and durable, also while a coordinator serves the run.
+
+SQLite copies the journal as it is at one moment; everything else in the folder is frozen, or follows from the journal.
+The copy is a run like any other.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.files import sync_folder
+from dreamfleet.common.runs import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS, RunFolder, open_run, run_lock
+
+
+def back_up(source: RunFolder, target: Path) -> None:
+    """Copy the run into the folder `target`, of its own name; an earlier copy of the same run there is replaced.
+
+    Whatever ends this, one whole copy is left if there was one. `UsageError` for a target that is something else, a
+    run that is served from there, or the run itself; `JournalError` where the disk refuses.
+    """
+    _check_target(source, target)
+    aside, former = (target.with_name(f".{target.name}.{word}") for word in ("part", "former"))
+    with _translated(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if former.exists() and not target.exists():  # an earlier call ended between two names
+            former.rename(target)
+        for left in (aside, former):
+            shutil.rmtree(left, ignore_errors=True)
+        try:
+            aside.mkdir(mode=0o700)
+            _fill(source, aside)
+            with _unserved(target):
+                if target.exists():
+                    target.rename(former)
+                aside.rename(target)
+            sync_folder(target.parent)
+        finally:
+            for left in (aside, former):
+                shutil.rmtree(left, ignore_errors=True)
+
+
+def _check_target(source: RunFolder, target: Path) -> None:
+    if target.exists() and target.samefile(source.path):
+        raise UsageError(f"{target} is the run itself: name another folder with --to")
+    if not (target / JOURNAL).exists():
+        if target.exists():
+            raise UsageError(f"{target} exists and is no run: name another folder with --to")
+        return
+    with open_run(target.parent, target.name) as other:
+        if other.uid != source.uid:
+            raise UsageError(f"{target} is another run of this name: name another folder with --to")
+
+
+def _fill(source: RunFolder, folder: Path) -> None:
+    """The controller first: it may lag behind the journal, as after a kill, and must not be ahead of it.
+
+    What the journal names lies in the folder before the journal does, so that it is copied behind it.
+    """
+    with suppress(FileNotFoundError):  # there is none before the first closed generation
+        shutil.copy2(source.controller_path, folder / CONTROLLER)
+    _copy_journal(source, folder / JOURNAL)
+    if source.spec.bundle:
+        shutil.copy2(source.bundle_path, folder / BUNDLE)
+    with RunFolder(folder) as copy:
+        drives = copy.rollouts()
+    if drives:
+        (folder / ROLLOUTS).mkdir()
+    for drive in drives:
+        shutil.copy2(source.path / ROLLOUTS / drive.name, folder / ROLLOUTS / drive.name)
+    for path in (*folder.rglob("*"), folder):
+        with suppress(FileNotFoundError):
+            _sync(path)
+
+
+def _copy_journal(source: RunFolder, path: Path) -> None:
+    where = f"{(source.path / JOURNAL).absolute().as_uri()}?mode=ro"
+    try:
+        with closing(sqlite3.connect(where, uri=True)) as live, closing(sqlite3.connect(path)) as copy:
+            live.backup(copy)
+            copy.execute("PRAGMA journal_mode = DELETE")  # one file, without a log beside it
+            found = copy.execute("PRAGMA quick_check(1)").fetchone()[0]
+    except sqlite3.Error as error:
+        raise JournalError(f"the journal of run {source.name} cannot be copied to {path.parent}: {error}") from error
+    if found != "ok":
+        raise JournalError(f"the journal of run {source.name} is damaged: {found}; the earlier copy is kept")
+
+
+@contextmanager
+def _unserved(target: Path) -> Iterator[None]:
+    """Hold the earlier copy, so that nobody goes on from it while it is replaced."""
+    if not target.exists():
+        yield
+        return
+    with run_lock(target):
+        yield
+
+
+@contextmanager
+def _translated(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        why = error.strerror or error
+        raise JournalError(f"cannot back up into {target}: {why}; an earlier copy is kept") from error
+
+
+def _sync(path: Path) -> None:
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)

@@ -1,0 +1,99 @@
+"""A copy of a run that is being served, from which it goes on to the same bits when its own folder is lost."""
+
+import shutil
+import sqlite3
+
+import pytest
+
+from dreamfleet.common.runs import BUNDLE, JOURNAL, ROLLOUTS, open_run
+from dreamfleet.common.store import find_bundle
+from tests.end_to_end.test_same_bits import GENERATIONS, SETTINGS, outcome
+
+pytestmark = pytest.mark.timeout(300)
+FLAGS = (*SETTINGS, "--evaluate-every", 0, "--collect-every", 1, "--collect-episodes", 1)
+
+
+def back_up(processes, to, name="test"):
+    return processes.call("runs", "backup", name, "--runs-dir", processes.runs, "--to", to)
+
+
+def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, tmp_path):
+    whole = processes.coordinator(*FLAGS, name="whole")
+    worker = processes.worker("--run", "whole")
+    assert whole.finish(120)[0] == 0
+    worker.end()
+
+    safe = tmp_path / "safe"
+    served = processes.coordinator(*FLAGS)
+    worker = processes.worker("--run", "test")
+    for generation in (0, 1):
+        served.wait_for(f"generation {generation}: mean")
+        code, out, err = back_up(processes, safe)
+        assert code == 0, err
+        assert "--resume test" in out
+    served.popen.kill()
+    worker.end()
+    shutil.rmtree(processes.runs / "test")
+    assert [path.name for path in safe.iterdir()] == ["test"], "the earlier copy is gone"
+    with open_run(safe, "test") as copy:
+        assert 2 <= len(copy.history()) < GENERATIONS
+        assert all(path.is_file() for path in copy.rollouts())
+
+    code, _, err = processes.call("runs", "backup", "test", "--runs-dir", safe, "--to", processes.runs)
+    assert code == 0, err
+    resumed = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs)
+    processes.worker("--run", "test")
+    assert resumed.finish(120)[0] == 0
+    assert outcome(processes, "test") == outcome(processes, "whole")
+    assert len(list((processes.runs / "test" / ROLLOUTS).iterdir())) == GENERATIONS
+
+
+@pytest.fixture
+def finished(processes):
+    """A run of two generations."""
+    coordinator = processes.coordinator(
+        "--task", "gym:CartPole-v1", "--population", 4, "--generations", 2, "--evaluate-every", 0, "--horizon", 20
+    )
+    processes.worker("--run", "test")
+    assert coordinator.finish(120)[0] == 0
+    return processes.runs / "test"
+
+
+def test_what_cannot_be_a_copy_is_left_alone(processes, finished, tmp_path):
+    other = tmp_path / "other"
+    for wrong, why in (
+        (processes.runs, "is the run itself"),
+        (tmp_path / "taken", "is no run"),
+        (other, "another run of this name"),
+    ):
+        if wrong.name == "taken":
+            (wrong / "test").mkdir(parents=True)
+        elif wrong == other:
+            assert back_up(processes, other)[0] == 0
+            with sqlite3.connect(other / "test" / JOURNAL) as journal:
+                journal.execute("UPDATE run SET value = 'another' WHERE key = 'uid'")
+        code, _, err = back_up(processes, wrong)
+        assert (code, why in err) == (2, True), err
+    code, _, err = back_up(processes, "/proc/nowhere")
+    assert (code, "cannot back up into" in err) == (1, True), err
+    code, _, err = back_up(processes, tmp_path, name="nobody")
+    assert (code, "no run 'nobody'" in err) == (1, True), err
+
+
+def test_a_call_that_was_killed_between_two_names_is_made_good(processes, finished, tmp_path):
+    safe = tmp_path / "safe"
+    assert back_up(processes, safe)[0] == 0
+    (safe / "test").rename(safe / ".test.former")
+    (safe / ".test.part").mkdir()
+    code, _, err = back_up(processes, safe)
+    assert code == 0, err
+    assert [path.name for path in safe.iterdir()] == ["test"]
+
+
+def test_a_world_model_is_copied_too(processes, tmp_path):
+    coordinator = processes.coordinator(*SETTINGS, "--generations", 1, "--evaluate-every", 0)
+    processes.worker("--run", "test")
+    assert coordinator.finish(120)[0] == 0
+    assert back_up(processes, tmp_path / "safe")[0] == 0
+    copied = tmp_path / "safe" / "test" / BUNDLE
+    assert copied.read_bytes() == find_bundle("tiny").path.read_bytes()
