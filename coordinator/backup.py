@@ -107,7 +107,7 @@ def _translated(target: Path) -> Iterator[None]:
         yield
     except OSError as error:
         why = error.strerror or error
-        raise JournalError(f"cannot back up into {target}: {why}; an earlier copy is kept") from error
+        raise JournalError(f"cannot back up into {target}: {why}; an earlier copy, if there is one, is kept") from error
 
 
 def _sync(path: Path) -> None:
