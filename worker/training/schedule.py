@@ -173,8 +173,12 @@ def summary(model: torch.nn.Module, other: Path | None = None, free: frozenset[s
         if learnt:
             count, shapes = sum(each.numel() for each in learnt), ", ".join(str(tuple(each.shape)) for each in learnt)
             rows.append(f"{name:<14} {type(module).__name__:<16} {count:>10,}  {shapes}")
-    total = sum(each.numel() for each in model.parameters() if each.requires_grad)
-    return "\n".join([*rows, f"{'in all':<31} {total:>10,}"])
+    return "\n".join([*rows, f"{'in all':<31} {learnt_parameters(model):>10,}"])
+
+
+def learnt_parameters(model: torch.nn.Module) -> int:
+    """How many numbers a training changes."""
+    return sum(each.numel() for each in model.parameters() if each.requires_grad)
 
 
 def keep_triton_from_mesa(maps: Path = Path("/proc/self/maps")) -> None:

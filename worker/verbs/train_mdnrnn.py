@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.worker.training.flags import changed
     from dreamfleet.worker.training.origin import agreed_preset
     from dreamfleet.worker.training.presets import find_preset
-    from dreamfleet.worker.training.schedule import device_of, summary
+    from dreamfleet.worker.training.schedule import device_of, learnt_parameters, summary
     from dreamfleet.worker.training.telling import show
     from dreamfleet.worker.training.train_mdnrnn import CHECKPOINT, train_mdnrnn
     from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
@@ -39,8 +39,9 @@ def run(args: argparse.Namespace) -> int:
     preset = find_preset(agreed_preset(args.data, args.preset))
     config, layers = changed(preset.mdnrnn, args), changed(preset.mdnrnn_layers, args)
     if args.summary:
-        text = summary(MDNRNN(layers), args.continue_from, HEADS_TO_COME)
-        answer(args, text, summary=text.splitlines())
+        model = MDNRNN(layers)
+        text = summary(model, args.continue_from, HEADS_TO_COME)
+        answer(args, text, summary=text.splitlines(), parameters=learnt_parameters(model))
         return 0
 
     def train(report: Report, stop: Stop) -> dict[str, float]:

@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.worker.training.flags import changed
     from dreamfleet.worker.training.origin import agreed_preset
     from dreamfleet.worker.training.presets import find_preset
-    from dreamfleet.worker.training.schedule import device_of, summary
+    from dreamfleet.worker.training.schedule import device_of, learnt_parameters, summary
     from dreamfleet.worker.training.telling import show
     from dreamfleet.worker.training.train_vae import CHECKPOINT, train_vae
     from dreamfleet.worker.worldmodel.vae import VAE
@@ -39,8 +39,9 @@ def run(args: argparse.Namespace) -> int:
     preset = find_preset(agreed_preset(args.data, args.preset))
     config, layers = changed(preset.vae, args), changed(preset.vae_layers, args)
     if args.summary:
-        text = summary(VAE(layers), args.continue_from)
-        answer(args, text, summary=text.splitlines())
+        model = VAE(layers)
+        text = summary(model, args.continue_from)
+        answer(args, text, summary=text.splitlines(), parameters=learnt_parameters(model))
         return 0
 
     def train(report: Report, stop: Stop) -> dict[str, float]:

@@ -1,0 +1,100 @@
+"""`dreamfleet contrast`: kinds of MDN-RNNs on equal data, several seeds each."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dreamfleet.common.listing import add_json, answer, print_rows
+from dreamfleet.coordinator.contrast.config import KINDS, RUN_FLAGS, SEEDS, Contrast, kinds_of
+
+if TYPE_CHECKING:
+    from dreamfleet.coordinator.contrast.summary import Outcome
+    from dreamfleet.coordinator.contrast.trials import Trials
+
+SUMMARY = "train kinds of MDN-RNNs on equal data, several seeds each, evolve in each one's dream, and tell them apart"
+EXTRAS = ("train",)
+PACKAGES = ("gymnasium", "onnx", "onnxruntime", "safetensors", "torch")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    shown = ", ".join(f'{name} "{flags}"' for name, flags in KINDS)
+    parser.add_argument("--data", type=Path, required=True, help="a data set that is encoded: all learn from it")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the trials; one that was begun goes on")
+    parser.add_argument(
+        "--kind", nargs=2, action="append", default=[], metavar=("NAME", "FLAGS"),
+        help="a kind by its flags of `train mdnrnn`, as one text; the others are compared with the first (default "
+        f"{shown})",
+    )  # fmt: skip
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), help="of each kind (default 1 2 3)")
+    parser.add_argument(
+        "--mdnrnn-flags", default="", metavar="FLAGS", help="of every training: --mdnrnn-flags='--updates 300'"
+    )
+    parser.add_argument(
+        "--run-flags", default=RUN_FLAGS, metavar="FLAGS",
+        help=f"of every `coordinator`, whose preset is dream unless another is named (default {RUN_FLAGS})",
+    )  # fmt: skip
+    parser.add_argument("--local", type=int, help="scoring processes (default one a core)")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do all trials that are left, and compare."""
+    from dreamfleet.common.holding import held
+    from dreamfleet.common.stopping import heeding_signals
+    from dreamfleet.coordinator.contrast.trials import LOCK, Trials
+    from dreamfleet.coordinator.iteration.evolving import Crew
+
+    contrast = Contrast(kinds_of(args.kind), tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
+    for package in PACKAGES:
+        if find_spec(package) is None:  # said now rather than after hours
+            raise ModuleNotFoundError(name=package)
+    with held(args.out / LOCK, "contrast"), heeding_signals() as stop:
+        trials = Trials(contrast, args.data, args.out, lambda: Crew.of((), args.local, (), ()), stop)
+        outcomes = _do(trials, contrast)
+    _tell(args, outcomes)
+    return 0
+
+
+def _do(trials: Trials, contrast: Contrast) -> list[Outcome]:
+    from rich.console import Console
+
+    from dreamfleet.common.errors import StoppedError
+
+    console = Console(stderr=True, highlight=False)
+    outcomes: list[Outcome] = []
+    try:
+        trials.begin()
+        with console.status("") as shown:
+            for trial in contrast.trials:
+                outcomes.append(trials.do(trial, shown.update))
+                console.print(f"{trial.name} is finished", markup=False)
+    except StoppedError as error:
+        raise StoppedError(f"{error}; what is finished is kept, and the same command goes on") from error
+    return outcomes
+
+
+def _tell(args: argparse.Namespace, outcomes: list[Outcome]) -> None:
+    from dreamfleet.coordinator.contrast import summary
+
+    found, means = list(summary.differences(outcomes)), summary.means(outcomes)
+    if args.json:
+        parts = {
+            "trials": [asdict(each) for each in outcomes],
+            "means": [asdict(each) for each in means],
+            "differences": [{"kind": k, "figure": f, **asdict(d), "clear": d.clear} for k, f, d in found],
+        }
+        answer(args, "", **parts)
+        return
+    rows = summary.rows(outcomes)
+    print_rows(rows, right=tuple(rows[0])[1:-1], least_first=("reward loss", "after 50", "AUC after 10", "parameters"))
+    print()
+    for each in means:
+        label = "score in reality" if each.figure == summary.SCORE else each.figure.replace("_", " ")
+        print(f"{each.kind}, {label}: {each.told} over {each.seeds} seeds")
+    first = outcomes[0].kind
+    print("\n".join(("", *(summary.told(kind, first, figure, each) for kind, figure, each in found))))

@@ -1,0 +1,67 @@
+"""Two kinds of MDN-RNNs on one small data set, killed in between."""
+
+import json
+import signal
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.runs import open_run
+from dreamfleet.worker.training.encode import encode
+from dreamfleet.worker.training.presets import TINY
+from dreamfleet.worker.training.train_vae import train_vae
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.drives import write_drives
+
+pytestmark = pytest.mark.timeout(300)
+RUN = (
+    "--generations 2 --population 4 --episodes 1 --horizon 10 --evaluate-every 1 --evaluation-episodes 1"
+    " --confirm-episodes 0"
+)
+SMALL = (
+    "--mdnrnn-flags", "--updates 3 --batch 2 --latent 4 --hidden 4 --validate-every 1", "--run-flags", RUN,
+    "--kind", "plain", "", "--kind", "attentive", "--window 2 --attention-units 2", "--local", 1,
+)  # fmt: skip
+
+
+@pytest.fixture
+def data(tmp_path):
+    folder = tmp_path / "data"
+    write_drives(folder)
+    layers = VAEConfig(latent=4, channels=(2, 2, 2, 2))
+    train_vae(folder, replace(TINY.vae, updates=2, batch=8, validate_every=1), lambda *_: None, layers)
+    for _ in encode(folder):
+        pass
+    return folder
+
+
+def test_a_contrast_that_was_stopped_goes_on_and_tells_kinds_apart(processes, data, tmp_path):
+    words = ("contrast", "--data", data, "--out", tmp_path / "out", "--seeds", 1, *SMALL)
+    first = processes.start(*words)
+    first.wait_for("plain-1 is finished", timeout=120)
+    first.popen.send_signal(signal.SIGTERM)
+    code, _ = first.finish(60)
+    assert code == 130, first.lines
+    assert "the same command goes on" in first.lines[-1]
+
+    code, out, err = processes.call(*words, "--json", timeout=200)
+    assert code == 0, err
+    told = json.loads(out)
+    assert [each["kind"] for each in told["trials"]] == ["plain", "attentive"]
+    for each in told["trials"]:
+        model = Bundle.open(tmp_path / "out" / f"{each['kind']}-1" / f"{each['kind']}-1.zip").manifest
+        assert model.models["mdnrnn"]["window"] == (2 if each["kind"] == "attentive" else 0)
+        assert each["quality"]["nats_per_dimension"] == model.provenance["quality"]["nats_per_dimension"]
+        with open_run(tmp_path / "out" / "runs", f"{each['kind']}-1") as run:
+            assert run.ended == "2 generations"
+            assert each["score"] == max(evaluation.mean for evaluation in run.evaluations())
+    code, _, err = processes.call(*words, "--run-flags", "--generations 9")
+    assert (code, "begun with other run_flags" in err) == (2, True), err
+
+
+def test_what_cannot_be_contrasted_is_said_at_once(processes, tmp_path):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    code, _, err = processes.call("contrast", "--data", empty, "--out", tmp_path / "out")
+    assert (code, "has no episodes: collect, train the VAE and encode there first" in err) == (1, True), err
