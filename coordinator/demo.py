@@ -7,7 +7,6 @@ Zenoh; imports neither the run nor the worker.
 from __future__ import annotations
 
 import math
-import os
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
@@ -24,6 +23,7 @@ from rich.text import Text
 
 from dreamfleet.common.client import Client
 from dreamfleet.common.config import option
+from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.processes import Child, ask, call, leash, spoken
 from dreamfleet.common.runs import CONTROLLER, open_run
@@ -148,7 +148,7 @@ class Demo:
         return table
 
     def _evolve(self, stage: Stage) -> None:
-        workers = self._config.workers or len(os.sched_getaffinity(0))
+        workers = self._config.workers or cores()
         self._say(f"{stage.what}: a coordinator and {workers} workers on this machine")
         logs = self._runs_dir / stage.run
         flags = {

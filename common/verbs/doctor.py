@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import platform
 import sys
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.cores import cores
 from dreamfleet.common.listing import add_json, print_rows
 from dreamfleet.common.site import offer
 
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
     findings = examine(args.runs_dir)
     roles = {role: lacking(role, findings) for role in ALL_ROLES}
-    host = {"python": platform.python_version(), "platform": platform.platform(), "cores": os.cpu_count(),
+    host = {"python": platform.python_version(), "platform": platform.platform(), "cores": cores(),
             "fingerprint": fingerprint()}  # fmt: skip
     if args.json:
         told = {role: not lacks for role, lacks in roles.items()}

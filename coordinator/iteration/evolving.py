@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import socket
 from collections.abc import Sequence
@@ -10,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.processes import Child, leash
 from dreamfleet.common.stopping import Stop
@@ -33,7 +33,7 @@ class Crew:
         cls, listen: tuple[str, ...], local: int | None, coordinator: tuple[str, ...], worker: tuple[str, ...]
     ) -> Crew:
         """As it was asked for: without an address on a free port of this host, scored by a slot a core."""
-        slots = local if local is not None else 0 if listen else len(os.sched_getaffinity(0))
+        slots = local if local is not None else 0 if listen else cores()
         return cls(listen or (f"tcp/127.0.0.1:{_free_port()}",), slots, coordinator, worker)
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import queue
 import random
 from contextlib import ExitStack
@@ -15,6 +14,7 @@ import zenoh
 from dreamfleet.common import keys
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.codec import Inbox
+from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import ConnectionFailedError, RefusedError
 from dreamfleet.common.session import Network, open_session
 from dreamfleet.common.store import BundleStore, default_cache
@@ -44,7 +44,7 @@ class Worker:
         self.inbox = Inbox()
         self._config = config
         self._network = network
-        self._slot_count = config.slots or len(os.sched_getaffinity(0))
+        self._slot_count = config.slots or cores()
         self._hello = make_request(self.identity, (*known_tasks(), *tasks), self._slot_count)
         terms = Terms(config.lifetime, config.drain_timeout, leaves_alone=config.exit_when_done or config.any)
         self._membership = Membership(terms, monotonic())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from dreamfleet.common import runs, shelf
 from dreamfleet.common.agent import TrainedAgent
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
+from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.evaluated import Evaluated
 from dreamfleet.common.seeds import TEST
@@ -65,7 +65,7 @@ def evaluate(
     if episodes < 1 or first_seed < 0 or (jobs is not None and jobs < 1):
         raise UsageError("episodes and jobs must be at least 1, first_seed at least 0")
     seeds = tuple(range(first_seed, first_seed + episodes))
-    return Evaluated.of(evaluation.evaluate(_agent(controller, bundle), seeds, jobs or os.cpu_count() or 1))
+    return Evaluated.of(evaluation.evaluate(_agent(controller, bundle), seeds, jobs or cores()))
 
 
 def _agent(controller: Controller | TrainedAgent, bundle: Bundle | None) -> Agent:

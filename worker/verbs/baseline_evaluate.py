@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 
+from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.saving import check_out, saving
 from dreamfleet.common.seeds import TEST, VALIDATION
@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--first-seed", type=int, default=TEST.start,
         help=f"first track's seed: test tracks from {TEST.start} (default), validation tracks from {VALIDATION.start}",
     )  # fmt: skip
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
+    parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
     parser.add_argument("--out", type=Path, help="write the same JSON here too, for `compare`")
 

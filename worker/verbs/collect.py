@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import os
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.config import add_flags
+from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.presets import preset_help
@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
     parser.add_argument("--preset", help=f"{preset_help('training')} (default tiny); the data set keeps it")
     add_flags(parser, CollectConfig, default="the preset's")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
+    parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
     parser.add_argument(
         "--controller", nargs="+", default=[], metavar="CONTROLLER",
         help="who drives the episodes that are missing, in turn, instead of random drivers: files, runs, or what ships",

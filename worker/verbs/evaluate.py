@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.saving import check_out, saving
 from dreamfleet.common.seeds import TEST
@@ -31,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, default=100, help="tracks (default 100)")
     parser.add_argument("--first-seed", type=int, default=TEST.start, help=f"first track's seed (default {TEST.start})")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
+    parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
     offer(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
     parser.add_argument("--out", type=Path, help="write the same JSON here too, for `compare` and `reproduce`")

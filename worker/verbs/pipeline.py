@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from contextlib import redirect_stdout
 from importlib import import_module
 from io import StringIO
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.cli import parser_of
+from dreamfleet.common.cores import cores
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.presets import preset_help
 from dreamfleet.common.site import settle
@@ -33,9 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="share of the preset's drives, and of each training's updates (default 1)",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="makes the drives and the trainings (default 0)")
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, help="processes that drive (default one a core)"
-    )
+    parser.add_argument("--jobs", type=int, default=cores(), help="processes that drive (default one a core)")
     parser.add_argument("--device", default="cpu", help="that trains: cpu, cuda, or auto (default cpu)")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the bundle to write (default PRESET.zip in --data)")
     for name, example in EXAMPLES.items():

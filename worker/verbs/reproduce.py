@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.site import offer
@@ -25,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("reports", metavar="REPORT", nargs="+", type=Path, help="files of `evaluate --out`")
     parser.add_argument("--episodes", type=int, help="drive only the first so many seeds of each (default all)")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default one a core)")
+    parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
     offer(parser, "runs_dir")
     add_json(parser)
 
