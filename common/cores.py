@@ -1,4 +1,4 @@
-"""How many cores this process may use: fewer than the host has where a container, a batch system or `taskset` says so."""
+"""How many cores this process may use: fewer than the host has where a container or a batch system says so."""
 
 from __future__ import annotations
 
