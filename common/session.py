@@ -23,16 +23,17 @@ MAX_RECEIVED = (
     128 * 1024
 )  # bytes of a message: above it Zenoh itself lets go; the largest of the protocol is MAX_MESSAGE
 _NO_ROOM = "no network session can be opened: {}; give this host more room (ulimit -n, ulimit -u)"
-__all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_session"]  # an endpoint is of both
+__all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_session", "settings_of"]
 
 
-def open_session(network: Network, *, timeout: float = 3.0) -> zenoh.Session:
+def open_session(network: Network, *, timeout: float | None = 3.0) -> zenoh.Session:
     """A router where `network.listen` is given, else a client; `ConnectionFailedError` after `timeout` seconds.
 
-    Once open, a client reconnects by itself for ever. Zenoh's own endless first attempt (`timeout_ms` -1) blocks in
-    native code where no signal is heard, so whoever wants to wait calls again.
+    Once open, a client reconnects by itself for ever. Zenoh's own endless first attempt (`timeout_ms` -1) blocks a
+    client in native code where no signal is heard, so whoever wants to wait calls again. A router does not block:
+    without a `timeout` it opens at once, and links to others as they come.
     """
-    settings = _settings(network, timeout_ms=int(timeout * 1000))
+    settings = settings_of(network, timeout)
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
     except zenoh.ZError as error:
@@ -45,7 +46,8 @@ def open_session(network: Network, *, timeout: float = 3.0) -> zenoh.Session:
         raise DreamfleetError(_NO_ROOM.format(_first_line(error))) from error
 
 
-def _settings(network: Network, timeout_ms: int) -> dict[str, Any]:
+def settings_of(network: Network, timeout: float | None) -> dict[str, Any]:
+    """Zenoh's own configuration for `network`; a stand-alone `zenohd` reads a router's as well."""
     router = bool(network.listen)
     room = room_for_connections()  # else strangers who connect could keep a coordinator from writing a file
     bounds = {"max_sessions": min(MOST_SESSIONS, room * 3 // 4), "accept_pending": min(MOST_SESSIONS, room // 4)}
@@ -67,8 +69,8 @@ def _settings(network: Network, timeout_ms: int) -> dict[str, Any]:
         "listen": {"endpoints": list(network.listen), "exit_on_failure": True},
         "connect": {
             "endpoints": list(network.connect),
-            "timeout_ms": timeout_ms,
-            "exit_on_failure": True,
+            "timeout_ms": -1 if timeout is None else int(timeout * 1000),
+            "exit_on_failure": timeout is not None,
             "retry": retry,
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
@@ -83,8 +85,8 @@ def _explain(network: Network, error: zenoh.ZError) -> str:
     if network.listen:
         return f"cannot listen on {', '.join(network.listen)}: {_first_line(error)}"
     return (
-        f"nobody answers at {', '.join(network.connect)}: start `dreamfleet coordinator` there, or name another "
-        "address with --connect tcp/HOST:PORT"
+        f"nobody answers at {', '.join(network.connect)}: start `dreamfleet coordinator` or `dreamfleet router` "
+        "there, or name another address with --connect tcp/HOST:PORT"
     )
 
 

@@ -22,7 +22,7 @@ from dreamfleet.common.network import DEFAULT_ENDPOINT, check_endpoint
 
 ARRAYS = ("stage",)  # tables that a file may hold several of
 # Of every verb: one file serves all of them.
-TABLES = ("run", "limits", "network", "worker", "dashboard", "demo", "iterate")
+TABLES = ("run", "limits", "network", "worker", "dashboard", "demo", "iterate", "router")
 OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG")
 PREFIX = "DREAMFLEET_"
 ALIKE = 0.75  # how near a name must be to a known one to be taken for a slip of the hand

@@ -70,7 +70,7 @@ def test_every_verb_offers_the_file_and_what_is_logged():
         assert "--log-level" in text, name
 
 
-SILENT = {"dashboard", "demo", "worker"}  # these work for a person who watches, or for nobody
+SILENT = {"dashboard", "demo", "router", "worker"}  # these work for a person who watches, or for nobody
 
 
 def test_every_verb_that_answers_can_do_so_in_json():

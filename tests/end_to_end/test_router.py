@@ -1,0 +1,114 @@
+"""Routers of their own: coordinator and workers only connect out, and meet there."""
+
+import json
+import os
+import signal
+import tomllib
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from dreamfleet.common.runs import open_run
+from tests.support import tasks
+from tests.support.hosts import new_host
+from tests.support.processes import free_port
+
+pytestmark = pytest.mark.timeout(300)
+RECIPES = Path(__file__).parents[2] / "deploy" / "zenoh"
+GENERATIONS, POPULATION = 8, 4
+SETTINGS = ("--task", tasks.SLOW_TOY, "--population", POPULATION, "--episodes", 1, "--generations", GENERATIONS,
+            "--evaluate-every", 0, "--beat", 0.2)  # fmt: skip
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    """Writes a recipe's file with the addresses of this test in place of its examples."""
+
+    def write(name, **addresses):
+        text = (RECIPES / name).read_text()
+        for example, address in addresses.items():
+            assert example.replace("_", ".") in text
+            text = text.replace(example.replace("_", "."), address)
+        (tmp_path / name).write_text(text)
+        return tmp_path / name
+
+    return write
+
+
+def fitness(processes, name):
+    with open_run(processes.runs, name) as run:
+        return [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
+
+
+def alone(processes, bundle):
+    coordinator = processes.coordinator("--bundle", bundle.path, *SETTINGS, name="alone")
+    processes.worker("--run", "alone", "--task", tasks.SLOW_TOY, "--slots", 4)
+    assert coordinator.finish(120)[0] == 0
+    return fitness(processes, "alone")
+
+
+def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe, random_bundle):
+    ports = {"router": free_port(), "second": free_port()}
+    first = recipe("one.toml", **{"0_0_0_0:7447": f"127.0.0.1:{ports['router']}",
+                                  "router_example:7447": f"127.0.0.1:{ports['router']}"})  # fmt: skip
+    second = recipe("linked.toml", **{"0_0_0_0:7447": f"127.0.0.1:{ports['second']}",
+                                      "router_example:7447": f"127.0.0.1:{ports['router']}",
+                                      "second_example:7447": f"127.0.0.1:{ports['second']}"})  # fmt: skip
+    linked = processes.start("router", "--config", second)  # either may start first
+    linked.wait_for("listening on")
+    router = processes.start("router", "--config", first)
+    router.wait_for("listening on")
+    coordinator = processes.start("coordinator", "--config", first, "--run", "far", "--runs-dir", processes.runs,
+                                  "--bundle", random_bundle.path, *SETTINGS)  # fmt: skip
+    worker = processes.start("worker", "--config", second, "--run", "far", "--task", tasks.SLOW_TOY, "--slots", 1)
+    worker.wait_for("joined")
+    coordinator.wait_for("generation 1: mean")
+    os.kill(router.popen.pid, signal.SIGKILL)
+    router.popen.wait()
+    processes.start("router", "--config", first).wait_for("listening on")
+    assert coordinator.finish(120)[0] == 0
+    linked.popen.send_signal(signal.SIGTERM)
+    assert linked.finish()[0] == 0
+    assert "1 routers" in linked.lines[-1]
+    assert fitness(processes, "far") == alone(processes, random_bundle)
+
+
+def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a_router(
+    processes, recipe, random_bundle
+):
+    """Each on a cable of its own to the router's host, which passes no packets on."""
+    with new_host() as inside, new_host() as elsewhere:
+        if elsewhere is None:
+            pytest.skip("network namespaces need root and iproute2")
+        near = [recipe("one.toml", **{"0_0_0_0:7447": f"127.0.0.1:{processes.port}",
+                                      "router_example:7447": f"{host.address}:{processes.port}"}).rename(
+                    processes.folder / f"{host.name}.toml") for host in (inside, elsewhere)]  # fmt: skip
+        listen = [f"tcp/{host.address}:{processes.port}" for host in (inside, elsewhere)]
+        processes.start("router", "--listen", *listen).wait_for("listening on")
+        coordinator = processes.start("coordinator", "--config", near[0], "--run", "nat", "--runs-dir", processes.runs,
+                                      "--bundle", random_bundle.path, *SETTINGS, inside=inside.inside)  # fmt: skip
+        worker = processes.start("worker", "--config", near[1], "--run", "nat", "--task", tasks.SLOW_TOY, "--slots", 2,
+                                 inside=elsewhere.inside)  # fmt: skip
+        worker.wait_for("joined")
+        assert coordinator.finish(120)[0] == 0
+    assert fitness(processes, "nat") == alone(processes, random_bundle)
+
+
+@pytest.mark.parametrize("name", ["one.toml", "linked.toml"])
+def test_what_is_printed_for_zenohd_is_the_routers_own_configuration(processes, name):
+    code, out, err = processes.call("router", "--config", RECIPES / name, "--print-config")
+    assert code == 0, err
+    told, wanted = json.loads(out), tomllib.loads((RECIPES / name).read_text())["router"]
+    assert told["mode"] == "router"
+    assert (told["listen"]["endpoints"], told["connect"]["endpoints"]) == (wanted["listen"], wanted.get("connect", []))
+    told["listen"]["endpoints"] = [f"tcp/127.0.0.1:{free_port()}"]
+    told["connect"]["endpoints"] = []
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(told))):  # unknown keys raise
+        pass
+
+
+def test_a_port_in_use_is_one_line(processes):
+    processes.start("router", "--listen", processes.endpoint).wait_for("listening on")
+    code, _, err = processes.call("router", "--listen", processes.endpoint)
+    assert (code, "is in use" in err, "Traceback" in err) == (1, True, False), err
