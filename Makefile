@@ -2,11 +2,12 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+SUPPLY := .venv-supply
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
 .PHONY: demo test setup check wheel long box2d-py simulate chaos sanitize bundle worker-size stranger reproduce \
-  reproduce-evolution clean
+  reproduce-evolution lock audit sbom clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(ARGS)
@@ -75,5 +76,24 @@ stranger:  ## both commands as a stranger runs them: a fresh clone of what is co
 worker-size: $(VENV)/bin/python  ## what a worker's environment weighs
 	$(BIN)/python deploy/worker_size.py
 
+$(SUPPLY)/.done:
+	$(PYTHON) -m venv $(SUPPLY)
+	$(SUPPLY)/bin/python -m pip --disable-pip-version-check install --quiet cyclonedx-bom pip-audit pip-tools
+	touch $@
+
+lock: $(SUPPLY)/.done  ## deploy/*.lock: exact versions and hashes of what stands in the images
+	$(SUPPLY)/bin/python deploy/lock.py
+
+audit: $(SUPPLY)/.done  ## known vulnerabilities of a worker's packages; says so where the advisories cannot be reached
+	$(SUPPLY)/bin/python deploy/audit.py
+
+sbom: $(SUPPLY)/.done  ## build/worker.cdx.json: what a worker's environment is made of, as CycloneDX
+	rm -rf build/locked && mkdir -p build
+	$(PYTHON) -m venv --without-pip build/locked
+	$(SUPPLY)/bin/python -m pip --disable-pip-version-check --python build/locked/bin/python install --quiet --require-hashes --requirement deploy/worker.lock
+	$(SUPPLY)/bin/python -m pip --disable-pip-version-check --python build/locked/bin/python install --quiet --no-deps .
+	$(SUPPLY)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --validate \
+	  --output-file build/worker.cdx.json build/locked/bin/python
+
 clean:
-	rm -rf $(VENV) .venv-box2d-py build dist *.egg-info
+	rm -rf $(VENV) $(SUPPLY) .venv-box2d-py build dist *.egg-info

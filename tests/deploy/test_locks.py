@@ -1,0 +1,76 @@
+"""What stands in an image: exact versions with hashes, whole, and those that the tests run with."""
+
+import json
+import re
+import subprocess
+from importlib.metadata import requires, version
+from pathlib import Path
+
+import pytest
+from packaging.markers import default_environment
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[2]
+DEPLOY = ROOT / "deploy"
+PIN = re.compile(r"^([A-Za-z0-9._-]+)==([^ ;\\]+)")
+
+
+def pins(path):
+    """Canonical name to version."""
+    found = (PIN.match(line) for line in path.read_text().splitlines())
+    return {canonicalize_name(each[1]): each[2] for each in found if each}
+
+
+def closure(name, extras=()):
+    """Every distribution that one needs here, with itself: name to the requirements of it."""
+    seen, waiting = {}, [(name, frozenset(extras))]
+    while waiting:
+        name, extras = waiting.pop()
+        for text in requires(name) or ():
+            wanted = Requirement(text)
+            under = [{**default_environment(), "extra": each} for each in (extras or {""})]
+            if wanted.marker is not None and not any(wanted.marker.evaluate(each) for each in under):
+                continue
+            key = canonicalize_name(wanted.name)
+            if key not in seen and key != "dreamfleet":
+                waiting.append((key, frozenset(wanted.extras)))
+            seen.setdefault(key, []).append(wanted.specifier)
+    return seen
+
+
+@pytest.mark.parametrize(("name", "extras"), [("coordinator", ()), ("worker", ("worker",))])
+def test_a_lock_holds_all_that_its_role_needs(name, extras):
+    locked = pins(DEPLOY / f"{name}.lock")
+    needed = closure("dreamfleet", extras)
+    assert locked.keys() == needed.keys(), "write it again: make lock"
+    for key, specifiers in needed.items():
+        assert all(locked[key] in each for each in specifiers), f"{key}: make lock"
+
+
+@pytest.mark.parametrize("name", ["build", "coordinator", "worker"])
+def test_a_lock_has_hashes_and_names_no_place(name):
+    text = (DEPLOY / f"{name}.lock").read_text()
+    for entry in re.split(r"\n(?=\S)", text)[1:]:
+        assert PIN.match(entry), entry
+        assert re.search(r"--hash=sha256:[0-9a-f]{64}", entry), entry
+    assert "/" not in text.replace("deploy/", "")
+
+
+@pytest.mark.parametrize("name", ["coordinator", "worker"])
+def test_a_lock_has_the_versions_that_are_tested(name):
+    tested = pins(ROOT / "constraints.txt")
+    assert pins(DEPLOY / f"{name}.lock").items() <= tested.items(), "make lock"
+    assert pins(DEPLOY / "worker.lock")["numpy"] == version("numpy")
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1200)
+def test_the_bill_of_materials_is_the_lock_and_an_audit_says_whether_it_ran():
+    subprocess.run(["make", "sbom"], cwd=ROOT, check=True, capture_output=True)
+    told = json.loads((ROOT / "build" / "worker.cdx.json").read_text())
+    assert told["metadata"]["component"]["name"] == "dreamfleet"
+    found = {canonicalize_name(each["name"]): each["version"] for each in told["components"]}
+    assert found == pins(DEPLOY / "worker.lock")
+    done = subprocess.run(["make", "audit"], cwd=ROOT, check=False, capture_output=True, text=True)
+    assert "known vulnerabilities" in done.stdout if "not audited" not in done.stderr else done.returncode == 2
