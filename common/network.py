@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from ipaddress import ip_address
 
 from dreamfleet.common.errors import UsageError
 
@@ -22,6 +23,15 @@ class Network:
     def __post_init__(self) -> None:
         for endpoint in (*self.listen, *self.connect):
             check_endpoint(endpoint)
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether an endpoint is of this host alone."""
+    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def check_endpoint(endpoint: str) -> str:

@@ -13,16 +13,16 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from dreamfleet.common.config import add_flags, load, option, read_toml
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.logs import choose_format
 from dreamfleet.common.network import DEFAULT_ENDPOINT, check_endpoint
 
-ARRAYS = ("stage",)  # tables that a file may hold several of
+ARRAYS = ("stage", "host")  # tables that a file may hold several of
 # Of every verb: one file serves all of them.
-TABLES = ("run", "limits", "network", "worker", "dashboard", "demo", "iterate", "router")
+TABLES = ("run", "limits", "network", "worker", "dashboard", "demo", "iterate", "router", "spawn")
 OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG")
 PREFIX = "DREAMFLEET_"
 ALIKE = 0.75  # how near a name must be to a known one to be taken for a slip of the hand
@@ -34,6 +34,7 @@ class SiteConfig:
 
     connect: tuple[str, ...] = option((), f"the run's router, or several to try (default {DEFAULT_ENDPOINT})")
     listen: tuple[str, ...] = option((), f"listen here (default {DEFAULT_ENDPOINT}, unless --connect is given)")
+    join: Path | None = option(None, "join file: where to connect, and by which credentials")  # noqa: RUF009
     runs_dir: Path = option(Path("runs"), "where runs live")  # noqa: RUF009 - a field, and paths do not change
     log_level: Literal["debug", "info", "warning", "error"] = option("info", "the least that is logged on stderr")
     log_format: Literal["text", "json", "auto"] = option("text", "as lines, as JSON, or auto: JSON but in a terminal")
@@ -58,6 +59,11 @@ def offer_everywhere(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def read_file(path: Path | None) -> dict[str, Any]:
+    """A configuration file of any verb."""
+    return read_toml(path, TABLES, top=[each.name for each in fields(SiteConfig)], arrays=ARRAYS)
+
+
 def settle(args: argparse.Namespace, environment: Mapping[str, str] = os.environ) -> None:
     """Complete parsed arguments from the file and the environment, and set how much is logged.
 
@@ -66,7 +72,7 @@ def settle(args: argparse.Namespace, environment: Mapping[str, str] = os.environ
     """
     given = frozenset(vars(args))
     path = args.config or (Path(environment[f"{PREFIX}CONFIG"]) if environment.get(f"{PREFIX}CONFIG") else None)
-    file = read_toml(path, TABLES, top=[each.name for each in fields(SiteConfig)], arrays=ARRAYS)
+    file = read_file(path)
     environment = _check_variables(environment)
     site = load(SiteConfig, "", flags=args, environment=environment, file=file)
     args.sources = {"flags": argparse.Namespace(**vars(args)), "environment": environment, "file": file}

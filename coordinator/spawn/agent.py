@@ -1,0 +1,447 @@
+"""What runs on a host while workers are spawned there: it looks, installs, starts, shows logs and ends.
+
+This text is sent over ssh and run by a Python that is found there, so that it imports the standard library alone. It is
+asked by lines of JSON on stdin, each followed by the files that it names, and answers by lines behind `MARK` on stdout:
+`say` or `line` while it works, then `ok` or `failed`. Nothing that changes a host is done to it twice at once.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import re
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+MARK = "dreamfleet-host "
+TICK = 0.1  # seconds between looks
+FIRST_WORD = 60.0  # seconds that a worker may take to say anything
+MOST_DRAIN = 900.0  # seconds that a drain is waited for
+AT_ONCE = ((signal.SIGTERM, 1.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 30.0))  # each with what it may take
+DRAINING = ((signal.SIGTERM, MOST_DRAIN),)
+LEAST_FREE = 700_000_000  # bytes that an environment takes while it is made
+LONGEST_TAIL = 8192  # bytes of a log in which its last line is looked for
+JOIN, LOG, STATE, WHOLE = "join", "log", "worker.json", "whole"
+JOIN_HERE = "{join}"  # a word that stands for the join file's path
+_HEAD = re.compile(r"^\S+ \S+ [A-Z]+ dreamfleet[\w.]*: |^dreamfleet: ")  # of a line of the log, or of a last word
+_RECORD = re.compile(rb"(?m)^(\d{4}-\S+ \S+ [A-Z]+ dreamfleet|\{)")  # a line of its log, as text or JSON
+
+
+class FailedError(Exception):
+    """What cannot be done here; the text says why and what to do."""
+
+
+class GoneError(Exception):
+    """Whoever asked is not there any more."""
+
+
+class Line:
+    """Questions on stdin, which is never read further than was sent, and answers on stdout."""
+
+    def __init__(self) -> None:
+        self._waiting = b""
+
+    def question(self) -> dict[str, Any]:
+        """The next question; an empty line asks nothing but to be heard."""
+        while b"\n" not in self._waiting:
+            self._hear()
+        text, _, self._waiting = self._waiting.partition(b"\n")
+        question: dict[str, Any] = json.loads(text or b"{}")
+        return question
+
+    def file(self, size: int) -> bytes:
+        """A file of so many bytes that follows a question."""
+        while len(self._waiting) < size:
+            self._hear()
+        data, self._waiting = self._waiting[:size], self._waiting[size:]
+        return data
+
+    def pause(self, seconds: float = TICK) -> bool:
+        """Wait so long, or until something is asked, which is then true; `GoneError` if nobody is there to ask."""
+        if not self._waiting and select.select([0], [], [], seconds)[0]:
+            self._hear()
+        return bool(self._waiting)
+
+    def tell(self, kind: str, told: Any) -> None:
+        """Answer; nobody may be there to read it."""
+        with suppress(BrokenPipeError):
+            print(MARK + json.dumps({kind: told}), flush=True)  # noqa: T201 - the answer
+
+    def _hear(self) -> None:
+        data = os.read(0, 1 << 20)
+        if not data:
+            raise GoneError
+        self._waiting += data
+
+
+class Place:
+    """The folder in which everything of a fleet's lies on this host."""
+
+    def __init__(self, text: str, line: Line) -> None:
+        self.root = Path(text).expanduser().absolute()
+        self._line = line
+
+    def environment(self, name: str) -> Path:
+        """Where an environment lies; it is whole when it holds `WHOLE`."""
+        return self.root / "environments" / name
+
+    def worker(self, name: str) -> Path:
+        """Where a worker's state, log and join file lie."""
+        return self.root / "workers" / name
+
+    def names(self, kind: str) -> list[str]:
+        """The environments or workers that are there."""
+        with suppress(FileNotFoundError):
+            return sorted(each.name for each in (self.root / kind).iterdir())
+        return []
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Inside, no other command changes anything here; one that is at work is waited for."""
+        while True:
+            self._make()
+            with (self.root / "lock").open("w") as lock:
+                self._take(lock.fileno())
+                with suppress(FileNotFoundError):  # who held it may have removed it all
+                    if os.path.samestat(os.fstat(lock.fileno()), (self.root / "lock").stat()):
+                        yield
+                        return
+
+    def remove(self) -> None:
+        """Leave nothing behind; a folder with other things in it stays, with these."""
+        made = [self.root]
+        with suppress(FileNotFoundError):
+            made = [Path(each) for each in json.loads((self.root / "made").read_text())]
+        for name in ("environments", "workers", "cache"):
+            shutil.rmtree(self.root / name, ignore_errors=True)
+        for name in ("made", "lock"):
+            (self.root / name).unlink(missing_ok=True)
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
+
+    def _make(self) -> None:
+        missing = [each for each in (self.root, *self.root.parents) if not each.exists()]
+        self.root.mkdir(parents=True, exist_ok=True)
+        if missing:
+            (self.root / "made").write_text(json.dumps([str(each) for each in missing]))
+
+    def _take(self, lock: int) -> None:
+        said = False
+        while True:
+            with suppress(BlockingIOError):
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            if not said:
+                self._line.tell("say", "another command is at work there: waiting for it")
+            said = True
+            self._line.pause()
+
+
+def birth(pid: int) -> str:
+    """When the process of this number began, by which it is told from a later one; empty where none runs."""
+    try:
+        facts = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except (FileNotFoundError, ProcessLookupError):
+        if Path("/proc/self/stat").exists():
+            return ""
+        words = ("ps", "-o", "stat=,lstart=", "-p", str(pid))
+        told = subprocess.run(words, capture_output=True, text=True, check=False)
+        state, _, began = told.stdout.strip().partition(" ")
+        return "" if state.startswith("Z") else began.strip()
+    return "" if facts[0] in "ZX" else f"{boot} {facts[19]}"  # proc_pid_stat(5): state, and the start in ticks
+
+
+class Found:
+    """A worker's state as it was written, and whether it still runs."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.state: dict[str, Any] = {}
+        with suppress(FileNotFoundError, ValueError):
+            self.state = json.loads((folder / STATE).read_text())
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether another host that shares this folder started it."""
+        return bool(self.state) and self.state["node"] != platform.node()
+
+    @property
+    def alive(self) -> bool:
+        """Whether this very process runs."""
+        with suppress(ChildProcessError):
+            os.waitpid(-1, os.WNOHANG)  # of our own: one that ended is none
+        return bool(self.state) and not self.elsewhere and birth(self.state["pid"]) == self.state["birth"]
+
+    @property
+    def holder(self) -> int:
+        """The process by whose tunnel it lives, as long as that runs; else 0."""
+        pid, began = self.state.get("holder", (0, ""))
+        return pid if pid and birth(pid) == began else 0
+
+    def row(self) -> dict[str, Any]:
+        """What is told of it."""
+        running = self.alive
+        age = time.time() - self.state["since"] if running else None
+        return {"name": self.folder.name, "running": running, "slots": self.state.get("slots"), "age": age,
+                "digest": self.state.get("digest"), "last": last_line(self.folder / LOG)}  # fmt: skip
+
+    def end(self, line: Line, steps: tuple[tuple[signal.Signals, float], ...]) -> None:
+        """Ask it to leave, and wait until it has."""
+        for number, seconds in steps:
+            if not self.alive:
+                return
+            with suppress(ProcessLookupError):  # it leads a group, with the children that score for it
+                (os.killpg if number == signal.SIGKILL else os.kill)(self.state["pid"], number)
+            deadline = time.monotonic() + seconds
+            while self.alive and time.monotonic() < deadline:
+                line.pause() if len(steps) == 1 else time.sleep(TICK)
+        if self.alive:
+            raise FailedError(f"worker {self.folder.name} does not leave: end it with --now")
+
+
+def last_line(log: Path) -> str:
+    """What a worker said last, without its time."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - LONGEST_TAIL))
+            lines = file.read().decode(errors="replace").splitlines()
+    except FileNotFoundError:
+        return ""
+    said = [each.strip() for each in lines if each.strip()]
+    return _HEAD.sub("", said[-1]) if said else ""
+
+
+def look(question: dict[str, Any], line: Line) -> dict[str, Any]:
+    """What is there; nothing is changed."""
+    place = Place(question["root"], line)
+    there = next(each for each in (place.root, *place.root.parents) if each.exists())
+    installed = None
+    with suppress(importlib.metadata.PackageNotFoundError):
+        installed = importlib.metadata.version("dreamfleet")
+    return {
+        "python": list(sys.version_info[:2]),
+        "executable": sys.executable,
+        "machine": platform.machine(),
+        "system": platform.system(),
+        "installed": installed,
+        "venv": importlib.util.find_spec("venv") is not None and importlib.util.find_spec("ensurepip") is not None,
+        "writable": os.access(there, os.W_OK),
+        "root": str(place.root),
+        "free": shutil.disk_usage(there).free,
+        "environments": [each for each in place.names("environments") if (place.environment(each) / WHOLE).exists()],
+        "workers": [Found(place.worker(each)).row() for each in place.names("workers")],
+    }
+
+
+def install(question: dict[str, Any], files: dict[str, bytes], line: Line) -> dict[str, Any]:
+    """An environment of this name that is whole: it is made unless it is there."""
+    place = Place(question["root"], line)
+    folder = place.environment(question["environment"])
+    with place.locked():
+        if (folder / WHOLE).exists():
+            return {"python": str(folder / "bin" / "python")}
+        shutil.rmtree(folder, ignore_errors=True)  # an attempt that was interrupted
+        parcel = folder / "parcel"
+        parcel.mkdir(parents=True)
+        for name, data in files.items():
+            (parcel / Path(name).name).write_bytes(data)
+        line.tell("say", "makes its environment")
+        _call(sys.executable, "-m", "venv", str(folder))
+        python = str(folder / "bin" / "python")
+        line.tell("say", "installs the worker" + ("" if question["offline"] else ", from the package index"))
+        source = ("--no-index", "--find-links", ".") if question["offline"] else ("--constraint", "pins.txt")
+        _call(python, "-m", "pip", "install", "--quiet", "--no-cache-dir", "--disable-pip-version-check", *source,
+              f"./{question['wheel']}[worker]", inside=parcel)  # fmt: skip
+        shutil.rmtree(parcel)
+        (folder / WHOLE).touch()
+    return {"python": python}
+
+
+def _call(*command: str, inside: Path | None = None) -> None:
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, cwd=inside)
+    if done.returncode == 0:
+        return
+    said = [each.strip() for each in (done.stdout + done.stderr).splitlines() if each.strip()]
+    text = "\n".join(said)
+    if "ensurepip" in text and "-m venv" in " ".join(command):
+        raise FailedError("its Python has no venv: install it there (Debian: apt install python3-venv)")
+    if "No space left" in text or "Errno 28" in text:
+        raise OSError(errno.ENOSPC, "no space left")
+    why = next((each for each in said if "ERROR: " in each), said[-1] if said else f"exit code {done.returncode}")
+    raise FailedError(
+        f"the worker cannot be installed ({why.removeprefix('ERROR: ')}): where it reaches no package index, or one "
+        "without what it needs, give --wheelhouse, or --remote-python where it is installed"
+    )
+
+
+def start(question: dict[str, Any], files: dict[str, bytes], line: Line) -> dict[str, Any]:
+    """Start a worker, unless the same one runs; another one of its name is drained first."""
+    place = Place(question["root"], line)
+    folder = place.worker(question["name"])
+    with place.locked():
+        found = Found(folder)
+        if found.alive and found.holder:
+            raise FailedError("a worker of this name runs by the tunnel of another command: end that one first")
+        if found.alive and not question["held"] and found.state["digest"] == question["digest"]:
+            return {**found.row(), "outcome": "running"}
+        if found.elsewhere:
+            raise FailedError(
+                f"worker {folder.name} was started by {found.state['node']}, which shares this folder: give each host "
+                "a name of its own, or end that one first"
+            )
+        outcome = "replaced" if found.alive else "started"
+        found.end(line, DRAINING)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            _keep(folder / name, data)
+        began = _launch(place, folder, question)
+    _await_word(began, folder, line)
+    return {**Found(folder).row(), "outcome": outcome}
+
+
+def _keep(path: Path, data: bytes) -> None:
+    """Write a file that is whole or not there, for this user alone: no umask is trusted."""
+    aside = path.with_name(f".{path.name}")
+    with open(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+        file.write(data)
+    aside.chmod(0o600)
+    aside.replace(path)
+
+
+def _launch(place: Place, folder: Path, question: dict[str, Any]) -> subprocess.Popen[bytes]:
+    log = folder / LOG
+    log.unlink(missing_ok=True)
+    state = {
+        "digest": question["digest"],
+        "slots": question["slots"] or _cores(),
+        "since": time.time(),
+        "node": platform.node(),
+    }
+    if question["held"]:
+        state["holder"] = [os.getpid(), birth(os.getpid())]
+    _keep(folder / STATE, b"{}")  # a disk that is full is so before anything runs
+    words = [question["python"], *(str(folder / JOIN) if each == JOIN_HERE else each for each in question["words"])]
+    with log.open("xb") as out:
+        began = subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True, cwd=folder,
+            env={**os.environ, "DREAMFLEET_CACHE": str(place.root / "cache"), **question["env"]},
+        )  # fmt: skip
+    try:
+        _keep(folder / STATE, json.dumps({**state, "pid": began.pid, "birth": birth(began.pid)}).encode())
+    except OSError:
+        began.kill()
+        raise
+    return began
+
+
+def _cores() -> int:
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # of Linux alone
+        return os.cpu_count() or 1
+
+
+def _await_word(began: subprocess.Popen[bytes], folder: Path, line: Line) -> None:
+    """Until its log has begun, which a usage or a traceback does not; `FailedError` if it ended instead."""
+    deadline = time.monotonic() + FIRST_WORD
+    while began.poll() is None and not _RECORD.search((folder / LOG).read_bytes()) and time.monotonic() < deadline:
+        line.pause()
+    if began.poll():
+        why = last_line(folder / LOG) or f"exit code {began.returncode}"
+        raise FailedError(f"its worker ended at once: {why}")
+
+
+def follow(question: dict[str, Any], line: Line) -> dict[str, Any]:
+    """A worker's log from its beginning, line by line, until it ended or something else is asked."""
+    found = Found(Place(question["root"], line).worker(question["name"]))
+    rest = b""
+    with (found.folder / LOG).open("rb") as log:
+        while True:
+            over = not found.alive
+            *lines, rest = (rest + log.read()).split(b"\n")
+            for each in lines:
+                line.tell("line", each.decode(errors="replace"))
+            if over or line.pause():
+                return {**found.row(), "ended": over}
+
+
+def end(question: dict[str, Any], line: Line) -> dict[str, Any]:
+    """End one worker, or all, with what belongs to them; unless told to keep it, the rest too when none is left."""
+    place, ended = Place(question["root"], line), list[dict[str, Any]]()
+    if not place.root.exists():
+        return {"ended": ended}
+    with place.locked():
+        for name in question["names"] or place.names("workers"):
+            found = Found(place.worker(name))
+            if found.elsewhere or not found.folder.exists():
+                continue
+            ended += [found.row()]
+            if found.alive:
+                line.tell("say", f"worker {name} leaves")
+            found.end(line, AT_ONCE if question["now"] else DRAINING)
+            shutil.rmtree(found.folder)
+        if not place.names("workers") and not question["keep"]:
+            place.remove()
+    return {"ended": ended}
+
+
+def obey(question: dict[str, Any], line: Line) -> None:
+    """Do what is asked, and answer."""
+    files = {name: line.file(size) for name, size in question.get("files", [])}
+    tasks: dict[str, Callable[[], dict[str, Any]]] = {
+        "look": lambda: look(question, line),
+        "install": lambda: install(question, files, line),
+        "start": lambda: start(question, files, line),
+        "follow": lambda: follow(question, line),
+        "end": lambda: end(question, line),
+    }
+    where = question["root"]
+    try:
+        line.tell("ok", tasks[question["do"]]())
+    except FailedError as error:
+        line.tell("failed", str(error))
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            line.tell("failed", f"no space left in {where}: make room there, or name another --remote-dir")
+        elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+            line.tell("failed", f"{error.filename or where} cannot be written there: name another --remote-dir")
+        else:
+            line.tell("failed", f"{error}")
+
+
+def main() -> None:
+    """Answer until nobody asks; a worker that lives by this connection then ends with it."""
+    os.umask(0o077)
+    line, held = Line(), list[dict[str, Any]]()
+    line.tell("ok", {})
+    try:
+        while True:
+            if not (question := line.question()):
+                continue
+            if question.get("held"):
+                held.append(question)
+            obey(question, line)
+    except GoneError:
+        for each in held:
+            if Found(Place(each["root"], line).worker(each["name"])).holder == os.getpid():
+                with suppress(FailedError, OSError):
+                    end({**each, "names": [each["name"]], "now": True, "keep": True}, line)
+
+
+if __name__ == "__main__":
+    main()

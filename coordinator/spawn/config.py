@@ -1,0 +1,151 @@
+"""Which hosts there are, and how a worker is brought to each: settings, their checks, and what follows from them."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.config import load, option, read_table
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.keys import check_worker_name
+from dreamfleet.common.network import is_loopback
+
+HOSTS = "host"  # [[host]] in a file
+TAKEN = ("--name", "--slots", "--connect", "--join")  # flags of a worker that are ours to give
+MOST_SLOTS = 1024
+_ADDRESS = re.compile(r"(ssh://)?([^@\s]+@)?(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^@:\s/]+)(:\d+)?/?")
+
+
+@dataclass(frozen=True)
+class SpawnConfig:
+    """How a worker is brought to a host; a host's own table says what differs there."""
+
+    slots: int = option(0, "scoring processes of each worker; 0: one a core")
+    worker_flags: str = option("", 'further flags of each `worker`, as one text: "--run night --exit-when-done"')
+    env: tuple[str, ...] = option((), "variables of its environment, each as NAME=VALUE")
+    remote_dir: str = option("~/.local/share/dreamfleet", "folder there that everything lies in")
+    remote_python: str = option(
+        "", "Python there: used as it is where dreamfleet is installed in it; else, as by default the first one of "
+        "3.11 or newer on PATH, it makes an environment",
+    )  # fmt: skip
+    wheelhouse: Path | None = option(None, "folder of wheels here, copied there instead of a package index's")  # noqa: RUF009
+    tunnel: bool | None = option(
+        None, "reach --connect from here, through the ssh connection, as long as this command runs (default: where "
+        "--connect is this host's own loopback)",
+    )  # fmt: skip
+    ssh: str = option("ssh", 'the ssh client with flags of your own: "ssh -F FILE", "ssh -J jump -i KEY"')
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.slots <= MOST_SLOTS:
+            raise UsageError(f"--slots must be from 0 to {MOST_SLOTS}, not {self.slots}")
+        for each in self.env:
+            if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*=[^\0]*", each):
+                raise UsageError(f"--env {each!r}: write it as NAME=VALUE")
+        if self.wheelhouse is not None and not any(self.wheelhouse.glob("*.whl")):
+            raise UsageError(f"--wheelhouse {self.wheelhouse} holds no wheel: fill it with `pip download -d FOLDER`")
+        if not self.remote_dir.strip("/ ") or self.remote_dir == "~":
+            raise UsageError(f"--remote-dir {self.remote_dir!r}: name a folder of its own")
+        if not _words("ssh", self.ssh):
+            raise UsageError("--ssh: name the ssh client")
+        said = {word.partition("=")[0] for word in _words("worker-flags", self.worker_flags)}
+        if taken := [flag for flag in TAKEN if flag in said]:
+            raise UsageError(f"--worker-flags: {', '.join(taken)} is given otherwise: see --help")
+
+
+@dataclass(frozen=True)
+class HostConfig:
+    """One [[host]] of a file."""
+
+    address: str = field(metadata={"help": "as ssh takes it: user@host, a name of ~/.ssh/config, or ssh://host:port"})
+    name: str = option("", "of host and worker (default the address without user)")
+
+
+@dataclass(frozen=True)
+class Host:
+    """One host, and how a worker is brought there."""
+
+    name: str
+    address: str
+    spawn: SpawnConfig
+
+    def __post_init__(self) -> None:
+        if self.address.startswith("-") or not _ADDRESS.fullmatch(self.address):
+            raise UsageError(f"{self.address!r} is no host: write it as user@host, host, or ssh://user@host:port")
+        check_worker_name(self.name)
+
+    @property
+    def flags(self) -> list[str]:
+        """Further flags of its worker."""
+        return _words("worker-flags", self.spawn.worker_flags)
+
+    @property
+    def ssh(self) -> list[str]:
+        """The ssh client with the user's own flags."""
+        return _words("ssh", self.spawn.ssh)
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Variables that its worker is given."""
+        return dict(each.partition("=")[::2] for each in self.spawn.env)
+
+    def forwards(self, connect: Iterable[str], *, joins: bool) -> tuple[str, ...]:
+        """HOST:PORT of each endpoint that its worker reaches through a tunnel: by default where all are loopback's.
+
+        `joins`: a join file says where to connect, unless endpoints are given too.
+        """
+        endpoints = tuple(connect)
+        wanted = self.spawn.tunnel
+        if wanted is None:
+            wanted = not joins and all(map(is_loopback, endpoints))
+        if not wanted:
+            return ()
+        if strange := [each for each in endpoints if not each.startswith("tcp/")]:
+            raise UsageError(f"--tunnel carries tcp alone, which ssh encrypts, and not {', '.join(strange)}")
+        return tuple(each.removeprefix("tcp/") for each in endpoints)
+
+
+def read_hosts(rows: Sequence[Mapping[str, Any]], sources: Mapping[str, Any]) -> list[Host]:
+    """The hosts of [[host]] tables; what one says is stronger than [spawn], and weaker than environment and flags."""
+    hosts = []
+    for number, row in enumerate(rows, start=1):
+        where = f"[[{HOSTS}]] number {number}"
+        own = {key: row[key] for key in ("address", "name") if key in row}
+        if "address" not in own:
+            raise UsageError(f'{where} has no address: write address = "user@host"')
+        about = HostConfig(**read_table(HostConfig, where, own))
+        rest = read_table(SpawnConfig, where, {key: value for key, value in row.items() if key not in own})
+        table = (sources.get("file") or {}).get("spawn", {})
+        texts = {key: str(value) if isinstance(value, Path) else value for key, value in rest.items()}
+        lists = {key: list(value) if isinstance(value, tuple) else value for key, value in texts.items()}
+        spawn = load(SpawnConfig, "spawn", **{**sources, "file": {"spawn": {**table, **lists}}})
+        hosts.append(Host(about.name or name_of(about.address), about.address, spawn))
+    return told_apart(hosts)
+
+
+def told_apart(hosts: list[Host]) -> list[Host]:
+    """The same hosts; `UsageError` where there is none, or two of one name."""
+    if not hosts:
+        raise UsageError(f"no host is named: give user@host, or a file with [[{HOSTS}]] tables")
+    names = [each.name for each in hosts]
+    if twice := sorted({each for each in names if names.count(each) > 1}):
+        raise UsageError(
+            f"several hosts are called {', '.join(twice)}: give each a name of its own in a file, for `up`"
+        )
+    return hosts
+
+
+def name_of(address: str) -> str:
+    """What a host is called that is given by its address alone."""
+    found = _ADDRESS.fullmatch(address)
+    return re.sub(r"[^A-Za-z0-9.-]+", "-", found["host"] if found else address).strip("-.")[:63] or "worker"
+
+
+def _words(name: str, text: str) -> list[str]:
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise UsageError(f"--{name} {text!r}: {error}") from error

@@ -1,0 +1,79 @@
+"""Which hosts a file names, what each is told, and whether it is reached by a tunnel."""
+
+import argparse
+
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.coordinator.spawn.config import Host, SpawnConfig, name_of, read_hosts, told_apart
+
+LOOPBACK, WIDE = "tcp/127.0.0.1:7447", "tcp/10.0.0.1:7447"
+
+
+def hosts(*rows, file=None, flags=None, environment=None):
+    sources = {"file": file or {}, "flags": argparse.Namespace(**(flags or {})), "environment": environment or {}}
+    return read_hosts(rows, sources)
+
+
+def test_a_hosts_word_is_stronger_than_the_files_and_weaker_than_a_flag(tmp_path):
+    (tmp_path / "a.whl").touch()
+    row = {"address": "me@big", "slots": 16, "env": ["A=1", "B=x=y"], "wheelhouse": str(tmp_path)}
+    (host,) = hosts(row, file={"spawn": {"slots": 4, "remote_dir": "/data/fleet"}})
+    assert (host.name, host.spawn.slots, host.spawn.remote_dir) == ("big", 16, "/data/fleet")
+    assert host.environment == {"A": "1", "B": "x=y"}
+    assert host.spawn.wheelhouse == tmp_path
+    (host,) = hosts(row, environment={"DREAMFLEET_SPAWN_SLOTS": "3"})
+    assert host.spawn.slots == 3
+    (host,) = hosts(row, flags={"slots": 2}, environment={"DREAMFLEET_SPAWN_SLOTS": "3"})
+    assert host.spawn.slots == 2
+
+
+@pytest.mark.parametrize(
+    ("row", "why"),
+    [
+        ({}, "no address"),
+        ({"address": "a", "slot": 3}, "did you mean 'slots'"),
+        ({"address": "a", "slots": "3"}, "slots in \\[\\[host\\]\\] number 1 must be a whole number"),
+        ({"address": "a", "slots": -1}, "--slots"),
+        ({"address": "-oProxyCommand=x"}, "is no host"),
+        ({"address": "a b"}, "is no host"),
+        ({"address": "a", "name": "x/y"}, "cannot name a worker"),
+        ({"address": "a", "env": ["A"]}, "NAME=VALUE"),
+        ({"address": "a", "worker_flags": "--slots 3"}, "given otherwise"),
+        ({"address": "a", "worker_flags": "'"}, "No closing quotation"),
+        ({"address": "a", "remote_dir": "/"}, "a folder of its own"),
+        ({"address": "a", "wheelhouse": "/nowhere"}, "holds no wheel"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_said(row, why):
+    with pytest.raises(UsageError, match=why):
+        hosts(row)
+
+
+def test_hosts_are_told_apart_by_name():
+    assert [each.name for each in hosts({"address": "a@h"}, {"address": "b@h", "name": "other"})] == ["h", "other"]
+    with pytest.raises(UsageError, match="several hosts are called h"):
+        hosts({"address": "a@h"}, {"address": "b@h"})
+    with pytest.raises(UsageError, match="no host is named"):
+        told_apart([])
+
+
+@pytest.mark.parametrize(
+    ("address", "name"),
+    [("me@big.example", "big.example"), ("ssh://me@big:2222", "big"), ("[fe80::1]", "fe80-1"), ("node_1", "node-1")],
+)
+def test_a_host_is_called_by_its_address(address, name):
+    assert Host(name_of(address), address, SpawnConfig()).name == name
+
+
+def test_a_tunnel_is_the_default_to_a_loopback_alone():
+    def forwards(tunnel, *connect, joins=False):
+        return Host("a", "a", SpawnConfig(tunnel=tunnel)).forwards(connect, joins=joins)
+
+    assert forwards(None, LOOPBACK) == ("127.0.0.1:7447",)
+    assert forwards(None, "tcp/[::1]:7447", "tcp/localhost:1") == ("[::1]:7447", "localhost:1")
+    assert forwards(None, WIDE) == forwards(None, LOOPBACK, WIDE) == forwards(False, LOOPBACK) == ()
+    assert forwards(None, LOOPBACK, joins=True) == ()
+    assert forwards(True, WIDE) == ("10.0.0.1:7447",)
+    with pytest.raises(UsageError, match="carries tcp alone"):
+        forwards(True, "tls/10.0.0.1:7447")

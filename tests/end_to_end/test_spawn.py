@@ -1,0 +1,223 @@
+"""Workers on hosts that a real sshd leads to: brought up, left, followed, ended; and whatever stands in the way."""
+
+import json
+import os
+import signal
+import sys
+import time
+
+import pytest
+
+from dreamfleet.coordinator.spawn.agent import birth
+from tests.support import tasks
+from tests.support.disks import small_disk
+from tests.support.sshd import closed_port, new_key, ssh_hosts
+
+pytestmark = pytest.mark.timeout(300)
+PATIENCE = 120
+TOY = ("--task", tasks.TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0)
+
+
+@pytest.fixture
+def hosts(tmp_path):
+    with ssh_hosts(tmp_path) as found:
+        if found is None:
+            pytest.skip("there is no sshd here")
+        yield found
+
+
+def words(hosts, *more):
+    return ("--ssh", hosts.ssh, "--remote-python", sys.executable, *more)
+
+
+def write_file(processes, hosts, *names, more=""):
+    rows = "".join(f'[[host]]\naddress = "{name}"\nslots = 1\n' for name in names)
+    path = processes.folder / "hosts.toml"
+    path.write_text(
+        f'connect = ["{processes.endpoint}"]\n[spawn]\nssh = "{hosts.ssh}"\nremote_python = "{sys.executable}"\n'
+        f'worker_flags = "--task {tasks.TOY}"\n{more}\n{rows}'
+    )
+    return path
+
+
+def told(processes, *arguments, code=0):
+    """The rows that a verb tells, by host."""
+    done, out, err = processes.call(*arguments, "--json", timeout=PATIENCE)
+    assert done == code, err
+    return {row["host"]: row for row in json.loads(out.splitlines()[-1])["hosts"]}
+
+
+def state(host, name=None):
+    return json.loads((host.root() / "workers" / (name or host.name) / "worker.json").read_text())
+
+
+def await_that(happens, why):
+    deadline = time.monotonic() + PATIENCE
+    while not happens():
+        assert time.monotonic() < deadline, why
+        time.sleep(0.1)
+
+
+def runs(pid):
+    return bool(birth(pid))  # a dead process whose parent has not heard of it runs no more
+
+
+def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(processes, hosts):
+    a, b = hosts.add("a"), hosts.add("b")
+    coordinator = processes.coordinator(*TOY, "--generations", 10**6)
+    file = write_file(processes, hosts, "a", "b", more="tunnel = false")
+    assert {row["state"] for row in told(processes, "up", file, "--check").values()} == {"ready"}
+    assert not a.root().exists()
+
+    first = told(processes, "up", file)
+    assert {name: row["state"] for name, row in first.items()} == {"a": "started", "b": "started"}
+    pids = [state(host)["pid"] for host in (a, b)]
+    coordinator.wait_for("generation 1: mean", timeout=PATIENCE)
+    await_that(lambda: processes.status()["slots"] == 2, "two workers never joined")
+
+    again = told(processes, "up", file)
+    assert {row["state"] for row in again.values()} == {"running"}
+    assert "joined run test" in again["a"]["what"]
+    assert [state(host)["pid"] for host in (a, b)] == pids
+    file.write_text(file.read_text().replace("slots = 1", "slots = 2", 1))
+    changed = told(processes, "up", file)
+    assert {name: row["state"] for name, row in changed.items()} == {"a": "replaced", "b": "running"}
+
+    assert {row["state"] for row in told(processes, "down", file).values()} == {"left"}
+    assert not any(runs(pid) for pid in pids)
+    assert [list(host.home.iterdir()) for host in (a, b)] == [[], []]
+    assert {row["state"] for row in told(processes, "down", "a", "b", "--ssh", hosts.ssh).values()} == {"nothing"}
+
+
+def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_the_command(processes, hosts):
+    a = hosts.add("a")
+    coordinator = processes.coordinator(*TOY, "--generations", 10**6)
+    spawn = ("spawn", "a", "--connect", processes.endpoint, *words(hosts, "--worker-flags", f"--task {tasks.TOY}"))
+    command = processes.start(*spawn)
+    command.wait_for("reaches its coordinator through this command", timeout=PATIENCE)
+    pid = state(a)["pid"]
+    coordinator.wait_for("generation 1: mean", timeout=PATIENCE)
+
+    refused = told(processes, *spawn, code=1)["a"]
+    assert "by the tunnel of another command" in refused["what"]
+
+    command.popen.send_signal(signal.SIGINT)
+    code, out = command.finish(PATIENCE)
+    assert code == 0, "".join(command.lines)
+    assert "left" in out
+    assert not runs(pid)
+    assert not (a.root() / "workers" / "a").exists()
+
+    command = processes.start(*spawn)
+    command.wait_for("reaches its coordinator through this command", timeout=PATIENCE)
+    pid = state(a)["pid"]
+    command.popen.kill()
+    os.killpg(command.popen.pid, signal.SIGKILL)
+    await_that(lambda: not (a.root() / "workers" / "a").exists(), "the worker outlives its tunnel")
+    assert not runs(pid)
+
+
+def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(processes, hosts):
+    a, coordinator = hosts.add("a"), processes.coordinator(*TOY, "--generations", 10**6)
+    flags = ("--connect", processes.endpoint, "--no-tunnel", "--follow")
+    own = ("--worker-flags", f"--task {tasks.TOY} --exit-when-done")
+    command = processes.start("spawn", "a", *words(hosts, *flags, *own))
+    coordinator.wait_for("generation 1: mean", timeout=PATIENCE)
+    command.popen.send_signal(signal.SIGINT)
+    code, out = command.finish(PATIENCE)
+    assert code == 0
+    assert "goes on without this command" in out
+    assert runs(state(a)["pid"])
+
+    command = processes.start("spawn", "a", *words(hosts, *flags, *own))
+    coordinator.popen.send_signal(signal.SIGTERM)
+    code, out = command.finish(PATIENCE)
+    assert code == 0
+    assert "a | " in out
+    assert "joined run test" in out
+    assert "leaving run test" in out
+
+
+def test_two_commands_at_once_start_one_worker(processes, hosts):
+    a = hosts.add("a")
+    file = write_file(processes, hosts, "a", more="tunnel = false")
+    both = [processes.start("up", file, "--json") for _ in range(2)]
+    states = [json.loads(each.finish(PATIENCE)[1])["hosts"][0]["state"] for each in both]
+    assert sorted(states) == ["running", "started"]
+    pid = state(a)["pid"]
+    told(processes, "down", file, "--now")
+    assert not runs(pid)
+
+
+def test_each_thing_that_stands_in_the_way_is_said_with_its_remedy_and_the_others_come_up(processes, hosts, tmp_path):
+    for name in ("good", "changed", "strange", "locked", "bare"):
+        hosts.add(name, **({"path": "/nowhere"} if name == "bare" else {}))
+    hosts.write(refused=("127.0.0.1", closed_port()), lost=("host.invalid", 22))
+    foreign = new_key(tmp_path / "foreign")
+    stranger = hosts.config_with(foreign)
+    keys = hosts.known.read_text().splitlines()
+    other = foreign.with_suffix(".pub").read_text().split()[:2]
+    keys[1] = " ".join([keys[1].split()[0], *other])
+    hosts.known.write_text("\n".join([keys[0], keys[1], *keys[3:], ""]))
+    rows = ""
+    for name in ("good", "changed", "strange", "bare", "refused", "lost"):
+        rows += f'[[host]]\naddress = "{name}"\nremote_python = "{"" if name == "bare" else sys.executable}"\n'
+    rows += f'[[host]]\naddress = "locked"\nssh = "ssh -F {stranger}"\nremote_python = "{sys.executable}"\n'
+    rows += f'[[host]]\naddress = "good"\nname = "wrong"\nremote_python = "{tmp_path}/none"\n'
+    file = tmp_path / "hosts.toml"
+    file.write_text(f'[spawn]\ntunnel = false\nssh = "{hosts.ssh}"\nslots = 1\n{rows}')
+    found = told(processes, "up", file, code=1)
+    assert found.pop("good")["state"] == "started"
+    assert {row["state"] for row in found.values()} == {"failed"}
+    reasons = {
+        "changed": "ssh-keygen -R", "strange": "its host key is not known here", "locked": "refuses this user and key",
+        "bare": "no Python of 3.11", "wrong": "no Python of 3.11", "refused": "nothing answers ssh",
+        "lost": "no such host",
+    }  # fmt: skip
+    assert {name: why for name, why in reasons.items() if why not in found[name]["what"]} == {}
+    told(processes, "down", "good", *words(hosts), "--now")
+
+
+def test_a_full_disk_and_a_folder_that_cannot_be_written_are_said(processes, hosts, tmp_path):
+    hosts.add("a")
+    with small_disk(tmp_path / "disk", 1) as disk:
+        if disk is None:
+            pytest.skip("mounting a disk needs root")
+        flags = ("--no-tunnel", "--slots", 1, "--remote-dir", disk.path / "fleet")
+        room = told(processes, "spawn", "a", "--ssh", hosts.ssh, *flags, code=1)["a"]["what"]
+        assert "an environment takes" in room
+        disk.fill()
+        full = told(processes, "spawn", "a", *words(hosts, *flags), code=1)["a"]["what"]
+        assert "no space left" in full
+        assert "--remote-dir" in full
+        disk.free()
+    denied = told(processes, "spawn", "a", *words(hosts, "--no-tunnel", "--remote-dir", "/proc/fleet"), code=1)["a"]
+    assert "cannot be written" in denied["what"] or "/proc/fleet" in denied["what"]
+
+
+def test_a_worker_that_ends_at_once_says_why_and_a_number_in_anothers_hands_is_left_alone(processes, hosts):
+    a = hosts.add("a")
+    bad = told(processes, "spawn", "a", *words(hosts, "--no-tunnel", "--worker-flags=--nonsense"), code=1)["a"]
+    assert "--nonsense" in bad["what"]
+    bystander = processes.worker()
+    path = a.root() / "workers" / "a" / "worker.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "pid": bystander.popen.pid}))
+    told(processes, "down", "a", *words(hosts), "--now")
+    assert bystander.popen.poll() is None
+    assert list(a.home.iterdir()) == []
+
+
+def test_a_join_file_is_handed_over_by_no_command_line_for_its_reader_alone(processes, hosts, tmp_path):
+    a = hosts.add("a")
+    join = tmp_path / "secret.join"
+    join.write_text("not a join file: a secret")
+    watched = tmp_path / "python"
+    watched.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/words\nexec {sys.executable} "$@"\n')
+    watched.chmod(0o755)
+    told(processes, "spawn", "a", "--ssh", hosts.ssh, "--remote-python", watched, "--join", join, code=1)
+    there = a.root() / "workers" / "a" / "join"
+    assert there.read_bytes() == join.read_bytes()
+    assert there.stat().st_mode & 0o777 == 0o600
+    assert "secret" not in (tmp_path / "words").read_text()
+    told(processes, "down", "a", *words(hosts))
+    assert list(a.home.iterdir()) == []
