@@ -328,7 +328,7 @@ def _launch(place: Place, folder: Path, question: dict[str, Any]) -> subprocess.
     log.unlink(missing_ok=True)
     state = {
         "digest": question["digest"],
-        "slots": question["slots"] or _cores(),
+        "slots": question["slots"],
         "since": time.time(),
         "node": platform.node(),
     }
@@ -347,13 +347,6 @@ def _launch(place: Place, folder: Path, question: dict[str, Any]) -> subprocess.
         began.kill()
         raise
     return began
-
-
-def _cores() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # of Linux alone
-        return os.cpu_count() or 1
 
 
 def _await_word(began: subprocess.Popen[bytes], folder: Path, line: Line) -> None:

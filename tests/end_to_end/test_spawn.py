@@ -3,18 +3,25 @@
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
+from contextlib import suppress
+from ipaddress import ip_address
+from pathlib import Path
 
 import pytest
 
 from dreamfleet.coordinator.spawn.agent import birth
+from dreamfleet.coordinator.spawn.parcel import pack_wheel
 from tests.support import tasks
 from tests.support.disks import small_disk
+from tests.support.hosts import new_host
 from tests.support.sshd import closed_port, new_key, ssh_hosts
 
 pytestmark = pytest.mark.timeout(300)
 PATIENCE = 120
+BARE = "/usr/local/bin:/usr/bin:/bin"  # where no dreamfleet is installed
 TOY = ("--task", tasks.TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0)
 
 
@@ -40,9 +47,9 @@ def write_file(processes, hosts, *names, more=""):
     return path
 
 
-def told(processes, *arguments, code=0):
+def told(processes, *arguments, code=0, patience=PATIENCE):
     """The rows that a verb tells, by host."""
-    done, out, err = processes.call(*arguments, "--json", timeout=PATIENCE)
+    done, out, err = processes.call(*arguments, "--json", timeout=patience)
     assert done == code, err
     return {row["host"]: row for row in json.loads(out.splitlines()[-1])["hosts"]}
 
@@ -221,3 +228,55 @@ def test_a_join_file_is_handed_over_by_no_command_line_for_its_reader_alone(proc
     assert "secret" not in (tmp_path / "words").read_text()
     told(processes, "down", "a", *words(hosts))
     assert list(a.home.iterdir()) == []
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_three_hosts_install_from_wheels_alone_one_of_them_after_it_was_killed_at_that(processes, hosts, tmp_path):
+    house = tmp_path / "house"
+    wheel = pack_wheel(native=True)
+    (tmp_path / wheel.name).write_bytes(wheel.data)
+    subprocess.run(
+        [sys.executable, "-m", "pip", "download", "--quiet", "--dest", house, f"{tmp_path / wheel.name}[worker]"],
+        check=True,
+    )
+    with new_host() as x, new_host() as y, new_host() as z:
+        if z is None:
+            pytest.skip("network namespaces need root and iproute2")
+        cables = {"x": x, "y": y, "z": z}
+        there = [
+            hosts.add(name, address=str(ip_address(cable.address) + 1), inside=cable.inside, path=BARE, modules="")
+            for name, cable in cables.items()
+        ]
+        near = [f"tcp/{cable.address}:{processes.port}" for cable in cables.values()]
+        coordinator = processes.start("coordinator", "--run", "far", "--runs-dir", processes.runs, "--listen", *near)
+        file = tmp_path / "hosts.toml"
+        listed = ", ".join(f'"{each}"' for each in near)
+        rows = "".join(f'[[host]]\naddress = "{name}"\nslots = 1\n' for name in cables)
+        file.write_text(f'connect = [{listed}]\n[spawn]\nssh = "{hosts.ssh}"\nwheelhouse = "{house}"\n{rows}')
+
+        interrupted = processes.start("up", file)
+        interrupted.wait_for("x installs the worker", timeout=600)
+        await_that(lambda: pip_of(there[0]) is not None, "pip never ran")
+        pip, agent = pip_of(there[0])
+        os.kill(agent, signal.SIGKILL)
+        os.kill(pip, signal.SIGKILL)
+        code, out = interrupted.finish(900)
+        assert code == 1
+        assert "try `ssh x` by hand" in out
+
+        found = told(processes, "up", file, patience=900)
+        assert {name: row["state"] for name, row in found.items()} == {"x": "started", "y": "running", "z": "running"}
+        coordinator.wait_for("generation 1: mean", timeout=600)
+        told(processes, "down", file, patience=900)
+        assert [list(host.home.iterdir()) for host in there] == [[], [], []]
+
+
+def pip_of(host):
+    """The numbers of the pip that runs on a host, and of what started it."""
+    for path in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            words = (path / "cmdline").read_bytes().split(b"\0")
+            if str(host.home).encode() in words[0] and b"install" in words:
+                return int(path.name), int((path / "stat").read_text().rpartition(")")[2].split()[1])
+    return None

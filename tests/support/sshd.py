@@ -20,7 +20,7 @@ PATIENCE = 60
 class SshHost:
     """One sshd; `home` is where whoever logs in is at home."""
 
-    def __init__(self, folder, name, address="127.0.0.1", inside=(), path=None, **options):
+    def __init__(self, folder, name, address="127.0.0.1", inside=(), path=None, modules=ROOT, **options):
         self.name, self.address, self.inside = name, address, inside
         self.port = free_port()
         self.folder = folder / name
@@ -29,7 +29,7 @@ class SshHost:
         self._key = new_key(self.folder / "host_key")
         self._config = self.folder / "sshd_config"
         shell = {"HOME": self.home, "PATH": path or f"{Path(sys.executable).parent}:{os.environ['PATH']}",
-                 "PYTHONPATH": ROOT}  # fmt: skip
+                 "PYTHONPATH": modules}  # fmt: skip
         said = {
             "ListenAddress": address, "Port": self.port, "HostKey": self._key, "PidFile": "none", "UsePAM": "no",
             "StrictModes": "no", "PasswordAuthentication": "no", "MaxStartups": "100",
