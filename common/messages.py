@@ -180,6 +180,7 @@ class JobBatch(Message):
     jobs: tuple[Job, ...]
     cancels: tuple[Digest, ...]
     verdicts: tuple[Verdict, ...]
+    leave: bool = field(default=False, metadata=OPTIONAL)  # the run ends with its workers
 
 
 @dataclass(frozen=True)

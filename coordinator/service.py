@@ -39,6 +39,7 @@ from dreamfleet.coordinator.claim import Claim
 from dreamfleet.coordinator.custody import Custody
 from dreamfleet.coordinator.fleet import Send
 from dreamfleet.coordinator.lines import summary, worker_command
+from dreamfleet.coordinator.packing import Content
 from dreamfleet.coordinator.queryables import BundleServer, answer_status
 from dreamfleet.coordinator.replies import control_reply, hello_reply, misunderstanding
 from dreamfleet.coordinator.run import Run
@@ -52,6 +53,7 @@ DRAIN = 256  # events that share one commit at most
 LINGER = 0.005  # seconds that a commit waits for more to share it
 SNAPSHOT_INTERVAL = 0.2
 SUMMARY = 60.0  # seconds from one line about the run to the next
+DISBANDING = 10.0  # seconds that workers may take to leave a run that ends with them
 ALONE = 5.0  # seconds without a worker after which the log says so
 _REPEATED: dict[str, type[Message]] = {"result": ResultBatch, "beat": Beat, "upload": UploadPart}
 
@@ -74,6 +76,8 @@ class Service:
         self._inbox = Inbox()
         self._mishaps = Mishaps(log)
         self._stopping = self._draining = False
+        self._disbanding_since: float | None = None  # every batch then says `leave`
+        self._told_at = -math.inf
         self._evaluations_told = 0
 
     def stop(self) -> None:
@@ -158,6 +162,7 @@ class Service:
             self._write_notes()
             if self._draining and not self._exchange.leased:
                 self.stop()
+            self._disband(session, now)
             self._custody.look(now)
             self._claim.look(now)
 
@@ -251,6 +256,8 @@ class Service:
             payload = query.payload.to_bytes() if query.payload is not None else b""
             request = self._inbox.decode_json(HelloRequest, payload)
             refusal = misunderstanding(request)
+            if self._disbanding_since is not None:
+                refusal = refusal or ("the run ends with its workers", "wait until somebody goes on with it")
             if request is not None and refusal is None:
                 refusal = self._exchange.refusal(request, self._run.settings)
             numbering = 0
@@ -266,6 +273,7 @@ class Service:
             "resume": self._resume,
             "drain": self._drain_run,
             "stop": self.stop,
+            "disband": self._begin_to_disband,
         }
         with query:
             verb = str(query.key_expr).rsplit("/", 1)[-1]
@@ -282,6 +290,21 @@ class Service:
         self._draining = True
         self._run.pause("draining")
 
+    def _begin_to_disband(self) -> None:
+        self._run.pause("ending with its workers")
+        self._disbanding_since = monotonic()
+
+    def _disband(self, session: zenoh.Session, now: float) -> None:
+        """Tell the workers to leave, again and again; stop when all have, or take too long."""
+        if self._disbanding_since is None:
+            return
+        there = [each for each in self._exchange.members if each.lost is None]
+        if not there or now - self._disbanding_since > DISBANDING:
+            self.stop()
+        elif now - self._told_at >= self._intervals.beat:
+            self._told_at = now
+            self._put(session, [Send(each.identity, each.numbering, 0, Content()) for each in there])
+
     def _batch(self, send: Send) -> bytes:
         content = send.content
         return encode(
@@ -295,6 +318,7 @@ class Service:
                 jobs=tuple(work.job for work in content.work),
                 cancels=tuple(content.cancels),
                 verdicts=tuple(content.verdicts),
+                leave=self._disbanding_since is not None,
             )
         )
 

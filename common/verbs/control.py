@@ -16,11 +16,16 @@ class ControlVerb:
     name: str
     SUMMARY: str
     outcome: str
+    with_workers: str = ""  # what is asked for instead with --workers; empty where that is no flag
     EXTRAS: tuple[str, ...] = ()
 
     def configure(self, parser: argparse.ArgumentParser) -> None:
         """Add the verb's arguments."""
         parser.add_argument("run_name", nargs="?", metavar="RUN", help="name of the run (default: the only live one)")
+        if self.with_workers:
+            parser.add_argument(
+                "--workers", action="store_true", help="end its workers too, but those of any run (--any)"
+            )
         offer(parser, "connect")
         add_json(parser)
 
@@ -28,10 +33,11 @@ class ControlVerb:
         """Ask, and say what follows."""
         from dreamfleet.common.client import Client
 
+        asked = self.with_workers if self.with_workers and args.workers else self.name
         with Client(args.connect) as client:
             name = args.run_name or client.status().run
-            client.control(name, self.name)
-        answer(args, f"run {name} {self.outcome.format(run=name)}", run=name, asked=self.name, accepted=True)
+            client.control(name, asked)
+        answer(args, f"run {name} {self.outcome.format(run=name)}", run=name, asked=asked, accepted=True)
         return 0
 
 
@@ -44,4 +50,5 @@ STOP = ControlVerb(
     "stop",
     "leave now; the run can be continued",
     "is left by its coordinator; continue it on that host with: dreamfleet coordinator --resume {run}",
+    with_workers="disband",
 )

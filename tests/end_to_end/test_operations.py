@@ -1,8 +1,10 @@
-"""The configuration file that docs/operations.md shows is one that every verb accepts."""
+"""The configuration file that docs/operations.md shows is one that every verb accepts; a run ends with its workers."""
 
+import json
 import re
 from pathlib import Path
 
+from tests.support import tasks
 from tests.support.processes import ROOT
 
 
@@ -15,3 +17,18 @@ def test_the_documented_file_is_accepted_by_every_kind_of_verb(processes):
     assert "no run 'absent'" in err
     _, _, err = processes.call("worker", "--config", path, "--run", "No Good")
     assert "cannot name a run" in err
+
+
+def test_a_run_ends_with_its_workers_and_one_of_any_run_waits_for_the_next(processes):
+    coordinator = processes.coordinator("--task", tasks.SLOW_TOY, "--generations", 10**6, "--evaluate-every", 0)
+    flags = ("--task", tasks.SLOW_TOY)
+    own, anyone = processes.worker(*flags), processes.worker("--any", *flags)
+    own.wait_for("joined")
+    anyone.wait_for("joined")
+    code, out, _ = processes.call("stop", "test", "--workers", "--connect", processes.endpoint, "--json")
+    assert code == 0
+    assert json.loads(out)["asked"] == "disband"
+    assert own.finish()[0] == 0
+    assert coordinator.finish()[0] == 130
+    anyone.wait_for("leaving run test")
+    assert anyone.popen.poll() is None

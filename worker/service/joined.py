@@ -171,6 +171,8 @@ class JoinedRun:
             self._line.inbox.dropped["earlier numbering"] += 1
             return
         self._membership.hear(monotonic())
+        if batch.leave:
+            self._membership.disband()
         if batch.numbering > self._backlog.numbering:  # it was welcomed again or given up, unheard
             self._begin_numbering(batch.numbering)
         for digest in batch.cancels:

@@ -6,7 +6,8 @@ happened: the joined coordinator was out of sight, another life of it is in sigh
 owes an answer. To say hello once too often costs a message; to be forgotten would cost a host.
 
 A worker leaves when it was told to (the first time it drains: what runs is finished and delivered), when its lifetime
-is over (it drains too), or, where it was asked to, when it has seen no coordinator for `GONE` seconds.
+is over (it drains too), when the run ends with its workers, or, where it was asked to, when it has seen no coordinator
+for `GONE` seconds.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ class Membership:
         """It has joined a run, in the life `nonce` of its coordinator, who hears a beat every so many seconds."""
         self._beat = beat
         self._coordinators: set[str] = set()
+        self._disbanded = False
         self._alone_since: float | None = now  # until a coordinator's token says otherwise
         self._ask_at = now
         self.rejoin(nonce, now)
@@ -72,6 +74,10 @@ class Membership:
     def hear(self, now: float) -> None:
         """The coordinator spoke, or a slot did: what it says is news that an answer is due to."""
         self._quiet_since = now
+
+    def disband(self) -> None:
+        """The joined run ends, and its workers with it."""
+        self._disbanded = True
 
     def appear(self, nonce: str) -> None:
         """A coordinator's token of the joined run came into sight."""
@@ -108,7 +114,7 @@ class Membership:
 
     def over(self, now: float, busy: bool) -> bool:
         """Whether to leave the run now; `busy` while anything runs or is not delivered."""
-        if self._told_to_stop > 1:
+        if self._told_to_stop > 1 or self._disbanded:
             return True
         if self._drain_until is not None:
             return not busy or now > self._drain_until or self._alone(now)

@@ -33,6 +33,14 @@ def test_a_member_whose_coordinator_is_in_sight_and_speaks_says_nothing():
         assert not any(member.must_rejoin(float(second), hands) for hands in (IDLE, BUSY, OWED))
 
 
+def test_a_run_that_ends_with_its_workers_is_left_at_once_and_the_next_one_is_not():
+    member = joined()
+    member.disband()
+    assert member.over(1.0, busy=True)
+    member.join("another run's", BEAT, now=2.0)
+    assert not member.over(3.0, busy=False)
+
+
 @pytest.mark.parametrize(("hands", "after"), [(IDLE, PATIENCE), (OWED, PATIENCE), (UPLOADING, PATIENCE + UPLOAD_GRACE)])
 def test_silence_that_means_something_makes_it_ask_whether_it_is_known(hands, after):
     member = joined()
