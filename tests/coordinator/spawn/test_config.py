@@ -1,11 +1,15 @@
 """Which hosts a file names, what each is told, and whether it is reached by a tunnel."""
 
 import argparse
+import re
+from pathlib import Path
 
 import pytest
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.site import read_file
 from dreamfleet.coordinator.spawn.config import Host, SpawnConfig, name_of, read_hosts, told_apart
+from tests.support.processes import ROOT
 
 LOOPBACK, WIDE = "tcp/127.0.0.1:7447", "tcp/10.0.0.1:7447"
 
@@ -26,6 +30,17 @@ def test_a_hosts_word_is_stronger_than_the_files_and_weaker_than_a_flag(tmp_path
     assert host.spawn.slots == 3
     (host,) = hosts(row, flags={"slots": 2}, environment={"DREAMFLEET_SPAWN_SLOTS": "3"})
     assert host.spawn.slots == 2
+
+
+def test_the_documented_file_is_one(tmp_path):
+    (tmp_path / "a.whl").touch()
+    text = re.search(r"```toml\n(.*?)```", (Path(ROOT) / "docs" / "hosts.md").read_text(), re.DOTALL)[1]
+    path = tmp_path / "hosts.toml"
+    path.write_text(text.replace("/data/wheels", str(tmp_path)))
+    file = read_file(path)
+    big, node = hosts(*file["host"], file=file)
+    assert (big.name, big.spawn.slots, big.flags) == ("big", 16, ["--run", "night", "--exit-when-done"])
+    assert (node.name, node.spawn.wheelhouse, node.environment) == ("node-7", tmp_path, {"OMP_NUM_THREADS": "1"})
 
 
 @pytest.mark.parametrize(
