@@ -94,6 +94,11 @@ class Place:
         self.root = Path(text).expanduser().absolute()
         self._line = line
 
+    @property
+    def caches(self) -> dict[str, str]:
+        """Variables that keep what others would leave in the user's home in here, too."""
+        return {"DREAMFLEET_CACHE": str(self.root / "cache"), "XDG_CACHE_HOME": str(self.root / "cache")}
+
     def environment(self, name: str) -> Path:
         """Where an environment lies; it is whole when it holds `WHOLE`."""
         return self.root / "environments" / name
@@ -261,19 +266,22 @@ def install(question: dict[str, Any], files: dict[str, bytes], line: Line) -> di
         for name, data in files.items():
             (parcel / Path(name).name).write_bytes(data)
         line.tell("say", "makes its environment")
-        _call(sys.executable, "-m", "venv", str(folder))
+        _call(place, sys.executable, "-m", "venv", str(folder))
         python = str(folder / "bin" / "python")
         line.tell("say", "installs the worker" + ("" if question["offline"] else ", from the package index"))
         source = ("--no-index", "--find-links", ".") if question["offline"] else ("--constraint", "pins.txt")
-        _call(python, "-m", "pip", "install", "--quiet", "--no-cache-dir", "--disable-pip-version-check", *source,
-              f"./{question['wheel']}[worker]", inside=parcel)  # fmt: skip
+        flags = ("--quiet", "--no-cache-dir", "--disable-pip-version-check", *source)
+        _call(place, python, "-m", "pip", "install", *flags, f"./{question['wheel']}[worker]", inside=parcel)
         shutil.rmtree(parcel)
         (folder / WHOLE).touch()
     return {"python": python}
 
 
-def _call(*command: str, inside: Path | None = None) -> None:
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, cwd=inside)
+def _call(place: Place, *command: str, inside: Path | None = None) -> None:
+    environment = {**os.environ, **place.caches}
+    done = subprocess.run(
+        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, cwd=inside, env=environment
+    )
     if done.returncode == 0:
         return
     said = [each.strip() for each in (done.stdout + done.stderr).splitlines() if each.strip()]
@@ -339,7 +347,7 @@ def _launch(place: Place, folder: Path, question: dict[str, Any]) -> subprocess.
     with log.open("xb") as out:
         began = subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True, cwd=folder,
-            env={**os.environ, "DREAMFLEET_CACHE": str(place.root / "cache"), **question["env"]},
+            env={**os.environ, **place.caches, **question["env"]},
         )  # fmt: skip
     try:
         _keep(folder / STATE, json.dumps({**state, "pid": began.pid, "birth": birth(began.pid)}).encode())

@@ -37,7 +37,7 @@ def _unheard(_kind: str, _text: str) -> None:
 
 
 class Connection:
-    """A host's agent, from the connection on; `ConnectionFailedError` says why there is none, and what to do."""
+    """A host's agent; where none answers, `ConnectionFailedError` says why, and what to do."""
 
     def __init__(self, ssh: Sequence[str], address: str, python: str = "", forwards: Sequence[str] = ()) -> None:
         self._address = address
@@ -57,7 +57,11 @@ class Connection:
             ) from error
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
-        self._send(program)
+        self._program = program
+
+    def begin(self) -> None:
+        """Have the agent run, which may be waited for: whoever waits can be ended by `close`."""
+        self._send(self._program)
         self._answer(_unheard)
 
     def ask(self, do: str, hear: Hear = _unheard, sent: Mapping[str, bytes] | None = None, **facts: Any) -> Any:

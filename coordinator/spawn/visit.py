@@ -112,6 +112,7 @@ class Visit:
         self._connection = Connection(self.host.ssh, self.host.address, spawn.remote_python, forwards)
         if self._closed.is_set():
             self._connection.close()
+        self._connection.begin()
 
     def _look(self, forwards: tuple[str, ...]) -> dict[str, Any]:
         self._connect(forwards)

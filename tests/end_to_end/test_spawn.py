@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -156,10 +157,17 @@ def test_two_commands_at_once_start_one_worker(processes, hosts):
     assert not runs(pid)
 
 
-def test_each_thing_that_stands_in_the_way_is_said_with_its_remedy_and_the_others_come_up(processes, hosts, tmp_path):
+@pytest.fixture
+def mute():
+    """A port where somebody listens and nobody answers."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server
+
+
+def test_each_thing_that_stands_in_the_way_is_said_and_the_others_come_up(processes, hosts, mute, tmp_path):
     for name in ("good", "changed", "strange", "locked", "bare"):
         hosts.add(name, **({"path": "/nowhere"} if name == "bare" else {}))
-    hosts.write(refused=("127.0.0.1", closed_port()), lost=("host.invalid", 22))
+    hosts.write(refused=("127.0.0.1", closed_port()), lost=("host.invalid", 22), mute=mute.getsockname())
     foreign = new_key(tmp_path / "foreign")
     stranger = hosts.config_with(foreign)
     keys = hosts.known.read_text().splitlines()
@@ -171,6 +179,7 @@ def test_each_thing_that_stands_in_the_way_is_said_with_its_remedy_and_the_other
         rows += f'[[host]]\naddress = "{name}"\nremote_python = "{"" if name == "bare" else sys.executable}"\n'
     rows += f'[[host]]\naddress = "locked"\nssh = "ssh -F {stranger}"\nremote_python = "{sys.executable}"\n'
     rows += f'[[host]]\naddress = "good"\nname = "wrong"\nremote_python = "{tmp_path}/none"\n'
+    rows += f'[[host]]\naddress = "mute"\nssh = "{hosts.ssh} -o ConnectTimeout=2"\n'
     file = tmp_path / "hosts.toml"
     file.write_text(f'[spawn]\ntunnel = false\nssh = "{hosts.ssh}"\nslots = 1\n{rows}')
     found = told(processes, "up", file, code=1)
@@ -179,10 +188,22 @@ def test_each_thing_that_stands_in_the_way_is_said_with_its_remedy_and_the_other
     reasons = {
         "changed": "ssh-keygen -R", "strange": "its host key is not known here", "locked": "refuses this user and key",
         "bare": "no Python of 3.11", "wrong": "no Python of 3.11", "refused": "nothing answers ssh",
-        "lost": "no such host",
+        "lost": "no such host", "mute": "cannot be reached",
     }  # fmt: skip
     assert {name: why for name, why in reasons.items() if why not in found[name]["what"]} == {}
     told(processes, "down", "good", *words(hosts), "--now")
+
+
+def test_ctrl_c_while_hosts_are_brought_up_ends_the_command_and_not_what_others_hold(processes, hosts, tmp_path):
+    hosts.add("a")
+    slow, asked = tmp_path / "python", tmp_path / "asked"
+    slow.write_text(f'#!/bin/sh\n[ "$1" = -c ] && exit 0\ntouch {asked}\nexec cat > /dev/null\n')
+    slow.chmod(0o755)
+    command = processes.start("spawn", "a", "--ssh", hosts.ssh, "--remote-python", slow)
+    await_that(asked.exists, "the host was never asked")
+    command.popen.send_signal(signal.SIGINT)
+    assert command.finish(PATIENCE)[0] == 130
+    assert "the same command goes on" in command.lines[-1]
 
 
 def test_a_full_disk_and_a_folder_that_cannot_be_written_are_said(processes, hosts, tmp_path):

@@ -1,8 +1,10 @@
 """Hosts that are reached by a real sshd: each with a port, a host key and a home of its own."""
 
 import getpass
+import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -10,6 +12,7 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
+from dreamfleet.coordinator.spawn.agent import birth
 from tests.support.processes import ROOT, free_port
 
 SSHD = shutil.which("sshd", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin")
@@ -51,6 +54,11 @@ class SshHost:
         return self
 
     def stop(self):
+        """Nobody is let in any more, and no worker is left."""
+        for path in self.root().glob("workers/*/worker.json"):
+            state = json.loads(path.read_text())
+            if state and birth(state["pid"]) == state["birth"]:
+                os.killpg(state["pid"], signal.SIGKILL)
         if self._popen is not None:
             self._popen.terminate()
             self._popen.wait()
