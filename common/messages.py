@@ -59,6 +59,7 @@ Horizon = Annotated[int, Between(1, 10**6)]  # an episode's steps at most, when 
 Share = Annotated[float, Between(0.0, 1.0)]
 Patience = Annotated[int, Between(0, 10**6)]  # steps without reward before a scored episode is cut; 0: never
 Packages = Annotated[tuple[Word, ...], Length(0, 64)]
+HostClass = Annotated[str, Length(0, 32)]  # hosts of one compute the same bits; empty: not known yet
 Kind = Literal["score", "evaluate", "collect"]
 VerdictWord = Literal["accepted", "duplicate", "obsolete", "refused"]
 
@@ -203,6 +204,8 @@ class ResultBatch(Message):
 
     fingerprint: Text
     results: tuple[Result, ...]
+    # Of the host that scored; `None` from workers of before there were classes, here and in the messages below.
+    host_class: HostClass | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
@@ -230,6 +233,7 @@ class Beat(Message):
     load: Annotated[float, Between(0.0, 1e6)]  # the host's, over one minute
     steps_per_second: Annotated[float, Between(0.0, 1e9)]
     drawn_by: Word  # whose picture the slots see: native, gymnasium, or - where a task does not say
+    host_class: HostClass | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,6 +303,7 @@ class HelloRequest:
     fingerprint: Text
     slots: Count
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions the fingerprint names
+    host_class: HostClass | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
@@ -323,6 +328,7 @@ class HelloReply:
         default=NUMERIC_PACKAGES, metadata=OPTIONAL
     )  # whose versions the run's fingerprint names
     numbering: Count = field(default=0, metadata=OPTIONAL)  # of the batches that follow; it rises
+    classes: bool = field(default=False, metadata=OPTIONAL)  # that a worker names; earlier ones drop it
 
 
 @dataclass(frozen=True, kw_only=True)

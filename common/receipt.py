@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.classes import Classes
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.effort import Effort
@@ -58,12 +59,14 @@ class Receipt:
     generations: Count  # that were closed
     effort: Effort  # of the run itself
     start: StartReceipt | None = field(default=None, metadata=OPTIONAL)  # `None`: at zero
-    fingerprint: str | None = field(default=None, metadata=OPTIONAL)  # of the hosts that scored
-    mixed: bool = field(default=False, metadata=OPTIONAL)  # others could join: there is no second time to the bit
+    fingerprint: str | None = field(default=None, metadata=OPTIONAL)  # of the host that scored first
+    # Hosts of other bits scored, or could: there is no second time to the bit.
+    mixed: bool = field(default=False, metadata=OPTIONAL)
     versions: dict[str, str] | None = field(default=None, metadata=OPTIONAL)  # of what the coordinator computed with
     # The first validation seed, and how many, of each evaluation and of the confirmation.
     seeds: dict[str, tuple[int, ...]] | None = field(default=None, metadata=OPTIONAL)
     subspace: str | None = field(default=None, metadata=OPTIONAL)  # that the search kept to, whole, as a journal has it
+    classes: Classes | None = field(default=None, metadata=OPTIONAL)  # of all hosts that scored
 
     @property
     def total(self) -> Effort:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common import schema
 from dreamfleet.common.bounds import finite, saturated
+from dreamfleet.common.classes import Classes, class_of, count
 from dreamfleet.common.effort import Effort, GenerationEffort
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files import check_regular, is_folder, is_there
@@ -48,7 +49,8 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.name = path.name
-        self._connection = _connect_read_only(path / JOURNAL)
+        self._connection, version = _connect_read_only(path / JOURNAL)
+        self._class_column = "host_class" if version >= schema.CLASSES else "''"
 
     def __enter__(self) -> RunFolder:
         return self
@@ -91,6 +93,11 @@ class RunFolder:
         return self._fact("ended")
 
     @property
+    def classes(self) -> Classes:
+        """What its accepted results are of."""
+        return Classes.of(count(self._typed(self._all(counted_query(self._class_column)), "ssi")))
+
+    @property
     def bundle_path(self) -> Path:
         """The run's own copy of its world model."""
         return self.path / BUNDLE
@@ -121,8 +128,12 @@ class RunFolder:
 
     def results(self, generation: int, number: int, kind: str = "score") -> list[StoredResult]:
         """A candidate's accepted results, by episode."""
-        query = f"SELECT {_RESULT} FROM result WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"  # noqa: S608
-        return [StoredResult(*row) for row in self._typed(self._all(query, kind, generation, number), "siiiififss")]
+        query = (
+            f"SELECT {_RESULT}, {self._class_column} FROM result "  # noqa: S608
+            "WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"
+        )
+        rows = self._typed(self._all(query, kind, generation, number), "siiiififsss")
+        return [StoredResult(*(*row[:-1], row[-1] or class_of(row[-2]))) for row in rows]
 
     def candidates(self) -> list[StoredCandidate]:
         """Every candidate by generation and number."""
@@ -248,6 +259,11 @@ _CANDIDATES = (
 )
 
 
+def counted_query(class_column: str = "host_class") -> str:
+    """How many results there are of each class, which may be empty, and fingerprint."""
+    return f"SELECT {class_column}, fingerprint, count(*) FROM result GROUP BY 1, 2"  # noqa: S608
+
+
 def efforts_query(begun: Sequence[BegunStage]) -> str:
     """What results took: kind, generation, whether they confirmed, whether they were driven, steps, microseconds.
 
@@ -305,7 +321,8 @@ def run_paths(runs_dir: Path) -> Iterator[Path]:
         yield journal.parent
 
 
-def _connect_read_only(path: Path) -> sqlite3.Connection:
+def _connect_read_only(path: Path) -> tuple[sqlite3.Connection, int]:
+    """An open journal and its schema version."""
     # A finished journal on a read-only disk has no shared-memory file to map; nobody writes it either.
     immutable = "" if os.access(path.parent, os.W_OK) else "&immutable=1"
     try:
@@ -314,14 +331,13 @@ def _connect_read_only(path: Path) -> sqlite3.Connection:
     except (sqlite3.Error, OSError) as error:
         raise JournalError(f"{path} cannot be read: {error}") from error
     try:
-        schema.check(connection, path)
+        return connection, schema.check(connection, path)
     except (sqlite3.Error, UnicodeError) as error:
         connection.close()
         raise JournalError(f"{path} cannot be read: {one_line(str(error))}; restore it from a copy") from error
     except JournalError:
         connection.close()
         raise
-    return connection
 
 
 @contextmanager

@@ -34,9 +34,11 @@ MIGRATIONS = (
         generation INTEGER PRIMARY KEY, vector BLOB NOT NULL, episodes INTEGER NOT NULL
     ) STRICT;
     """,
+    "ALTER TABLE result ADD COLUMN host_class TEXT NOT NULL DEFAULT '';",
 )
 """Entry i brings a journal from version i to i + 1; only ever appended to."""
 VERSION = len(MIGRATIONS)
+CLASSES = 3  # the version since which results name their host's class; empty: its fingerprint tells it
 
 
 # What would run as a table is read: somebody's own query, which need not end.

@@ -10,9 +10,10 @@ import json
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
+from dreamfleet.common.classes import Classes
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.fields import OPTIONAL, known
-from dreamfleet.common.messages import MAX_MESSAGE, Count, Length, Seconds, Text, Word
+from dreamfleet.common.messages import MAX_MESSAGE, Count, HostClass, Length, Seconds, Text, Word
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 
 SCHEMA = 2
@@ -108,6 +109,7 @@ class WorkerStatus:
     # own round trip is shorter. `None` before the first.
     round_trip: float | None = field(default=None, metadata=OPTIONAL)
     resent: Count = field(default=0, metadata=OPTIONAL)  # batches that were sent again
+    host_class: HostClass = field(default="", metadata=OPTIONAL)  # not known yet
 
 
 What = Literal[
@@ -208,6 +210,8 @@ class Status:
     refused: dict[str, str] = field(default_factory=dict, metadata=OPTIONAL)  # workers that could not join, and why
     confirmed: StoredConfirmation | None = field(default=None, metadata=OPTIONAL)  # of what is reported
     confirming: Progress = field(default=Progress(0, 0), metadata=OPTIONAL)  # one round of a confirmation
+    strict: bool = field(default=False, metadata=OPTIONAL)  # hosts of another class than the first result's are refused
+    classes: Classes = field(default=Classes(), metadata=OPTIONAL)  # of the hosts that scored, by accepted results
 
     @property
     def over(self) -> bool:

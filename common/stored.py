@@ -116,6 +116,7 @@ class StoredResult:
     seconds: float
     worker: str
     fingerprint: str
+    host_class: str  # of the host that scored
 
 
 @dataclass(frozen=True)

@@ -139,6 +139,8 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
     yield 3, "throughput", f"{rate:,.0f} steps/s, {steps:,} in all"
     resent = f", {waste.resent_batches} batches sent again" if waste.resent_batches else ""
     yield 4, "waste", f"{waste.share:.1%}, {waste.reissued} jobs issued again{resent}"
+    if status.classes.total:
+        yield 4 if status.classes.mixed else 7, "hosts", status.classes.told
     if sum(status.dropped.values()):
         yield 8, "dropped messages", ", ".join(f"{count} {why}" for why, count in status.dropped.items())
 

@@ -1,7 +1,8 @@
-"""Who may join a run: workers that know its task, on hosts that compute the same bits. Pure."""
+"""Who may join a run: workers that know its task; where it is strict, on hosts of one class. Pure."""
 
 from __future__ import annotations
 
+from dreamfleet.common.classes import counted_as
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import HelloRequest
 from dreamfleet.common.printable import shortened
@@ -13,11 +14,12 @@ LONGEST = 600  # characters of what a worker says of itself: two of them fit int
 
 
 def refusal(
-    request: HelloRequest, task: str, fingerprint: str | None, packages: tuple[str, ...] = NUMERIC_PACKAGES
+    request: HelloRequest, task: str, admitted: str | None, packages: tuple[str, ...] = NUMERIC_PACKAGES
 ) -> tuple[str, str] | None:
     """Why a worker cannot join a run of `task` and what to do about it; `None` if it may.
 
-    `fingerprint` is the one that the run admits, `None` admits any; it names the versions of `packages`.
+    `admitted` is the class that the run keeps to, `None` admits any; fingerprints name the versions of `packages`. A
+    worker that does not know its class yet may join, and is judged once it says it.
     """
     if not {task, task.partition(":")[0]} & set(request.tasks):  # itself, or the family that it is of
         return f"this run scores in {task!r}, which the worker does not know (it knows: {_known(request.tasks)})", (
@@ -26,17 +28,18 @@ def refusal(
     if request.packages != packages:
         named, own = (shortened(", ".join(each), LONGEST) for each in (request.packages, packages))
         return f"its fingerprint names {named}, this run's {own}", ("say hello again about those")
-    if fingerprint in (None, request.fingerprint):
+    host_class = counted_as(request.host_class, request.fingerprint, admitted)
+    if admitted is None or host_class in ("", admitted):
         return None
-    return differ(fingerprint, request.fingerprint)
+    return differ(admitted, host_class, request.fingerprint)
 
 
-def differ(run: str | None, worker: str) -> tuple[str, str]:
-    """Why a worker of another fingerprint than the run's cannot add to it, and what to do about it."""
-    own, other = shortened(run or "", LONGEST), shortened(worker, LONGEST)
-    return f"fingerprints differ: the run has [{own}], the worker [{other}]", (
-        "install the same package versions on a host of the same CPU features; or continue the run with --mixed, which "
-        "takes results of any host, though their last bits may differ: the run then cannot be repeated to the bit"
+def differ(run: str | None, host_class: str, fingerprint: str) -> tuple[str, str]:
+    """Why a worker of another class than a strict run's cannot add to it, and what to do about it."""
+    own, other, host = (shortened(each or "", LONGEST) for each in (run, host_class, fingerprint))
+    return f"classes differ: the run is strict, of class {own}, and this host is of {other} [{host}]", (
+        "install the same dreamfleet and package versions on a host of the same CPU features; or continue the run with "
+        "--no-strict, which takes results of any host, though its bits then hang on which host scored what"
     )
 
 

@@ -57,7 +57,10 @@ def _rows(run: RunFolder, controller: Controller, receipt: Receipt, settings: Ru
         yield "begun at", f"{receipt.start.source}, SHA-256 `{receipt.start.sha256}`"
     if settings.subspace:
         yield "subspace", f"SHA-256 `{settings.subspace}`"
-    if receipt.fingerprint is not None:
+    if receipt.classes is not None:
+        yield "hosts", receipt.classes.told
+        yield from ((f"class {name}", hosts) for name, hosts in receipt.classes.rows)
+    elif receipt.fingerprint is not None:
         yield "hosts", f"`{receipt.fingerprint}`" + (", and others: its last bits are its own" if receipt.mixed else "")
     if receipt.versions is not None:
         yield "coordinator", ", ".join(f"{name} {version}" for name, version in receipt.versions.items())
@@ -72,7 +75,7 @@ def _commands(run: RunFolder) -> dict[str, str]:
     last = max((each.number for each in run.history()), default=0)
     beside, controller = ("--runs-dir", str(run.path.parent)), str(run.controller_path)
     words = {
-        "one candidate's fitness again, to the bit, on any host of the fingerprint": (
+        "one candidate's fitness again, to the bit, on any host of its class": (
             "replay", run.name, "--candidate", f"{last}/0", *beside,
         ),
         "the whole run again, to the bit": ("repeat", controller, *beside),

@@ -371,11 +371,12 @@ class NetworkConfig:
     connect: tuple[str, ...] = option((), "connect to these stand-alone routers, as well where --listen is given")
     beat: float = option(1.0, "seconds between a worker's beats")
     evaluation_share: float = option(0.25, "of a busy fleet's time that evaluations get, 0 to 0.9; 0: only idle slots")
-    mixed: bool = option(
+    strict: bool = option(
         False,
-        "take results of hosts whose CPU features or package versions differ from those of the first accepted result; "
-        "last bits may then differ, so the run cannot be repeated to the bit",
+        "take results only of hosts that compute the same bits as the first one that scored, so that the run ends with "
+        "the same bits whoever is killed",
     )
+    mixed: bool = option(False, "deprecated: any host may score unless --strict is given")
     metrics_port: str = option(
         "", "answer Prometheus under /metrics at this port of 127.0.0.1, or at HOST:PORT; anybody there may read it"
     )

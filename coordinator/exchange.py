@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 
 from dreamfleet.common.bounds import LONGEST_EPISODE, excess, most_steps
+from dreamfleet.common.classes import Classes, counted_as
 from dreamfleet.common.errors import DreamfleetError, InternalError
 from dreamfleet.common.messages import Beat, HelloRequest, Kind, Result, ResultBatch, UploadPart
 from dreamfleet.common.printable import shortened
@@ -15,7 +16,7 @@ from dreamfleet.coordinator.admission import Refusals, differ, refusal
 from dreamfleet.coordinator.failure import LONGEST_ERROR, Failure
 from dreamfleet.coordinator.fleet import Fleet, Send
 from dreamfleet.coordinator.jobs import Work
-from dreamfleet.coordinator.journal import FINGERPRINT, Journal
+from dreamfleet.coordinator.journal import FINGERPRINT, HOST_CLASS, Journal
 from dreamfleet.coordinator.member import Member
 from dreamfleet.coordinator.slack import Slack
 
@@ -25,12 +26,13 @@ class Exchange:
 
     def __init__(
         self, journal: Journal, incarnation: int, fleet: Fleet, slack: Slack, score: Callable[[Result], None],
-        *, horizon: int, mixed: bool = False,
+        *, horizon: int, strict: bool = False,
     ) -> None:  # fmt: skip
         self.refusals = Refusals()
-        self.fingerprint = journal.fingerprint()  # of the first accepted result; `None` before it
+        # Of the first accepted result; `None` before it.
+        self.fingerprint, self.host_class = journal.fingerprint(), journal.host_class()
         self._horizon = horizon  # of a scored episode whose job names none
-        self._mixed = mixed
+        self.strict = strict  # no other class counts
         self._journal = journal
         self._incarnation = incarnation
         self._fleet = fleet
@@ -40,7 +42,7 @@ class Exchange:
 
     def refusal(self, request: HelloRequest, settings: RunSettings) -> tuple[str, str] | None:
         """Why a worker cannot join and what to do about it; `None` if it may."""
-        admitted = None if self._mixed else self.fingerprint
+        admitted = self.host_class if self.strict else None
         found = refusal(request, settings.task.task, admitted, settings.packages)
         known = request.packages == settings.packages  # else it says hello again
         if found is not None and known and self.refusals.add(request.worker, found[0]):
@@ -48,16 +50,22 @@ class Exchange:
         return found
 
     def admit(self, request: HelloRequest, now: float) -> int:
-        """Welcome a worker; what it computes is compared with the run's fingerprint once there is one.
+        """Welcome a worker; of a strict run its class is compared with the run's once both are known.
 
         Its batches are counted anew, under the number that is returned.
         """
         self.refusals.admitted(request.worker)
-        return self._fleet.welcome(request.worker, request.slots, request.fingerprint, now)
+        numbering = self._fleet.welcome(request.worker, request.slots, request.fingerprint, now)
+        self._fleet.members[request.worker].host_class = self._class_of(request.host_class, request.fingerprint)
+        return numbering
 
     def beat(self, worker: str, beat: Beat, now: float) -> None:
-        """A worker says what it holds."""
+        """A worker says what it holds, and of which class its host is: before it is given anything."""
         self._fleet.beat(worker, beat, now)
+        member = self._fleet.members.get(worker)
+        if member is not None and beat.host_class:
+            member.host_class = self._class_of(beat.host_class, member.fingerprint)
+            self._keep_to_class(member)
 
     def depart(self, worker: str, now: float) -> None:
         """A worker's token vanished."""
@@ -68,14 +76,15 @@ class Exchange:
 
         One that raises keeps none of the others from being counted; then the first such error is raised.
         """
-        if not self._equal(batch.fingerprint):
-            self._turn_away(worker, batch.fingerprint)
+        host_class = self._class_of(batch.host_class or None, batch.fingerprint)
+        if not self._takes(host_class):
+            self._turn_away(worker, host_class, batch.fingerprint)
             return
         errors = []
         for each in batch.results:
             wanted = each.digest in self._fleet.jobs
             try:
-                self._result(worker, each, batch.fingerprint, now)
+                self._result(worker, each, batch.fingerprint, host_class, now)
             except DreamfleetError:
                 raise
             except Exception as error:
@@ -85,7 +94,7 @@ class Exchange:
         if errors:
             raise errors[0]
 
-    def _result(self, worker: str, said: Result, fingerprint: str, now: float) -> None:
+    def _result(self, worker: str, said: Result, fingerprint: str, host_class: str, now: float) -> None:
         work = self._fleet.jobs.work(said.digest)
         each = said if work is None else bounded(said, work.job.kind, work.job.horizon or self._horizon)
         result = self._slack.collections.receive(worker, each, work)
@@ -94,8 +103,8 @@ class Exchange:
             return
         _, work = self._fleet.result(worker, result, now)
         if work is not None:
-            self._journal.add_result(work.job, result, worker, fingerprint, self._incarnation)
-            self._settle_fingerprint(fingerprint)
+            self._journal.add_result(work.job, result, worker, fingerprint, self._incarnation, host_class)
+            self._settle_class(host_class, fingerprint)
             self._count(work, result)
         self._uploads.forget(result.digest)
 
@@ -155,26 +164,40 @@ class Exchange:
         """Parts of uploads that were dropped, by reason."""
         return self._uploads.dropped
 
-    def _equal(self, fingerprint: str) -> bool:
-        """Whether a host of this fingerprint may add to the run."""
-        return self._mixed or self.fingerprint in (None, fingerprint)
+    @property
+    def classes(self) -> Classes:
+        """What the accepted results are of."""
+        return self._journal.classes
 
-    def _settle_fingerprint(self, fingerprint: str) -> None:
-        """The first accepted result's fingerprint becomes the run's, in the transaction that writes the result."""
-        if self.fingerprint is not None:
+    def _class_of(self, said: str | None, fingerprint: str) -> str:
+        """What a host counts as in this run; empty: it is not known yet."""
+        return counted_as(said, fingerprint, self.host_class)
+
+    def _takes(self, host_class: str) -> bool:
+        """Whether hosts of this class may add to the run."""
+        return not self.strict or self.host_class in (None, host_class)
+
+    def _settle_class(self, host_class: str, fingerprint: str) -> None:
+        """The first accepted result's class and fingerprint become the run's, in the transaction that writes it."""
+        if self.host_class is not None:
             return
-        self.fingerprint = fingerprint
+        self.host_class, self.fingerprint = host_class, fingerprint
+        self._journal.set_fact(HOST_CLASS, host_class)
         self._journal.set_fact(FINGERPRINT, fingerprint)
         for member in list(self._fleet.members.values()):
-            if not self._equal(member.fingerprint):
-                self._turn_away(member.identity, member.fingerprint)
+            member.host_class = self._class_of(member.host_class, member.fingerprint)
+            self._keep_to_class(member)
 
-    def _turn_away(self, worker: str, fingerprint: str) -> None:
-        """Forget a worker of another fingerprint: it hears no more, says hello again, and is told why and what to do.
+    def _keep_to_class(self, member: Member) -> None:
+        if member.host_class and not self._takes(member.host_class):
+            self._turn_away(member.identity, member.host_class, member.fingerprint)
+
+    def _turn_away(self, worker: str, host_class: str, fingerprint: str) -> None:
+        """Forget a worker of another class: it hears no more, says hello again, and is told why and what to do.
 
         Nothing of what it has computed gets a verdict, so that it does not take silence for success.
         """
-        why, _ = differ(self.fingerprint, fingerprint)
+        why, _ = differ(self.host_class, host_class, fingerprint)
         self._fleet.dismiss(worker)
         if self.refusals.add(worker, why):
             self._fleet.notes.append(f"worker {worker} must go: {why}")

@@ -7,6 +7,7 @@ import os
 import secrets
 import shutil
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -20,11 +21,12 @@ from numpy.typing import NDArray
 
 from dreamfleet.common import schema
 from dreamfleet.common.bounds import LARGEST_FITNESS, LONGEST_EPISODE, finite, most_steps
+from dreamfleet.common.classes import Classes, class_of, count
 from dreamfleet.common.effort import Effort
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.files import sync_folder, write_aside
 from dreamfleet.common.messages import Job, Result
-from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, efforts_query
+from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, counted_query, efforts_query
 from dreamfleet.common.stages import begun_stages
 from dreamfleet.common.stored import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.checkpoint import Checkpoint
@@ -35,7 +37,7 @@ from dreamfleet.coordinator.evaluation import Evaluation
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
 MOST_VARIABLES = 500  # of one SQL statement
-FINGERPRINT = "fingerprint"  # the fact's name
+FINGERPRINT, HOST_CLASS = "fingerprint", "host_class"  # the facts' names
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ class Journal:
         self._stamp: tuple[int, int] | None = None  # of the file, as the last commit left it
         self._opened: int | None = None  # the latest generation
         self._effort: Effort | None = None  # of every result, once somebody asked
+        self._counted: Counter[tuple[str, str]] | None = None  # results by class and fingerprint, likewise
         self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
         with _translated(path):
             self._connection = sqlite3.connect(path, timeout=5)
@@ -171,6 +174,21 @@ class Journal:
         scored = self._read("SELECT 1 FROM result LIMIT 1").fetchone() is not None
         return self.fact(FINGERPRINT) if scored else None
 
+    def host_class(self) -> str | None:
+        """That of the first accepted result; `None` before it.
+
+        In journals from before there were classes its fingerprint tells it.
+        """
+        fingerprint = self.fingerprint()
+        return None if fingerprint is None else self.fact(HOST_CLASS) or class_of(fingerprint)
+
+    @property
+    def classes(self) -> Classes:
+        """What all results are of: read once, then counted with each."""
+        if self._counted is None:
+            self._counted = count(self._read(counted_query()))
+        return Classes.of(self._counted)
+
     def set_fact(self, key: str, value: str) -> None:
         """Write one of the run's facts."""
         self._write("INSERT OR REPLACE INTO run (key, value) VALUES (?, ?)", key, value)
@@ -214,14 +232,18 @@ class Journal:
             time(), closed.mean, closed.std, closed.best, closed.worst, closed.steps, closed.seconds, closed.number,
         )  # fmt: skip
 
-    def add_result(self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int) -> None:
-        """Write an accepted result."""
+    def add_result(
+        self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str = ""
+    ) -> None:
+        """Write an accepted result; without a class its fingerprint tells it."""
         self._write(
             "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
-            "fingerprint, incarnation) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "fingerprint, incarnation, host_class) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], result.fitness,
-            result.steps, result.seconds, worker, fingerprint, incarnation,
+            result.steps, result.seconds, worker, fingerprint, incarnation, host_class,
         )  # fmt: skip
+        if self._counted is not None:
+            self._counted[host_class or class_of(fingerprint), fingerprint] += 1
         if self._effort is not None:
             made = result.steps, int(result.seconds * 1e6)
             self._effort += Effort.of(job.task, job.kind, *made, driven=bool(job.driven))
@@ -247,7 +269,7 @@ class Journal:
         query = f"DELETE FROM result WHERE NOT ({within}) AND ({still}) RETURNING digest"  # noqa: S608
         bounds = LARGEST_FITNESS, most_steps(LONGEST_EPISODE), most_steps(horizon)
         dropped = len(self._read(query, *bounds))
-        self._effort = None
+        self._effort = self._counted = None
         self.commit()
         return dropped
 

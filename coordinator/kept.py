@@ -21,8 +21,9 @@ LIMITS, NETWORK = "limits", "network"  # the facts' names
 
 
 def facts_of(limits: LimitsConfig, network: NetworkConfig) -> dict[str, str]:
-    """The facts to keep, by name."""
-    return {name: json.dumps(_changed(each), allow_nan=False) for name, each in ((LIMITS, limits), (NETWORK, network))}
+    """The facts to keep, by name. Whether a run is strict is always written: one that does not say so is older."""
+    kept = {LIMITS: _changed(limits), NETWORK: {**_changed(network), "strict": network.strict}}
+    return {name: json.dumps(each, allow_nan=False) for name, each in kept.items()}
 
 
 def kept_limits(stored: RunFolder) -> Table:
@@ -31,8 +32,13 @@ def kept_limits(stored: RunFolder) -> Table:
 
 
 def kept_network(stored: RunFolder) -> Table:
-    """Where a run was last reached, and how it treated its workers; empty if it kept nothing."""
-    return _read(stored, NETWORK, NetworkConfig)
+    """Where a run was last reached, and how it treated its workers.
+
+    One from before runs said whether they are strict was so, unless it was `mixed`.
+    """
+    kept = _read(stored, NETWORK, NetworkConfig)
+    mixed = kept.pop("mixed", False)
+    return {"strict": not mixed, **kept}
 
 
 def choose_addresses(own: NetworkConfig, site: SiteConfig, kept: Table) -> NetworkConfig:
@@ -49,9 +55,9 @@ def choose_addresses(own: NetworkConfig, site: SiteConfig, kept: Table) -> Netwo
     return replace(own, listen=listen or (() if connect else (DEFAULT_ENDPOINT,)), connect=connect)
 
 
-def is_mixed(network: str | None) -> bool:
-    """Whether hosts of any fingerprint may join, by the fact that is kept of the network."""
-    return bool(json.loads(network or "{}").get("mixed", False))
+def settle_strict(network: NetworkConfig, *, said: bool) -> NetworkConfig:
+    """The same without `mixed`: it asks for what is done anyway, and loosens a run unless `strict` is `said` too."""
+    return replace(network, strict=network.strict and (said or not network.mixed), mixed=False)
 
 
 def _read(stored: RunFolder, name: str, section: type[Any]) -> dict[str, Any]:

@@ -58,9 +58,9 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         custody = stack.enter_context(closing(Custody(journal, served)))
         service = _service(request, custody, served)
         on_stoppable(service.stop)
-        fleet, mixed = Fleet(request.network.beat, request.network.evaluation_share), request.network.mixed
+        fleet, strict = Fleet(request.network.beat, request.network.evaluation_share), request.network.strict
         try:
-            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), mixed=mixed))
+            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), strict=strict))
         except ConnectionFailedError as error:
             if request.config is None:
                 raise

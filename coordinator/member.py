@@ -65,6 +65,7 @@ class Member:
     load: float = 0.0
     steps_per_second: float = 0.0
     drawn_by: str = "-"
+    host_class: str = ""  # not known yet
     finished: int = 0
     resent: int = 0  # batches that were sent again
     leases: dict[bytes, Lease] = field(default_factory=dict)  # in the order in which they were given

@@ -10,7 +10,6 @@ from dreamfleet.common.fingerprint import package_version
 from dreamfleet.common.receipt import Receipt, StartReceipt, validation_uses
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.journal import Journal
-from dreamfleet.coordinator.kept import NETWORK, is_mixed
 from dreamfleet.coordinator.start import MEAN, SOURCE, SUBSPACE
 
 DECIDING = ("dreamfleet", "numpy", "cma", "cmaes")  # packages whose versions decide what is asked for
@@ -19,8 +18,8 @@ DECIDING = ("dreamfleet", "numpy", "cma", "cmaes")  # packages whose versions de
 def draw_up(journal: Journal, settings: RunSettings, generations: int) -> Receipt:
     """The receipt of a run that has closed so many generations. It costs the same however long the run is."""
     return Receipt(
-        generations, journal.effort, _start(journal), journal.fingerprint(), is_mixed(journal.fact(NETWORK)),
-        versions(), validation_uses(settings), journal.fact(SUBSPACE),
+        generations, journal.effort, _start(journal), journal.fingerprint(), journal.classes.mixed, versions(),
+        validation_uses(settings), journal.fact(SUBSPACE), journal.classes,
     )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.classes import BY_FINGERPRINT
 from dreamfleet.common.config import Table
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ControllerError, UsageError
@@ -94,10 +95,10 @@ class Repetition:
     def compare(self, folder: Path) -> Compared:
         """What the run in a folder reports, with the controller."""
         again = Controller.load(folder / CONTROLLER)
-        if again.sha256 == self.controller.sha256:
-            return Compared(True, f"the same controller as the first time, to the bit ({again.sha256[:12]})")
         with RunFolder(folder) as stored:
-            why = self._cause(stored)
+            why, hosts = self._cause(stored), self._hosts(stored)
+        if again.sha256 == self.controller.sha256:
+            return Compared(True, f"the same controller as the first time, to the bit ({again.sha256[:12]}){hosts}")
         names = f"({again.sha256[:12]} instead of {self.controller.sha256[:12]})"
         return Compared(False, f"NOT the same controller as the first time {names}: {why}", why)
 
@@ -113,14 +114,32 @@ class Repetition:
             )
         return config
 
+    def _named(self, stored: RunFolder) -> tuple[str, str] | None:
+        """The one class of the hosts of the first time, and of this time; `None` where bits do not tell both."""
+        told = [each.largest[0].host_class for each in (self.receipt.classes, stored.classes)
+                if each is not None and each.total == 1]  # fmt: skip
+        if len(told) < 2 or any(each.startswith(BY_FINGERPRINT) for each in told):
+            return None
+        return told[0], told[1]
+
+    def _hosts(self, stored: RunFolder) -> str:
+        """Whether its hosts are of the first time's class, as far as that is known; a part of a sentence."""
+        if (classes := self._named(stored)) is None:
+            return ""
+        return ", on hosts of the same class" if classes[0] == classes[1] else ", though on hosts of another class"
+
     def _cause(self, stored: RunFolder) -> str:
         """What is known to differ between the first time and now."""
         first, here = self.receipt, versions()
         if first.mixed:
-            return "the first run took hosts of any kind, so that its last bits are its own"
+            return "the first run took hosts of several classes, so that its last bits are its own"
+        if stored.classes.mixed:
+            return f"this time hosts of several classes scored ({stored.classes.told}): --strict keeps to one"
+        if (classes := self._named(stored)) and classes[0] != classes[1]:
+            return f"its hosts were of class {classes[0]}, these are of {classes[1]}: their bits differ"
         if first.fingerprint is None:
             return "the receipt names no fingerprint, and only equal hosts give equal bits"
-        if first.fingerprint != stored.fingerprint:
+        if not classes and first.fingerprint != stored.fingerprint:
             return f"its hosts were of another fingerprint: [{first.fingerprint}], now [{stored.fingerprint}]"
         others = [f"{name} {each}, now {here.get(name)}" for name, each in (first.versions or {}).items()
                   if here.get(name) != each]  # fmt: skip

@@ -37,6 +37,7 @@ def hello_reply(
         intervals={} if why else asdict(intervals),
         packages=run.settings.packages,
         numbering=numbering,
+        classes=True,
     )
 
 

@@ -37,7 +37,7 @@ class Run:
         fleet: Fleet,
         now: float,
         *,
-        mixed: bool = False,
+        strict: bool = False,
     ) -> None:
         self.settings = settings
         self.limits = limits
@@ -56,7 +56,7 @@ class Run:
         self._agenda = Agenda(settings)
         self.slack = Slack(journal, settings, self.uid, self.history, evaluations, self._agenda)
         self.exchange = Exchange(
-            journal, self.incarnation, fleet, self.slack, self._score, horizon=settings.task.horizon, mixed=mixed
+            journal, self.incarnation, fleet, self.slack, self._score, horizon=settings.task.horizon, strict=strict
         )
         evaluated = self.slack.evaluations.finished
         self._generations = Generations(journal, settings, self._agenda, self.history, evaluated)

@@ -101,6 +101,8 @@ def _status(run: Run, name: str, standing: Standing, now: float) -> Status:
         refused=_refused(run),
         confirmed=run.confirmed,
         confirming=Progress(*run.slack.confirming),
+        strict=run.exchange.strict,
+        classes=run.exchange.classes,
     )
 
 
@@ -196,6 +198,7 @@ def _worker(member: Member, now: float) -> WorkerStatus:
         job_seconds=None if member.record.job is None else round(member.record.job, 4),
         round_trip=None if member.record.trip is None else round(member.record.trip, 4),
         resent=member.resent,
+        host_class=member.host_class,
     )
 
 

@@ -188,8 +188,8 @@ def _plural(count: int, noun: str) -> str:
 def _fleet(status: Status) -> str:
     counts = status.workers
     gone = counts.known - counts.present
-    told = f"{counts.present} present, {_plural(status.slots, 'slot')}"
-    return f"{told}, {gone} gone" if gone else told
+    told = f"{counts.present} present, {_plural(status.slots, 'slot')}" + (f", {gone} gone" if gone else "")
+    return f"{told}; {status.classes.told}" if status.classes.total else told
 
 
 def _workers(look: Look) -> dict[str, list[Any]]:

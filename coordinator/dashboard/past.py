@@ -126,6 +126,7 @@ def _facts(run: RunFolder, course: Course, total: Effort) -> Facts:
         ("optimiser", f"{optimiser(settings)}, first step size {settings.sigma0:g}"),
         ("seed", str(settings.seed)),
         ("spent", total.told),
+        ("hosts", run.classes.told),
         ("best evaluation", NONE if best is None else f"{score(best)}, generation {best.generation}"),
         ("confirmed", NONE if course.confirmed is None else
          f"{score(course.confirmed)} on {course.confirmed.episodes} fresh tracks"),

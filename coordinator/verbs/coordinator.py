@@ -133,11 +133,14 @@ def request_of(
     start: Start | None,
 ) -> RunRequest:  # fmt: skip
     """What is to be served where the arguments say, else where it was `kept`; without `config` it is continued."""
-    from dreamfleet.coordinator.kept import choose_addresses
+    from dreamfleet.coordinator.kept import choose_addresses, settle_strict
     from dreamfleet.coordinator.main import RunRequest
 
     base = {key: value for key, value in kept.items() if key not in ("listen", "connect")}
     own = load(NetworkConfig, "network", base=base, **args.sources)
+    if own.mixed:
+        log.warning("--mixed is deprecated: a run takes any host unless it is --strict (--no-strict loosens one)")
+    own = settle_strict(own, said="strict" in args.given)
     return RunRequest(name, args.runs_dir, config, limits, choose_addresses(own, args.site, kept), start)
 
 

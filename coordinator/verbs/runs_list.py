@@ -14,7 +14,7 @@ from dreamfleet.common.site import offer
 
 SUMMARY = "list the runs on this disk"
 EXTRAS = ()
-LEAST_FIRST = ("created", "task", "mean", "evaluated")  # what a narrow terminal does without
+LEAST_FIRST = ("created", "classes", "task", "mean", "evaluated")  # what a narrow terminal does without
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     if not rows:
         print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME", file=sys.stderr)
         return 0
-    print_rows(rows, right=("generations", "mean", "evaluated", "confirmed"), least_first=LEAST_FIRST)
+    print_rows(rows, right=("generations", "mean", "evaluated", "confirmed", "classes"), least_first=LEAST_FIRST)
     return 0
 
 
@@ -50,8 +50,9 @@ def _row(path: Path) -> dict[str, object]:
                 "mean": round(history[-1].mean, 1) if history else None,
                 "evaluated": round(evaluations[-1].mean, 1) if evaluations else None,
                 "confirmed": round(confirmed.mean, 1) if confirmed else None,
+                "classes": run.classes.total,
                 "state": f"ended: {run.ended}" if run.ended else "open",
             }
     except JournalError as error:
         return {"run": path.name, "created": None, "task": None, "generations": None, "mean": None,
-                "evaluated": None, "confirmed": None, "state": str(error)}  # fmt: skip
+                "evaluated": None, "confirmed": None, "classes": None, "state": str(error)}  # fmt: skip

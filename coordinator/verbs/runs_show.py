@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import Any
 
 from dreamfleet.common.listing import add_json, print_rows
 from dreamfleet.common.runs import open_run
@@ -33,13 +34,18 @@ def run(args: argparse.Namespace) -> int:
         confirmed = stored.confirmation()
         facts = {"run": stored.name, "run_uid": stored.uid, "created": stored.created, "ended": stored.ended,
                  "fingerprint": stored.fingerprint}  # fmt: skip
+        classes = stored.classes
     begun = begun_stages(settings, history, evaluations) if settings.stages else ()
     if args.json:
-        rows = {"history": [asdict(each) for each in history], "evaluations": [asdict(each) for each in evaluations]}
+        rows: dict[str, Any] = {"history": [asdict(each) for each in history]}
+        rows["evaluations"] = [asdict(each) for each in evaluations]
         rows["stages"] = [{"number": each.stage.number, "since": each.since, "after": each.why} for each in begun]
         reported = None if confirmed is None else {**asdict(confirmed), "error": confirmed.error}
+        rows["classes"] = asdict(classes)
         print(json.dumps({**facts, "settings": asdict(settings), "confirmed": reported, **rows}, indent=2))
         return 0
+    facts["hosts"] = classes.told
+    facts |= {f"class {name}": hosts for name, hosts in classes.rows}
     facts["reported"] = told(confirmed or best_of(evaluations))
     facts |= {"stage": f"{len(begun)} of {len(settings.stages)}"} if begun else {}
     shown_settings = {**_flat(settings), **_stages(settings, begun)}

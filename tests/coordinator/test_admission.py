@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import pytest
 
+from dreamfleet.common.classes import class_of
 from dreamfleet.common.fingerprint import fingerprint
 from dreamfleet.coordinator.admission import MOST_REFUSED, Refusals, refusal
 from tests.support.samples import JSON
@@ -31,8 +32,25 @@ def test_a_fingerprint_of_other_packages_is_asked_for_again_before_it_is_judged(
     assert "numpy, gymnasium, box2d" in why
     assert "again" in remedy
     about = hello(packages=PACKAGES, fingerprint=fingerprint(PACKAGES))
-    assert refusal(about, LANDER, fingerprint(PACKAGES), PACKAGES) is None
-    assert refusal(about, LANDER, "elsewhere", PACKAGES)[0].startswith("fingerprints differ")
+    assert refusal(about, LANDER, class_of(fingerprint(PACKAGES)), PACKAGES) is None
+    assert refusal(about, LANDER, class_of("elsewhere"), PACKAGES)[0].startswith("classes differ")
+
+
+@pytest.mark.parametrize(
+    ("told", "admitted", "may_join"),
+    [
+        ("a" * 16, None, True),
+        ("a" * 16, "a" * 16, True),
+        ("a" * 16, "b" * 16, False),
+        ("", "b" * 16, True),  # it does not know yet
+        (None, "b" * 16, False),  # it knows nothing of classes
+        ("a" * 16, class_of("here"), True),  # the run goes by fingerprints
+        ("", class_of("elsewhere"), False),
+    ],
+)
+def test_a_strict_run_admits_its_own_class_and_who_does_not_know_its_own_yet(told, admitted, may_join):
+    found = refusal(hello(packages=PACKAGES, host_class=told), LANDER, admitted, PACKAGES)
+    assert (found is None) == may_join
 
 
 def test_another_worlds_package_does_not_change_a_fingerprint():

@@ -10,7 +10,7 @@ from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.site import SiteConfig
 from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.journal import Journal
-from dreamfleet.coordinator.kept import choose_addresses, facts_of, kept_limits, kept_network
+from dreamfleet.coordinator.kept import choose_addresses, facts_of, kept_limits, kept_network, settle_strict
 
 HERE, THERE, FAR = "tcp/0.0.0.0:7610", "tcp/there:1", "tcp/far:2"
 
@@ -30,20 +30,30 @@ def keep(folder, facts):
 
 
 def test_limits_and_network_come_back_as_they_were(folder):
-    limits, network = LimitsConfig(minutes=30.0, target=900.0), NetworkConfig((HERE,), (), 0.2, mixed=True)
+    limits, network = LimitsConfig(minutes=30.0, target=900.0), NetworkConfig((HERE,), (), 0.2, strict=True)
     keep(folder, facts_of(limits, network))
     with RunFolder(folder) as run:
         assert LimitsConfig(**kept_limits(run)) == limits
         assert NetworkConfig(**kept_network(run)) == network
 
 
-def test_a_journal_from_before_kept_nothing(folder):
+@pytest.mark.parametrize(("kept", "strict"), [("{}", True), ('{"mixed": true}', False), ('{"strict": false}', False)])
+def test_a_run_from_before_runs_said_so_was_strict_unless_it_was_mixed_and_goes_on_so(folder, kept, strict):
     with RunFolder(folder) as run:
-        assert (kept_limits(run), kept_network(run)) == ({}, {})
+        assert (kept_limits(run), kept_network(run)) == ({}, {"strict": True})
+    keep(folder, {"network": kept})
+    with RunFolder(folder) as run:
+        assert kept_network(run) == {"strict": strict}
 
 
-def test_defaults_are_not_written():
-    assert facts_of(LimitsConfig(), NetworkConfig()) == {"limits": "{}", "network": "{}"}
+def test_mixed_loosens_a_strict_run_unless_strict_is_said_beside_it():
+    asked = NetworkConfig(strict=True, mixed=True)
+    assert settle_strict(asked, said=False) == NetworkConfig()
+    assert settle_strict(asked, said=True) == NetworkConfig(strict=True)
+
+
+def test_defaults_are_not_written_but_whether_a_run_is_strict():
+    assert facts_of(LimitsConfig(), NetworkConfig()) == {"limits": "{}", "network": '{"strict": false}'}
 
 
 @pytest.mark.parametrize("text", ["not JSON", "[]", '{"minutes": "many"}', json.dumps({"patience": 3})])

@@ -24,11 +24,11 @@ from tests.coordinator.test_report import EVALUATED, Reporting
 class Spending(Reporting):
     """Each result took a tenth of a second and ten steps."""
 
-    start, network = None, NetworkConfig()
+    start = None
 
     def begin(self):
         if self.start is not None:
-            for name, text in {**self.start.facts, **facts_of(self.limits, self.network)}.items():
+            for name, text in {**self.start.facts, **facts_of(self.limits, NetworkConfig())}.items():
                 self.journal.set_fact(name, text)
             self.journal.commit()
         super().begin()
@@ -43,8 +43,8 @@ class Spending(Reporting):
 def make(tmp_path, random_bundle):
     made = []
 
-    def begin(start=None, network=None, **changes):
-        kind = type("One", (Spending,), {"start": start, "network": network or NetworkConfig()})
+    def begin(start=None, **changes):
+        kind = type("One", (Spending,), {"start": start})
         settings = replace(EVALUATED, **changes)
         made.append(kind(tmp_path / "runs" / f"night-{len(made)}", random_bundle.path, settings, 4))
         return made[-1]
@@ -81,10 +81,10 @@ def test_effort_is_counted_on_as_it_would_be_summed_up(make):
 def test_a_start_is_in_it_whole_with_what_had_been_spent(make, tmp_path):
     size = EVALUATED.controller.size
     start = Start(np.linspace(0, 1, size), EVALUATED.task.bundle, "controller a", "", Effort(5, 6, 7, 8))
-    bench = make(start, NetworkConfig(mixed=True))
+    bench = make(start)
     found = receipt_of(bench.end())
     assert np.array_equal(found.start.vector, start.mean)
-    assert (found.start.source, found.start.effort, found.mixed) == ("controller a", start.effort, True)
+    assert (found.start.source, found.start.effort, found.mixed) == ("controller a", start.effort, False)
     assert found.total == start.effort + found.effort
     follower = find_start(str(bench.path / CONTROLLER), tmp_path)
     assert follower.effort == found.total
@@ -154,7 +154,7 @@ def test_why_a_second_time_differs_is_said_as_far_as_it_is_known(make):
     found = again.compare(second.path)
     assert (found.same, found.why) == (False, "hosts and versions are equal")
     for changes, says in (
-        ({"mixed": True}, "hosts of any kind"),
+        ({"mixed": True}, "hosts of several classes"),
         ({"fingerprint": None}, "names no fingerprint"),
         ({"fingerprint": "g"}, "now [f]"),
         ({"versions": {"cma": "1"}}, "cma 1, now"),
@@ -163,6 +163,17 @@ def test_why_a_second_time_differs_is_said_as_far_as_it_is_known(make):
         assert says in other.compare(second.path).told
     with pytest.raises(ControllerError):
         again.compare(first.path.parent)
+
+
+def test_whether_hosts_of_the_second_time_are_of_the_first_ones_class_is_said(make):
+    first, second = make(), make(seed=2)
+    first.host_class, second.host_class = "a" * 16, "b" * 16
+    controller = first.end()
+    second.end()
+    assert receipt_of(controller).classes.told == "one class: to the bit"
+    again = Repetition.of(controller, None)
+    assert again.compare(first.path).told.endswith("on hosts of the same class")
+    assert f"of class {'a' * 16}, these are of {'b' * 16}" in again.compare(second.path).told
 
 
 def test_a_result_is_counted_once_whoever_says_it_again(make):

@@ -29,7 +29,8 @@ SETTINGS = RunSettings(
 class Bench:
     """A run in a folder, driven by hand; time stands still unless it is moved."""
 
-    mixed = False
+    strict = False
+    host_class = None  # of both workers; `None`: they know nothing of classes
 
     def __init__(self, path, bundle, settings=SETTINGS, generations=1):
         self.path, self.now = path, 0.0
@@ -39,7 +40,7 @@ class Bench:
         self.begin()
 
     def begin(self):
-        self.run = Run(self.journal, self.settings, self.limits, Fleet(1.0), self.now, mixed=self.mixed)
+        self.run = Run(self.journal, self.settings, self.limits, Fleet(1.0), self.now, strict=self.strict)
         self.run.advance(self.now)
         self.run.commit()
         for name in (A, B):
@@ -52,20 +53,24 @@ class Bench:
         self.journal = Journal(self.path / "journal.sqlite")
         self.begin()
 
-    def beat(self, name, unacked=()):
+    def beat(self, name, unacked=(), host_class=None):
+        if name not in self.run.fleet.members:
+            return
         numbering = self.run.fleet.members[name].numbering
         head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "numbering": numbering,
                 "drawn_by": "-"}  # fmt: skip
         tags = tuple(digest[:TAG_BYTES] for digest in unacked)
-        self.run.fleet.beat(
+        self.run.exchange.beat(
             name,
             Beat(**head, seen=10**9, capacity=4, slots=4, queued=(), running=(), unacked=tags, load=0.0,
-                 steps_per_second=0.0),
+                 steps_per_second=0.0, host_class=host_class),
             self.now,
         )  # fmt: skip
 
     def deliver(self, name, result):
-        batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,))
+        batch = ResultBatch(
+            run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,), host_class=self.host_class
+        )
         self.run.exchange.results(name, batch, self.now)
         self.run.advance(self.now)
         self.run.commit()

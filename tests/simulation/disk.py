@@ -8,6 +8,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, Protocol
 
+from dreamfleet.common.classes import Classes
 from dreamfleet.common.effort import Effort
 from dreamfleet.common.messages import Job, Result
 from dreamfleet.common.runs import JOURNAL
@@ -78,6 +79,14 @@ class MemoryJournal:
     def fingerprint(self) -> str | None:
         return self.fact("fingerprint")
 
+    def host_class(self) -> str | None:
+        return self.fact("host_class")
+
+    @property
+    def classes(self) -> Classes:
+        """No rule hangs on it."""
+        return Classes()
+
     @property
     def effort(self) -> Effort:
         """No rule hangs on it."""
@@ -104,7 +113,9 @@ class MemoryJournal:
         self._witness.told(closed.number, fitness.tolist())
         self._put("generation", closed.number, {**row, "closed": closed, "fitness": fitness.tolist()})
 
-    def add_result(self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int) -> None:
+    def add_result(
+        self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str = ""
+    ) -> None:
         self._witness.counted(job, result)
         self._insert("result", result.digest, (job, result))
 

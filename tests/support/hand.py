@@ -44,6 +44,7 @@ class Hand:
         self.intervals = Intervals(beat=0.1, repeat=0.1)
         self.refusal = None
         self.packages = NUMERIC_PACKAGES  # that its run's fingerprint names
+        self.classes = True  # whether it knows classes of hosts
         self.worker = None
         self.slots = 0  # that its status shows
         self.offsets = queue.SimpleQueue()  # of the bundle's parts that were asked for
@@ -156,7 +157,7 @@ class Hand:
                 run=self.run, run_uid=self.run_uid, incarnation=self.incarnation, nonce=self.nonce,
                 why=why, remedy=remedy,
                 spec={} if why else asdict(self.spec), intervals={} if why else asdict(self.intervals),
-                packages=self.packages, numbering=self.numbering,
+                packages=self.packages, numbering=self.numbering, classes=self.classes,
             )  # fmt: skip
             query.reply(keys.hello(self.run), encode_json(reply), encoding="application/json")
         self._said.put(request)

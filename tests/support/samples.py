@@ -74,6 +74,14 @@ MSGPACK = {
             Result(b"\x03" * 32, 0.0, 300, 2.0, None, b"\x04" * 32),
         ),
     ),
+    "result-classed": ResultBatch(
+        **HEAD, fingerprint="x86_64 avx2", results=(Result(b"\x01" * 32, 812.5, 1000, 7.25, None, None),),
+        host_class="0123456789abcdef",
+    ),
+    "beat-classed": Beat(
+        **HEAD, nonce="c0ffee00c0ffee00", numbering=3, seen=9, capacity=4, slots=4, queued=(), running=(), unacked=(),
+        load=1.5, steps_per_second=987.5, drawn_by="native", host_class="0123456789abcdef",
+    ),
     "beat": Beat(
         **HEAD, nonce="c0ffee00c0ffee00", numbering=3, seen=9, capacity=4, slots=4, queued=(b"abcdefgh",),
         running=(Running(b"ABCDEFGH", 412),), unacked=(b"12345678",), load=1.5, steps_per_second=987.5,
@@ -100,6 +108,14 @@ JSON = {
         True, 2, 2, "0.1.0", "night", UID, 3, "c0ffee00c0ffee00", "", "",
         {"task": "car-racing", "bundle": "ab" * 32, "horizon": 1000, "patience": 100}, {"beat": 1.0, "repeat": 1.0},
         numbering=4,
+    ),
+    "hello-request-classed": HelloRequest(
+        2, 2, "0.1.0", "host-a/0a1b2c3d", ("car-racing", "dream"), "x86_64 avx2", 8, host_class="0123456789abcdef"
+    ),
+    "hello-reply-classed": HelloReply(
+        True, 2, 2, "0.1.0", "night", UID, 3, "c0ffee00c0ffee00", "", "",
+        {"task": "car-racing", "bundle": "ab" * 32, "horizon": 1000, "patience": 100}, {"beat": 1.0, "repeat": 1.0},
+        numbering=4, classes=True,
     ),
     "generation-event": GenerationEvent(
         v=1, run="night", run_uid=UID, incarnation=3, generation=7, mean=100.5, std=20.25, best=150.0, worst=-10.0,

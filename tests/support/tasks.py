@@ -93,6 +93,7 @@ class RaisingPolicy(ToyPolicy):
 
 class Crashing(Toy):
     name = CRASHING
+    probe_steps = 0
 
     def make_policy(self, assignment):
         return CrashingPolicy()
@@ -117,6 +118,7 @@ class NanPolicy(ToyPolicy):
 
 class Hanging(Toy):
     name = HANGING
+    probe_steps = 0
 
     def make_policy(self, assignment):
         return HangingPolicy()
@@ -131,6 +133,7 @@ class Silent(Toy):
     """Closes every connection of its process, and lives on."""
 
     name = SILENT
+    probe_steps = 0
 
     def make_policy(self, assignment):
         return SilentPolicy()
@@ -174,6 +177,7 @@ class Counted(Toy):
     """
 
     name = COUNTED
+    probe_steps = 0
     seconds = 0.001
 
     def make_environment(self, assignment):

@@ -12,13 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.classes import class_of
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.fingerprint import fingerprint
 from dreamfleet.common.messages import Kind, TaskSpec
 from dreamfleet.common.variants import Variant
+from dreamfleet.worker.scoring.behaviour import Behaviour
 from dreamfleet.worker.scoring.episode import Course, score
 from dreamfleet.worker.scoring.rollout import Rollout
 from dreamfleet.worker.scoring.watched import WatchedPolicy
-from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Onlooker, Score, Watchable, World
+from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Onlooker, Score, Task, Watchable, World
 from dreamfleet.worker.tasks.registry import find_task
 
 DRIVER = "controller"  # as a kept rollout names who drove
@@ -96,6 +99,22 @@ class Scorer:
     def drawn_by(self) -> str:
         """Who draws the environment's picture; `-` where a task does not say."""
         return str(getattr(self._environment.unwrapped, "drawn_by", "-"))
+
+    @cached_property
+    def host_class(self) -> str:
+        """The class of this host, as far as this task shows it: hosts of one compute the same bits.
+
+        Where nobody may look, or the task fails at it, the host's fingerprint tells it.
+        """
+        steps = getattr(self._task, "probe_steps", Task.probe_steps)
+        found, size = Behaviour(), self._assignment.controller.size
+        with suppress(Exception):  # a job that is to be scored will tell what is wrong, and to whom it matters
+            if steps > 0:
+                found.drive(self._environment, self._policy, size, steps)
+                if self._batch_for is not None:
+                    found.score(self._batch_for(self.spec.at(horizon=steps)), size)
+                return found.host_class
+        return class_of(fingerprint(self.world.packages))
 
     def course(self, kind: Kind, seed: int, spec: TaskSpec | None = None) -> Course:
         """The episode that a job of this kind and seed is, in the run's specification or in `spec`."""

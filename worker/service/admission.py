@@ -33,6 +33,7 @@ class Admission:
     intervals: Intervals
     packages: tuple[str, ...] = NUMERIC_PACKAGES  # whose versions the run's fingerprint names
     numbering: int = 0  # of the batches that follow
+    classes: bool = False  # whether the coordinator knows classes of hosts
 
 
 def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> Admission | None:
@@ -107,5 +108,5 @@ def _admission(reply: HelloReply) -> Admission:
         ) from error
     return Admission(
         keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages,
-        reply.numbering,
+        reply.numbering, reply.classes,
     )  # fmt: skip

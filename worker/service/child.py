@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Ready:
-    """A child's first word: it can score, and who draws its picture."""
+    """A child's first word: it can score, who draws its picture, and of which class its host is."""
 
     drawn_by: str
+    host_class: str
 
 
 def serve_jobs(
@@ -47,7 +48,7 @@ def serve_jobs(
     unblock_stdout()
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     scorer = _make_scorer(pipe, spec, bundle, announced)
-    pipe.send(Ready(scorer.drawn_by))
+    pipe.send(Ready(scorer.drawn_by, scorer.host_class))
     _take_turns(pipe, scorer, steps, abandoned, shown)
 
 

@@ -47,7 +47,8 @@ class Line:
     session: zenoh.Session
     identity: str
     inbox: Inbox
-    say_hello: Callable[[str], Admission | None]  # to a run by name; `None` if nobody answers
+    # To a run by name, of a class that may not be known yet; `None` if nobody answers.
+    say_hello: Callable[[str, str], Admission | None]
     pause: Callable[[], float]  # seconds until hello may be said again
 
 
@@ -218,7 +219,7 @@ class JoinedRun:
 
     def _send(self, now: float) -> None:
         for results in self._outbox.due(now):
-            self._post.results(results)
+            self._post.results(self._slots, results)
         if now >= self._beat_at:
             self._beat_at = now + self._admission.intervals.beat
             self._post.beat(
@@ -239,7 +240,7 @@ class JoinedRun:
     def _rejoin(self, now: float) -> None:
         """Say hello again; what runs goes on, what is unacknowledged is kept, what is queued is given again."""
         self._membership.ask(now, self._line.pause())
-        admission = self._line.say_hello(self._admission.run)
+        admission = self._line.say_hello(self._admission.run, self._slots.host_class)
         if admission is None:
             return
         if (admission.run_uid, admission.spec) != (self._admission.run_uid, self._admission.spec):

@@ -42,13 +42,14 @@ class Post:
         self._identity = identity
         self._run = admission
 
-    def results(self, results: tuple[Result, ...]) -> None:
+    def results(self, slots: Slots, results: tuple[Result, ...]) -> None:
         """One message of finished jobs."""
         batch = ResultBatch(
             run_uid=self._run.run_uid,
             incarnation=self._run.incarnation,
             fingerprint=fingerprint(self._run.packages),
             results=results,
+            host_class=self._class_of(slots),
         )
         self._put(keys.result(self._run.run, self._identity), batch)
 
@@ -80,8 +81,13 @@ class Post:
             load=os.getloadavg()[0],
             steps_per_second=min(rate, MOST_A_SECOND),
             drawn_by=slots.drawn_by,
+            host_class=self._class_of(slots),
         )
         self._put(keys.beat(self._run.run, self._identity), beat)
+
+    def _class_of(self, slots: Slots) -> str | None:
+        """The host's class, if it is known and the coordinator knows what that is."""
+        return slots.host_class or None if self._run.classes else None
 
     def _put(self, key: str, message: Message) -> None:
         self._session.put(key, encode(message), encoding=encoding(type(message)))

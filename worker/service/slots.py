@@ -12,6 +12,7 @@ from dreamfleet.common.bounds import saturated
 from dreamfleet.common.messages import MAX_LEASES, TAG_BYTES, Job, Result, Running, TaskSpec
 from dreamfleet.worker.service.announced import check_announced
 from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.child import Ready
 from dreamfleet.worker.service.failures import Failures
 from dreamfleet.worker.service.glimpses import Seen
 from dreamfleet.worker.service.slot import Slot, SlotEvent
@@ -39,6 +40,7 @@ class Slots:
         self._task = spec.task
         self._width = find_task(spec.task).width
         self._failures = Failures()
+        self.host_class = ""  # as the first child found it out; not known before
         self._watched = False
         self._shown: Slot | None = None
         self._slots: list[Slot] = []
@@ -118,6 +120,8 @@ class Slots:
     def handle(self, event: SlotEvent) -> tuple[Result, ...]:
         """Take a slot's event; the results that it brings."""
         slot = self._slots[event.slot]
+        if isinstance(event.word, Ready):
+            self.host_class = self.host_class or event.word.host_class
         if event.failure is not None:
             # A child that is starting has begun nothing, so no job is to blame.
             text = self._failures.tell(event.failure, self._task, slot.running if slot.ready else ())

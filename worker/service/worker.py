@@ -6,6 +6,7 @@ import logging
 import queue
 import random
 from contextlib import ExitStack
+from dataclasses import replace
 from time import monotonic
 from typing import Any
 
@@ -81,7 +82,7 @@ class Worker:
 
     def _main_loop(self, session: zenoh.Session) -> None:
         """One run, or one after another."""
-        line = Line(session, self.identity, self.inbox, lambda run: self._ask(session, run), _jittered_retry)
+        line = Line(session, self.identity, self.inbox, lambda *of: self._ask(session, *of), _jittered_retry)
         while (admission := self._join(session)) is not None:
             self._serve_run(line, admission)
             if not self._config.any:
@@ -135,8 +136,8 @@ class Worker:
             raise error
         log.warning("%s; asking it again in %.0f s", error, self._refusals.add(run, monotonic()))
 
-    def _ask(self, session: zenoh.Session, run: str | None) -> Admission | None:
-        return ask(session, run, self._hello, self.inbox)
+    def _ask(self, session: zenoh.Session, run: str | None, host_class: str = "") -> Admission | None:
+        return ask(session, run, replace(self._hello, host_class=host_class), self.inbox)
 
     def _obtain_bundle(self, session: zenoh.Session, admission: Admission) -> Bundle | None:
         store = BundleStore(default_cache())

@@ -29,6 +29,7 @@ __all__ = [
     "Assignment",
     "Batch",
     "Batched",
+    "Choosing",
     "Collected",
     "Continuous",
     "Description",
@@ -67,6 +68,13 @@ class Rewarded(Protocol):
 
     def reward(self, value: float) -> None:
         """The reward of the last action, before the next one is asked for."""
+
+
+class Choosing(Protocol):
+    """A policy whose actions hide what it computed, such as an index of the largest output; a policy need not tell."""
+
+    def outputs(self, observation: Any) -> Any:
+        """What it makes an action of, as one or more arrays: by these bits too hosts are told apart."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +188,9 @@ class Task:
 
     name: str
     width: ClassVar[int] = 1  # episodes that a slot scores at once
+    # Of an episode of fixed seed and parameters by which a worker finds out its host's class, before it is given
+    # anything to score; 0: nobody looks, and the host's fingerprint tells its class.
+    probe_steps: ClassVar[int] = 16
     world: World
 
     def world_of(self, assignment: Assignment) -> World:  # noqa: ARG002 - a dream asks its bundle

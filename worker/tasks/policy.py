@@ -32,11 +32,16 @@ class FlatPolicy:
 
     def act(self, observation: Any) -> Any:
         """The action for one observation of any shape, flattened."""
+        return self._actions.of(self.outputs(observation))
+
+    def outputs(self, observation: Any) -> Floats:
+        """The controller's outputs `(outputs,)` for one observation, of which the actions are made."""
         value = (np.asarray(observation, dtype=np.float32).reshape(-1) - self._mean) * self._scale
         *before, (weights, biases) = self._layers
         for each, offsets in before:
             value = np.tanh(each @ value + offsets)
-        return self._actions.of(weights @ value + biases)
+        found: Floats = weights @ value + biases
+        return found
 
 
 class Driver(Protocol):

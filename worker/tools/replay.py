@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.classes import class_of
+from dreamfleet.common.fingerprint import fingerprint
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.terms import terms_of
 from dreamfleet.common.threads import pin_thread_pools
@@ -20,6 +22,22 @@ class Replayed:
     seed: int
     stored: float
     replayed: float
+    host_class: str  # of the host that scored it
+    own: bool  # whether this host is of that class, so that the bits must be the same
+
+    @property
+    def same(self) -> bool:
+        """To the bit."""
+        return self.stored == self.replayed
+
+    def agrees(self, tolerance: float | None) -> bool | None:
+        """Whether it is what was stored; `None` where this host cannot tell.
+
+        A result of another class may differ by `tolerance`; without one nothing is known of it unless it is the same.
+        """
+        if self.same or self.own:
+            return self.same
+        return None if tolerance is None else abs(self.stored - self.replayed) <= tolerance
 
 
 def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[Replayed]:
@@ -32,7 +50,10 @@ def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[Replayed
 
     terms, own = terms_of(run, generation), run.spec
     scorer = Scorer(own, Bundle.open(run.bundle_path, own.bundle) if own.bundle else None)
+    here = scorer.host_class, class_of(fingerprint(run.settings.packages))
     for result in results:
         score = scorer.score("score", parameters, result.seed, spec=terms.spec_of(result.episode))
-        yield Replayed(result.episode, result.seed, result.fitness, score.fitness)
+        yield Replayed(
+            result.episode, result.seed, result.fitness, score.fitness, result.host_class, result.host_class in here
+        )
     scorer.close()
