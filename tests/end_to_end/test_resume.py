@@ -37,7 +37,7 @@ def stopped(processes, settings, *flags):
 
 def test_the_hint_of_a_run_that_was_left_is_a_whole_command_with_its_limits_and_its_network(processes, settings):
     processes.runs = processes.folder / "all my runs"
-    worker, said = stopped(processes, settings, "--generations", 6, "--mixed")
+    worker, said = stopped(processes, settings, "--generations", 6, "--strict")
     command = said.split("continue it with: ")[1]
     done = subprocess.run(
         command, shell=True, env=environment(processes.cache), capture_output=True, check=False, text=True, timeout=100,
@@ -47,7 +47,7 @@ def test_the_hint_of_a_run_that_was_left_is_a_whole_command_with_its_limits_and_
     assert worker.popen.poll() is None
     with open_run(processes.runs, "test") as run:
         assert json.loads(run.fact("limits")) == {"generations": 6}
-        assert json.loads(run.fact("network")) == {"listen": [processes.endpoint], "beat": 0.2, "mixed": True}
+        assert json.loads(run.fact("network")) == {"listen": [processes.endpoint], "beat": 0.2, "strict": True}
 
 
 def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept(processes, settings):

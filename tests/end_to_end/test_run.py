@@ -13,7 +13,7 @@ import pytest
 from dreamfleet.common.runs import open_run
 from dreamfleet.coordinator.start import latest
 from tests.support import tasks
-from tests.support.processes import environment, free_port
+from tests.support.processes import free_port
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -108,24 +108,6 @@ def test_a_job_that_fails_on_two_workers_pauses_the_run_and_says_why(processes, 
     assert "failed on two workers" in status["why"]
     assert "the road has ended" in status["why"]
     assert coordinator.popen.poll() is None
-
-
-def test_a_worker_with_another_fingerprint_is_refused_with_the_remedy(processes, settings, tmp_path):
-    processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
-    processes.worker("--task", tasks.SLOW_TOY).wait_for("joined")
-    stranger = tmp_path / "stranger.py"
-    stranger.write_text(
-        "import sys, dreamfleet.common.fingerprint, dreamfleet.worker.service.admission\n"
-        "dreamfleet.worker.service.admission.fingerprint = lambda: 'riscv64 other'\n"
-        "from dreamfleet.common.cli import main\nsys.exit(main(sys.argv[1:]))\n"
-    )
-    command = [sys.executable, stranger, "worker", "--connect", processes.endpoint, "--task", tasks.SLOW_TOY]
-    done = subprocess.run(
-        command, env=environment(tmp_path / "c"), capture_output=True, check=False, text=True, timeout=60
-    )
-    assert done.returncode != 0
-    assert "fingerprints differ" in done.stderr
-    assert "--mixed" in done.stderr
 
 
 def test_a_worker_that_does_not_know_the_task_is_refused(processes, settings):

@@ -82,7 +82,7 @@ def test_a_fork_that_never_began_goes_on_from_its_source_though_that_is_gone(pro
 
 
 def test_how_a_run_is_served_is_kept_with_its_start(processes, settings, controller):
-    refused(processes, "coordinator", "--run", "night", "--init", controller, *settings, "--mixed")
+    refused(processes, "coordinator", "--run", "night", "--init", controller, *settings, "--strict")
     with open_run(processes.runs, "night") as run:
         assert run.fact("limits") == '{"generations": 1}'
-        assert '"mixed": true' in run.fact("network")
+        assert '"strict": true' in run.fact("network")

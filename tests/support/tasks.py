@@ -16,16 +16,17 @@ from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 MODULE = "tests.support.tasks"
 (
     TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, EXPLODING, ENDLESS,
-    CHATTY, PAINTED,
+    CHATTY, PAINTED, ROUNDED,
 ) = (
     f"{MODULE}:{name}"
     for name in (
         "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Optimistic",
-        "Exploding", "Endless", "Chatty", "Painted",
+        "Exploding", "Endless", "Chatty", "Painted", "Rounded",
     )
 )  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, PAINTED
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
+ROUNDING = "DREAMFLEET_TEST_ROUNDING"  # set: `Rounded` computes as a host of another class does
 ODD_REWARD = "DREAMFLEET_TEST_ODD_REWARD"  # a file that holds a number: the next episode gives it, and the file is gone
 
 
@@ -77,6 +78,17 @@ class SlowToy(Toy):
 
     name = SLOW_TOY
     seconds = 0.03
+
+
+class Rounded(Toy):
+    """What it gives hangs on the host, by a bit."""
+
+    name = ROUNDED
+
+    def make_environment(self, assignment):
+        made = super().make_environment(assignment)
+        odd = np.finfo(np.float64).eps if ROUNDING in os.environ else 0.0
+        return gymnasium.wrappers.TransformReward(made, lambda reward: reward * (1 - odd))
 
 
 class Raising(Toy):

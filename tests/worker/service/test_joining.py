@@ -9,13 +9,13 @@ import pytest
 from dreamfleet.common.bundle import write_bundle
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, fingerprint
-from dreamfleet.common.messages import Intervals, TaskSpec
+from dreamfleet.common.messages import Intervals, ResultBatch, TaskSpec
 from dreamfleet.common.session import Network
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.service.worker import Worker
 from tests.support import tasks
-from tests.support.hand import DEADLINE, Hand
+from tests.support.hand import DEADLINE, SECOND, Hand
 from tests.support.processes import free_port
 from tests.support.stage import wait_for
 
@@ -169,3 +169,26 @@ def test_a_world_model_of_a_world_that_it_did_not_announce_imports_nothing(stage
     _, served = stage.worker()
     assert isinstance(served.exception(DEADLINE), RefusedError)
     assert not mark.exists()
+
+
+def test_it_names_its_class_with_all_that_it_says_once_a_child_has_found_it_out(stage, cached):
+    hand = stage.hand()
+    stage.worker()
+    assert hand.hello().host_class == ""
+    beat = hand.beat(lambda beat: beat.capacity > 0)
+    assert len(beat.host_class) == 16
+    hand.send(1, hand.job())
+    assert hand.next(ResultBatch).host_class == beat.host_class
+    hand.vanish()
+    hand.nonce = SECOND
+    hand.appear()
+    assert hand.hello().host_class == beat.host_class
+
+
+def test_a_coordinator_from_before_classes_hears_nothing_of_them(stage, cached):
+    hand = stage.hand()
+    hand.classes = False
+    stage.worker()
+    assert hand.ready().host_class is None
+    hand.send(1, hand.job())
+    assert hand.next(ResultBatch).host_class is None

@@ -1,3 +1,4 @@
+import json
 import sqlite3
 
 import pytest
@@ -31,3 +32,18 @@ def test_a_fitness_that_is_not_what_was_stored_is_told_and_exits_1(processes, fi
     code, _, err = processes.call("replay", "test", "--runs-dir", processes.runs, "--candidate", "5/0")
     assert code == 1
     assert "candidate 5/0" in err
+
+
+def test_what_a_host_of_another_class_scored_is_counted_and_compared_if_that_is_asked(processes, finished_run):
+    with sqlite3.connect(finished_run / JOURNAL) as connection:
+        connection.execute("UPDATE result SET fitness = fitness + 0.5, host_class = 'there' WHERE episode = 1")
+    connection.close()
+    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
+    code, out, err = processes.call(*replay)
+    assert (code, out.count("same bits"), out.count("not checkable here: of class there")) == (0, 1, 1)
+    assert "1 of 2 episodes were scored by hosts of another class" in err
+    found = json.loads(processes.call(*replay, "--json")[1])
+    assert (found["identical"], found["unchecked"]) == (False, 1)
+    code, out, err = processes.call(*replay, "--tolerance", 1)
+    assert (code, out.count("within 1, of class there"), err) == (0, 1, "")
+    assert processes.call(*replay, "--tolerance", 0.25)[0] == 1

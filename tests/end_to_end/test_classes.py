@@ -1,0 +1,162 @@
+"""Hosts whose bits differ: any may score, each result names its host's class, and a strict run keeps to one."""
+
+import hashlib
+import json
+import subprocess
+import sys
+
+import pytest
+
+from dreamfleet.common import keys
+from dreamfleet.common.codec import encode_json
+from dreamfleet.common.messages import HelloRequest
+from dreamfleet.common.runs import open_run
+from dreamfleet.common.session import Network, open_session
+from tests.support import tasks
+from tests.support.processes import environment
+
+pytestmark = pytest.mark.timeout(300)
+OTHER = "riscv64 other"
+ODD = ("env", f"{tasks.ROUNDING}=1")  # a host on which a sum comes out otherwise, in its last bit
+GO_ON = "coordinator", "--resume", "test", "--generations", 2
+OTHER_KERNEL = ("env", "OPENBLAS_CORETYPE=Nehalem")
+PRODUCT = (
+    "import hashlib, numpy as np; a = np.sin(np.arange(24 * 16)).astype('f4').reshape(16, 24);"
+    "print(hashlib.sha256((a @ a[3]).tobytes()).hexdigest())"
+)
+
+
+@pytest.fixture
+def settings(random_bundle):
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+            "--task", tasks.ROUNDED)  # fmt: skip
+
+
+@pytest.fixture
+def stranger(processes, tmp_path):
+    """Starts a worker on a host that says something else of itself, and computes the same."""
+    script, started = tmp_path / "stranger.py", []
+    script.write_text(
+        "import sys\nimport dreamfleet.worker.service.admission as admission, dreamfleet.worker.service.post as post\n"
+        f"admission.fingerprint = post.fingerprint = lambda *_: {OTHER!r}\n"
+        "from dreamfleet.common.cli import main\n"
+        "if __name__ == '__main__':\n    sys.exit(main(sys.argv[1:]))\n"  # its children import it too
+    )
+
+    def start():
+        command = [sys.executable, script, "worker", "--connect", processes.endpoint, "--task", tasks.ROUNDED,
+                   "--slots", "1", "--name", "stranger"]  # fmt: skip
+        started.append(subprocess.Popen(command, env=environment(tmp_path / "c"), stderr=subprocess.DEVNULL))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.kill()
+        each.communicate()
+
+
+def own(processes, *more, **where):
+    return processes.worker("--task", tasks.ROUNDED, "--name", "own", *more, **where)
+
+
+def one_after_the_other(processes, settings, first, second):
+    """The first worker scores generation 0, the second one generation 1."""
+    coordinator = processes.coordinator(*settings, "--generations", 1)
+    started = first()
+    assert coordinator.finish(120)[0] == 0
+    getattr(started, "popen", started).kill()  # else it would score the next generation too
+    coordinator = processes.start(*GO_ON, "--runs-dir", processes.runs)
+    second()
+    assert coordinator.finish(120)[0] == 0
+    with open_run(processes.runs, "test") as run:
+        return run.classes
+
+
+def test_a_strangers_hello_keeps_nobody_out_of_a_strict_run(processes, settings):
+    coordinator = processes.coordinator(*settings, "--generations", 1, "--strict")
+    hello = HelloRequest(keys.PROTOCOL_VERSION, keys.PROTOCOL_VERSION, "0", "gone/00000001", (tasks.ROUNDED,), OTHER, 1)
+    with open_session(Network(connect=(processes.endpoint,))) as session:
+        (reply,) = session.get(keys.hello("test"), payload=encode_json(hello), timeout=30)
+        assert b'"accepted": true' in reply.ok.payload.to_bytes()
+    own(processes)
+    assert coordinator.finish(120)[0] == 0
+
+
+def test_hosts_that_compute_the_same_are_of_one_class_whatever_they_say_of_themselves(processes, settings, stranger):
+    classes = one_after_the_other(processes, (*settings, "--strict"), stranger, lambda: own(processes))
+    assert classes.told == "one class: to the bit"
+    assert len(classes.largest[0].fingerprints) == 2
+    assert OTHER in classes.largest[0].fingerprints
+
+
+def test_a_strict_run_refuses_another_class_and_goes_on_strict_until_it_is_told_otherwise(processes, settings):
+    coordinator = processes.coordinator(*settings, "--generations", 1, "--strict")
+    first = own(processes)
+    assert coordinator.finish(120)[0] == 0
+    first.end()  # else it would score the next generation
+    resumed = *GO_ON, "--runs-dir", processes.runs
+    coordinator = processes.start(*resumed)
+    odd = own(processes, inside=ODD)
+    assert "--no-strict" in odd.wait_for("classes differ")
+    coordinator.wait_for("classes differ")
+    coordinator.end()
+    coordinator = processes.start(*resumed, "--mixed")
+    coordinator.wait_for("--mixed is deprecated")
+    own(processes, inside=ODD)
+    assert coordinator.finish(120)[0] == 0
+    with open_run(processes.runs, "test") as run:
+        assert run.classes.told == "mixed: 2 classes, 50.0%, 50.0% of results"
+        assert json.loads(run.fact("network"))["strict"] is False
+
+
+def test_status_runs_show_and_list_tell_of_what_classes_the_results_are(processes, settings):
+    coordinator = processes.coordinator(*settings, "--generations", 1000)
+    odd = own(processes, inside=ODD)
+    coordinator.wait_for("generation 0: mean")
+    assert processes.status()["classes"]["total"] == 1
+    odd.end()
+    own(processes)
+    while (status := processes.status())["classes"]["total"] < 2:
+        pass
+    assert len({each["host_class"] for each in status["worker_list"]} - {""}) >= 1
+    shown = processes.call("status", "--connect", processes.endpoint)[1]
+    assert "mixed: 2 classes" in shown
+    _, out, _ = processes.call("runs", "show", "test", "--runs-dir", processes.runs)
+    assert "mixed: 2 classes" in out
+    for each in status["classes"]["largest"]:
+        assert f"class {each['host_class']}" in out
+    (row,) = json.loads(processes.call("runs", "list", "--runs-dir", processes.runs, "--json")[1])
+    assert row["classes"] == 2
+
+
+def product(where):
+    done = subprocess.run([*where, sys.executable, "-c", PRODUCT], capture_output=True, check=True, timeout=60)
+    return hashlib.sha256(done.stdout).hexdigest()
+
+
+def test_another_kernel_of_openblas_is_another_class_whose_results_are_replayed_there(processes):
+    """Real arithmetic, no test's: OpenBLAS with and without fused products, under gymnasium's BipedalWalker."""
+    if product(()) == product(OTHER_KERNEL):
+        pytest.skip("OpenBLAS rounds the same with every kernel that this processor has")
+    settings = ("--task", "gym:BipedalWalker-v3", "--population", 4, "--episodes", 2, "--horizon", 100, "--sigma0", 1.0,
+                "--evaluate-every", 0)  # fmt: skip
+    classes = one_after_the_other(processes, settings, lambda: processes.worker(inside=OTHER_KERNEL), processes.worker)
+    assert classes.told == "mixed: 2 classes, 50.0%, 50.0% of results"
+
+    def replayed(candidate, where=(), *more):
+        replay = processes.start(
+            "replay", "test", "--runs-dir", processes.runs, "--candidate", candidate, *more, inside=where
+        )
+        code, out = replay.finish(60)
+        return code, out, "".join(replay.lines)
+
+    code, out, err = replayed("1/0")
+    assert (code, out.count("same bits"), err) == (0, 2, "")
+    code, out, _ = replayed("0/0", OTHER_KERNEL)
+    assert (code, out.count("same bits")) == (0, 2)
+    code, out, err = replayed("0/0")
+    assert "DIFFERS" not in out
+    assert out.count("not checkable here") + out.count("same bits") == 2
+    if "not checkable here" in out:
+        assert "scored by hosts of another class" in err
+        assert replayed("0/0", (), "--tolerance", 1000)[0] == 0
