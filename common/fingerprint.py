@@ -1,7 +1,7 @@
-"""Which hosts give equal bits: CPU feature class, libc, and the versions of the packages that compute a fitness.
+"""What a host is, in one line: CPU features, libc, and the versions of the packages that compute a fitness.
 
-Nothing guarantees equal bits across instruction sets or versions, so a run admits one fingerprint unless told
-otherwise.
+Nothing guarantees equal bits across instruction sets or versions; whether two hosts have them is what their classes say
+(`common/classes.py`).
 """
 
 from __future__ import annotations
