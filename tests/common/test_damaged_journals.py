@@ -10,7 +10,7 @@ import pytest
 
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.runs import RunFolder, open_run
-from dreamfleet.common.schema import APPLICATION_ID, VERSION
+from dreamfleet.common.schema import APPLICATION_ID, VERSION, check, migrate
 from tests.support.mutations import mutate
 
 RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
@@ -29,7 +29,7 @@ def look(folder):
         run.history(), run.evaluations(), run.rollouts(), run.strategy_state(), run.result_count()
         run.candidates(), run.scores(1), run.scores(1, confirming=True)
         run.uid, run.created, run.ended, run.fingerprint  # noqa: B018
-        run.candidate(0, 0), run.fitness(0, 0), run.results(0, 0)
+        run.candidate(0, 0), run.fitness(0, 0), run.results(0, 0), run.classes.told
 
 
 def test_damaged_pages(folder, watched):
@@ -44,6 +44,7 @@ def test_damaged_pages(folder, watched):
 def loose(path):
     """The same rows in tables that take anything, as another program might have written them."""
     with sqlite3.connect(path) as old:
+        migrate(old, check(old, path))
         names = [name for (name,) in old.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
         tables = {name: [each[1] for each in old.execute(f"PRAGMA table_info({name})")] for name in names}
         rows = {name: old.execute(f"SELECT * FROM {name}").fetchall() for name in names}
