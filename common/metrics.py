@@ -31,21 +31,28 @@ class Metric:
     text: str
     samples: Sequence[tuple[Mapping[str, str], float | None]]  # `None`: it has none
 
+    @property
+    def head(self) -> str:
+        """What stands once before its lines, of however many runs these are."""
+        return f"# HELP {self.name} {self.text}\n# TYPE {self.name} {self.kind}\n"
+
     def lines(self, run: str) -> Iterator[str]:
         """As they are written; nothing for a metric without a value."""
-        samples = [(labels, value) for labels, value in self.samples if value is not None]
-        if not samples:
-            return
-        yield f"# HELP {self.name} {self.text}"
-        yield f"# TYPE {self.name} {self.kind}"
-        for labels, value in samples:
-            named = ",".join(f'{name}="{_escaped(text)}"' for name, text in {"run": run, **labels}.items())
-            yield f"{self.name}{{{named}}} {_number(value)}"
+        for labels, value in self.samples:
+            if value is not None:
+                named = ",".join(f'{name}="{_escaped(text)}"' for name, text in {"run": run, **labels}.items())
+                yield f"{self.name}{{{named}}} {_number(value)}\n"
 
 
-def exposition(status: Status) -> str:
-    """All metrics of a run, each labelled with its name."""
-    return "".join(f"{line}\n" for metric in metrics(status) for line in metric.lines(status.run))
+def exposition(*statuses: Status) -> str:
+    """All metrics of these runs, each labelled with the run's name."""
+    return "".join(_together(statuses, of_each) for of_each in zip(*map(metrics, statuses), strict=True))
+
+
+def _together(statuses: Sequence[Status], of_each: Sequence[Metric]) -> str:
+    """One metric, of each run."""
+    lines = [line for status, metric in zip(statuses, of_each, strict=True) for line in metric.lines(status.run)]
+    return of_each[0].head + "".join(lines) if lines else ""
 
 
 def metrics(status: Status) -> Iterator[Metric]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 BOUNDARY = "dreamfleet-frame"
 CONTENT_TYPE = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
@@ -24,7 +24,7 @@ def write_part(out: BinaryIO, picture: bytes, facts: dict[str, Any]) -> None:
     out.flush()
 
 
-def read_parts(stream: BinaryIO) -> Iterator[tuple[bytes, dict[str, Any]]]:
+def read_parts(stream: IO[bytes]) -> Iterator[tuple[bytes, dict[str, Any]]]:
     """Each JPEG with its facts, until the stream ends, or is no such stream any more."""
     while (head := _read_head(stream)) is not None:
         try:
@@ -37,7 +37,7 @@ def read_parts(stream: BinaryIO) -> Iterator[tuple[bytes, dict[str, Any]]]:
         yield picture, facts
 
 
-def _read_head(stream: BinaryIO) -> dict[str, str] | None:
+def _read_head(stream: IO[bytes]) -> dict[str, str] | None:
     """The headers of the next part, by names in lower case; `None` at the end."""
     line = b"\r\n"
     while line == b"\r\n":  # after the last picture

@@ -73,7 +73,9 @@ class Child:
         log: Path | None = None,
         environment: Mapping[str, str] | None = None,
         inside: Sequence[str] = (),
+        read: Callable[[IO[bytes]], None] | None = None,
     ) -> None:
+        """`read` takes its stdout, in a thread of its own, where that is no text; it ends with the stream."""
         self.lines: list[str] = []  # of stderr, the last of them
         self._log = log
         self._out: deque[str] = deque(maxlen=LINES)
@@ -85,11 +87,12 @@ class Child:
             self.popen = subprocess.Popen(  # noqa: S603 - our own interpreter and verb
                 [*inside, *command(*words)], stdout=target, stderr=target, env=environment, start_new_session=True
             )
-        streams = ((self.popen.stdout, self._out.append, None), (self.popen.stderr, self._hear, self._heard))
+        streams = (
+            (self.popen.stdout, read or (lambda stream: _drain(stream, self._out.append, None))),
+            (self.popen.stderr, lambda stream: _drain(stream, self._hear, self._heard)),
+        )
         self._readers = [
-            threading.Thread(target=_drain, args=(stream, take, end), daemon=True)
-            for stream, take, end in streams
-            if stream is not None
+            threading.Thread(target=take, args=(stream,), daemon=True) for stream, take in streams if stream is not None
         ]
         for reader in self._readers:
             reader.start()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Mapping
+from contextlib import aclosing
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +13,28 @@ from starlette.responses import HTMLResponse, PlainTextResponse, Response, Strea
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.metrics import CONTENT_TYPE, exposition
 from dreamfleet.common.printable import printable
 from dreamfleet.coordinator.dashboard import past
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.dashboard.feed import Feed
 from dreamfleet.coordinator.dashboard.files import Files
 from dreamfleet.coordinator.dashboard.guard import Guard
-from dreamfleet.coordinator.dashboard.plain import written
-from dreamfleet.coordinator.dashboard.watching import event
+from dreamfleet.coordinator.dashboard.plain import event, written
+from dreamfleet.coordinator.dashboard.views import Subject, Views
 
+EVENTS = "text/event-stream"
+FULL = "too many pages are open: close some\n"
 FOR_EVER = "private, max-age=31536000, immutable"
 
 
-def make_app(feed: Feed, runs_dir: Path, config: DashboardConfig) -> ASGIApp:
+def make_app(feed: Feed, views: Views, runs_dir: Path, config: DashboardConfig) -> ASGIApp:
     """The page, behind its guard; `ModuleNotFoundError` where a package of the extra is missing."""
-    answers = _Answers(feed, runs_dir, Files())
+    answers = _Answers(feed, views, runs_dir, Files())
     routes = [
         Route("/", answers.index), Route("/files/{digest}/{name}", answers.file), Route("/live", answers.live),
+        Route("/view", answers.view), Route("/metrics", answers.metrics),
         Route("/runs", answers.runs), Route("/runs/{name}", answers.run),
     ]  # fmt: skip
     return Guard(Starlette(routes=routes), config.token, is_loopback=config.is_loopback)
@@ -38,8 +43,9 @@ def make_app(feed: Feed, runs_dir: Path, config: DashboardConfig) -> ASGIApp:
 class _Answers:
     """Those that are no `async def` run in a thread: they read disks."""
 
-    def __init__(self, feed: Feed, runs_dir: Path, files: Files) -> None:
+    def __init__(self, feed: Feed, views: Views, runs_dir: Path, files: Files) -> None:
         self._feed = feed
+        self._views = views
         self._runs_dir = runs_dir
         self._files = files
 
@@ -57,8 +63,24 @@ class _Answers:
 
     async def live(self, request: Request) -> Response:
         if self._feed.is_full:
-            return PlainTextResponse("too many pages are open: close some\n", 503)
-        return StreamingResponse(self._events(request.query_params.get("run")), media_type="text/event-stream")
+            return PlainTextResponse(FULL, 503)
+        return _stream(request, self._events(request.query_params.get("run")))
+
+    async def view(self, request: Request) -> Response:
+        if self._views.is_full:
+            return PlainTextResponse(FULL, 503)
+        try:
+            subject = Subject.of(request.query_params)
+        except UsageError as error:
+            return PlainTextResponse(f"{printable(str(error))}\n", 400)
+        return _stream(request, self._views.events(subject))
+
+    async def metrics(self, _request: Request) -> Response:
+        """Of all live runs; who reads them is a viewer for one picture."""
+        async with aclosing(self._feed.pictures()) as pictures:
+            async for picture in pictures:
+                return Response(exposition(*picture.statuses), media_type=CONTENT_TYPE)
+        return PlainTextResponse("this page is about to leave\n", 503)
 
     def runs(self, _request: Request) -> Response:
         return _json({"runs": past.listed(self._runs_dir), "folder": printable(str(self._runs_dir))})
@@ -71,7 +93,7 @@ class _Answers:
 
     async def _events(self, run: str | None) -> AsyncIterator[bytes]:
         """A frame for each picture, and the curves of its run whenever they are others."""
-        yield event("hello", {"digest": self._files.digest})
+        yield event("hello", {"digest": self._files.digest, "views": self._views.are_offered})
         drawn = None
         async for picture in self._feed.pictures():
             shown = picture.of(run)
@@ -82,6 +104,11 @@ class _Answers:
             if shown.drawn != drawn:
                 drawn = shown.drawn
                 yield shown.curves
+
+
+def _stream(request: Request, events: AsyncIterator[bytes]) -> Response:
+    """Events as they come; of a stream that has no end nobody gets the head alone."""
+    return Response(media_type=EVENTS) if request.method == "HEAD" else StreamingResponse(events, media_type=EVENTS)
 
 
 def _json(document: Mapping[str, Any], status: int = 200) -> Response:

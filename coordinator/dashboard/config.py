@@ -14,10 +14,11 @@ LEAST_TOKEN = 12  # characters: whoever can reach the port can guess
 
 @dataclass(frozen=True)
 class DashboardConfig:
-    """Its address, and a token."""
+    """Its address, a token, and how much it may do."""
 
     host: str = option("127.0.0.1", "listen here; on any other address than this computer's own a token is needed")
     port: int = option(8420, "port; 0: any that is free")
+    views: int = option(4, "live views at a time, each a process on this computer; 0: none")
     token: str | None = field(
         default=None, repr=False,
         metadata={"help": "only who knows it may look; $DREAMFLEET_DASHBOARD_TOKEN stands in no list of processes"},
@@ -26,6 +27,8 @@ class DashboardConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
             raise UsageError(f"--port must be from 0 to 65535, not {self.port}")
+        if self.views < 0:
+            raise UsageError(f"--views must be at least 0, not {self.views}")
         if self.token is not None and len(self.token) < LEAST_TOKEN:
             raise UsageError(f"--token must have at least {LEAST_TOKEN} characters: `openssl rand -hex 16` makes one")
         if self.token is None and not self.is_loopback:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 
 from dreamfleet.common.mishaps import Mishaps
 from dreamfleet.coordinator.dashboard.watching import Picture, Watcher
@@ -42,7 +42,7 @@ class Feed:
         """Whether anybody is asked anything."""
         return self._polling is not None
 
-    async def pictures(self) -> AsyncIterator[Picture]:
+    async def pictures(self) -> AsyncGenerator[Picture, None]:
         """The latest one, then each that is newer, until the feed is closed."""
         self._viewers += 1
         if self._polling is None:

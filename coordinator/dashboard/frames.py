@@ -27,6 +27,7 @@ class Look:
     population: Sequence[Population]  # the open generation's candidates, in parts
     heard: float  # seconds since 1970
     lost: float | None = None  # since then nobody answers
+    is_stored: bool = False  # its journal lies on this disk
 
 
 def frame(look: Look) -> dict[str, Any]:
@@ -38,6 +39,7 @@ def frame(look: Look) -> dict[str, Any]:
         "run": status.run,
         "uid": status.run_uid,
         "link": link,
+        "stored": look.is_stored,
         "state": {LOST: "coordinator lost", LIVE: status.state}.get(link, _over(status)),
         "sentence": _lost(status) if link == LOST else printable(sentence(status)),
         "lost": look.lost if link == LOST else None,

@@ -70,6 +70,8 @@ class Guard:
         if self._is_loopback and not is_own_host(headers.get("host", "")):
             # Else a page of somebody's own, whose name is made to lead here, could read along (DNS rebinding).
             return PlainTextResponse("ask for this page as http://127.0.0.1, with its port\n", 421)
+        if is_foreign(headers, scope["path"]):
+            return PlainTextResponse("another site's page asks for this: open it by its own address\n", 403)
         if self._token is None:
             return None
         given = QueryParams(scope["query_string"]).get("token")
@@ -98,6 +100,16 @@ class Guard:
 def is_own_host(host: str) -> bool:
     """Whether a Host header names this computer, as nobody else's page can."""
     return bool(_OURS.fullmatch(host))
+
+
+def is_foreign(headers: Mapping[str, str], path: str) -> bool:
+    """Whether a page of another site makes a browser ask: it may lead people here, and nothing else.
+
+    https://www.w3.org/TR/fetch-metadata/: what is no browser does not say where it asks from.
+    """
+    if headers.get("sec-fetch-site", "none") in ("same-origin", "none"):
+        return False
+    return path != "/" or headers.get("sec-fetch-mode") != "navigate"
 
 
 def equal(given: str, wanted: str) -> bool:

@@ -16,6 +16,11 @@ def written(document: Mapping[str, Any]) -> str:
         return _dumped(_tamed(document))
 
 
+def event(kind: str, document: Mapping[str, Any]) -> bytes:
+    """A server-sent event."""
+    return f"event: {kind}\ndata: {written(document)}\n\n".encode()
+
+
 def _dumped(document: Any) -> str:
     return json.dumps(document, allow_nan=False, separators=(",", ":"))
 

@@ -13,15 +13,18 @@ from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.coordinator.dashboard.app import make_app
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.dashboard.feed import Feed
+from dreamfleet.coordinator.dashboard.views import Views
 from dreamfleet.coordinator.dashboard.watching import Watcher
 
 LEAVE = 2  # seconds that open pages have to go
 
 
-def serve(config: DashboardConfig, watcher: Watcher, runs_dir: Path, ready: Callable[[str], None]) -> None:
+def serve(
+    config: DashboardConfig, watcher: Watcher, views: Views, runs_dir: Path, ready: Callable[[str], None]
+) -> None:
     """Serve until SIGINT or SIGTERM; `ready` is told the address once it can be opened."""
     feed = Feed(watcher)
-    app = make_app(feed, runs_dir, config)
+    app = make_app(feed, views, runs_dir, config)
     with _listening(config) as listening:
         server = _Server(
             uvicorn.Config(
@@ -29,6 +32,7 @@ def serve(config: DashboardConfig, watcher: Watcher, runs_dir: Path, ready: Call
                 ws="none", timeout_graceful_shutdown=LEAVE,
             ),
             feed,
+            views,
         )  # fmt: skip
         ready(config.address(listening.getsockname()[1]))
         server.run(sockets=[listening])
@@ -37,13 +41,14 @@ def serve(config: DashboardConfig, watcher: Watcher, runs_dir: Path, ready: Call
 class _Server(uvicorn.Server):
     """Lets go of open pages as it ends: their streams have no end of their own."""
 
-    def __init__(self, config: uvicorn.Config, feed: Feed) -> None:
+    def __init__(self, config: uvicorn.Config, feed: Feed, views: Views) -> None:
         super().__init__(config)
-        self._feed = feed
+        self._feed, self._views = feed, views
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """As uvicorn does it, once nobody waits for another picture."""
         self._feed.close()
+        await self._views.close()
         await super().shutdown(sockets)
 
 

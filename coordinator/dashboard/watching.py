@@ -6,7 +6,7 @@ import queue
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,7 +25,7 @@ from dreamfleet.coordinator.dashboard.curves import Course, curves, sampled
 from dreamfleet.coordinator.dashboard.frames import Look, frame
 from dreamfleet.coordinator.dashboard.lanes import Lanes
 from dreamfleet.coordinator.dashboard.past import quartiles_of
-from dreamfleet.coordinator.dashboard.plain import written
+from dreamfleet.coordinator.dashboard.plain import event
 
 ANSWER = 1.5  # seconds that an answer may take
 PATIENCE = 5.0  # seconds of slow answers after which a run counts as lost; where nobody is there it does at once
@@ -52,6 +52,7 @@ class Picture:
     runs: Mapping[str, Shown]
     chosen: str | None  # for whoever names no run
     absent: bytes  # for whom there is none: the event that says so
+    statuses: Sequence[Status] = ()  # of the live ones, with all workers that are known
 
     def of(self, run: str | None) -> Shown | None:
         """The run of that name, or the chosen one."""
@@ -154,7 +155,8 @@ class Watcher:
             "trouble": shortened(self._trouble, 1000),
             "only": self._only or "",
         }
-        return Picture(shown, chosen, event("frame", absent))
+        statuses = tuple(self._followed[name].whole for name in sorted(live))
+        return Picture(shown, chosen, event("frame", absent), statuses)
 
 
 @dataclass
@@ -193,6 +195,11 @@ class _Followed:
         """Whether its coordinator answers."""
         return self.lost is None and not self.status.over
 
+    @property
+    def whole(self) -> Status:
+        """The status with every worker."""
+        return replace(self.status, worker_list=tuple(self._workers))
+
     def is_of(self, farewell: Status) -> bool:
         """Whether that is its coordinator's, and not of an earlier life whose word came late."""
         return farewell.run_uid == self.uid and farewell.incarnation >= self.status.incarnation
@@ -222,8 +229,9 @@ class _Followed:
     def shown(self, live: list[str]) -> Shown:
         """As viewers get it."""
         look = Look(
-            self.status, self._workers, self._lanes.told(self._workers), self._population, self.heard, self.lost
-        )
+            self.status, self._workers, self._lanes.told(self._workers), self._population, self.heard, self.lost,
+            is_stored=self._quartiles is not None,
+        )  # fmt: skip
         self._draw()
         _, drawing, times = self._drawn
         return Shown(event("frame", {**frame(look), "live": live}), drawing, (self.uid, times))
@@ -291,8 +299,3 @@ def _rows(client: Client, part: str, kind: type[T], run: str, offset: int = 0) -
     """The rows of a paged part from `offset` on, as many as anybody wants to see."""
     rows = islice(client.pages(part, run, offset), MOST_ROWS - offset)
     return (from_plain(kind, known(kind, row)) for row in rows)
-
-
-def event(kind: str, document: Mapping[str, Any]) -> bytes:
-    """A server-sent event."""
-    return f"event: {kind}\ndata: {written(document)}\n\n".encode()

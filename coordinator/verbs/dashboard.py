@@ -24,9 +24,11 @@ def run(args: argparse.Namespace) -> int:
     """Serve it until Ctrl-C."""
     config = load(DashboardConfig, "dashboard", **args.sources)
     from dreamfleet.coordinator.dashboard.serving import serve
+    from dreamfleet.coordinator.dashboard.views import Views
     from dreamfleet.coordinator.dashboard.watching import Watcher
 
-    serve(config, Watcher(args.connect, args.run, args.runs_dir), args.runs_dir, _tell)
+    views = Views(args.connect, args.runs_dir, config.views)
+    serve(config, Watcher(args.connect, args.run, args.runs_dir), views, args.runs_dir, _tell)
     return 0
 
 

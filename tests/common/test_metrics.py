@@ -80,3 +80,13 @@ def test_every_metric_that_the_grafana_dashboard_asks_for_is_there():
     assert len(names) > 20
     assert names <= read(WHOLE).keys()
     assert len({panel["id"] for panel in dashboard["panels"]}) == len(dashboard["panels"])
+
+
+def test_several_runs_share_each_metrics_head():
+    text = exposition(WHOLE, dataclasses.replace(WHOLE, run="lucid", confirmed=None))
+    heads = re.findall(r"^# TYPE (\S+)", text, re.MULTILINE)
+    assert len(heads) == len(set(heads))
+    families = {each.name: each for each in text_string_to_metric_families(text)}
+    assert [each.labels["run"] for each in families["dreamfleet_generation"].samples] == ["night", "lucid"]
+    assert [each.labels["run"] for each in families["dreamfleet_confirmed_score"].samples] == ["night"]
+    assert exposition() == ""

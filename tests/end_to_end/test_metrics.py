@@ -1,5 +1,6 @@
 """`/metrics` of a live coordinator."""
 
+import re
 import urllib.error
 import urllib.request
 
@@ -8,6 +9,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from tests.support import tasks
 from tests.support.processes import free_port
+from tests.support.served import serving, snapshot
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -43,3 +45,19 @@ def test_a_coordinator_answers_prometheus_and_a_taken_port_is_one_line(processes
 def test_a_port_that_is_none_is_said_at_once(processes, wrong):
     code, _, err = processes.call("coordinator", "--run", "test", "--runs-dir", processes.runs, "--metrics-port", wrong)
     assert (code, "give a port such as 9108" in err) == (2, True), err
+
+
+def test_the_dashboard_answers_for_every_live_run_whoever_knows_the_token(processes):
+    with serving(processes.endpoint, snapshot(workers=80), snapshot(name="lucid")):
+        page = processes.start(
+            "dashboard", "--connect", processes.endpoint, "--port", 0, "--token", "correct horse battery"
+        )
+        address = re.search(r"http://\S+", page.wait_for("the dashboard is at")).group()
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            urllib.request.urlopen(f"{address}metrics", timeout=30)
+        asked = urllib.request.Request(f"{address}metrics", headers={"Authorization": "Bearer correct horse battery"})
+        with urllib.request.urlopen(asked, timeout=30) as answer:
+            text = answer.read().decode()
+    found = {each.name: each.samples for each in text_string_to_metric_families(text)}
+    assert [each.labels["run"] for each in found["dreamfleet_generation"]] == ["lucid", "night"]
+    assert sum(each.labels["run"] == "night" for each in found["dreamfleet_worker_slots"]) == 80, "not the head alone"

@@ -53,7 +53,7 @@ export const forget = () => {
 };
 
 const line = (x, y, name, ink, more = {}) => ({
-  type: "scatter", mode: "lines", x, y, name, line: { color: colour(ink), width: 2 }, hovertemplate: "%{y:.4~g}", ...more,
+  type: "scatter", mode: x.length === 1 ? "markers" : "lines", x, y, name, line: { color: colour(ink), width: 2 }, hovertemplate: "%{y:.4~g}", ...more,
 });
 
 const points = (of, name, ink, more = {}) => ({

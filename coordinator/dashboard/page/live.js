@@ -2,6 +2,7 @@
 
 import * as charts from "./charts.js";
 import { colour, facts, fill, make, open, say } from "./dom.js";
+import * as view from "./view.js";
 
 const TONES = {
   running: "good", evaluating: "busy", paused: "bad", "waiting for workers": "wait", "coordinator lost": "bad",
@@ -20,6 +21,7 @@ let lanes = null; // which rows are in sight
 export const show = () => {
   page = open("live");
   page.body.hidden = page.tiles.hidden = true;
+  view.show(page);
   curves = null;
   lanes?.disconnect();
   lanes = new IntersectionObserver((seen) => {
@@ -35,6 +37,7 @@ export const show = () => {
 
 export const drawCurves = (document) => {
   curves = document;
+  if (page) view.drawCurves(curves);
   if (!page || page.body.hidden) return;
   charts.fitness(page.fitness, curves);
   charts.search(page.search, curves);
@@ -73,10 +76,12 @@ export const fillFrame = (frame, wanted) => {
   facts(page.waste, frame.waste);
   say(page.fleet, frame.fleet);
   fillWorkers(frame);
+  view.fill(frame);
   if (first && curves) drawCurves(curves);
 };
 
 const fillAbsent = (frame, wanted) => {
+  view.fill(frame);
   page.body.hidden = page.tiles.hidden = true;
   page.troubles.hidden = !frame.trouble;
   fill(page.troubles, frame.trouble ? [frame.trouble] : [], () => make("li"), say);
@@ -237,6 +242,7 @@ export const redraw = () => {
 };
 
 export const leave = () => {
+  view.leave();
   page = null;
   lanes?.disconnect();
 };

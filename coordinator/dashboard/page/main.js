@@ -4,6 +4,7 @@ import * as charts from "./charts.js";
 import { say } from "./dom.js";
 import * as live from "./live.js";
 import * as runs from "./runs.js";
+import * as view from "./view.js";
 
 const SILENCE = 4000; // milliseconds without a word after which the dashboard itself is missed
 const silent = document.getElementById("silent");
@@ -47,7 +48,9 @@ const listen = () => {
   heard = Date.now();
   source = new EventSource(wanted ? `live?run=${encodeURIComponent(wanted)}` : "live");
   source.addEventListener("hello", (event) => {
-    if (JSON.parse(event.data).digest !== digest) location.reload(); // another version of the page is served now
+    const told = JSON.parse(event.data);
+    if (told.digest !== digest) location.reload(); // another version of the page is served now
+    view.offer(told.views);
   });
   source.addEventListener("frame", (event) => take({ frame: JSON.parse(event.data) }));
   source.addEventListener("curves", (event) => take({ curves: JSON.parse(event.data) }));
@@ -72,6 +75,7 @@ setInterval(() => {
 // Nobody is asked anything for a page that nobody sees.
 document.addEventListener("visibilitychange", () => {
   if (currentPage() !== "live") return;
+  view.settle();
   if (document.hidden) hush();
   else listen();
 });

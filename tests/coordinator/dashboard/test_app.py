@@ -13,12 +13,13 @@ from starlette.testclient import TestClient
 from dreamfleet.coordinator.dashboard.app import make_app
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.dashboard.feed import Feed
+from dreamfleet.coordinator.dashboard.views import Views
 from dreamfleet.coordinator.dashboard.watching import Watcher
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 HOME = "http://127.0.0.1:8420"
 TOKEN = "correct horse battery"
-PATHS = ("/", "/runs", "/runs/dream", "/live", "/files/0/main.js")
+PATHS = ("/", "/runs", "/runs/dream", "/live", "/view?run=night", "/metrics", "/files/0/main.js")
 
 
 @pytest.fixture
@@ -30,7 +31,7 @@ def runs(tmp_path):
 
 def client_of(runs, host="127.0.0.1", base=HOME, **config):
     feed = Feed(Watcher(("tcp/127.0.0.1:1",), None, runs))
-    app = make_app(feed, runs, DashboardConfig(host=host, **config))
+    app = make_app(feed, Views(("tcp/127.0.0.1:1",), runs, 1), runs, DashboardConfig(host=host, **config))
     return TestClient(app, base_url=base, follow_redirects=False)
 
 
@@ -47,7 +48,7 @@ def test_the_page_loads_what_it_names_and_a_browser_may_keep_that_for_ever(runs)
             assert "immutable" in answer.headers["cache-control"]
             assert answer.headers.get("content-encoding", "identity") == packing
     folder = next(each for each in found if each.endswith("main.js")).rpartition("/")[0]
-    for name in ("charts.js", "dom.js", "live.js", "runs.js"):
+    for name in ("charts.js", "dom.js", "live.js", "runs.js", "view.js"):
         assert client.get(f"/{folder}/{name}").status_code == 200
 
 
@@ -132,6 +133,30 @@ def test_it_is_only_looked_at(runs, method, path):
 def test_a_name_that_was_made_to_lead_here_is_refused(runs, host, path):
     answer = client_of(runs).get(path, headers={"host": host})
     assert (answer.status_code, "127.0.0.1" in answer.text) == (421, True)
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+@pytest.mark.parametrize("path", PATHS)
+def test_another_sites_page_may_lead_here_and_ask_for_nothing(runs, site, path):
+    client = client_of(runs)
+    for mode in ("cors", "no-cors", "navigate"):
+        answer = client.get(path, headers={"sec-fetch-site": site, "sec-fetch-mode": mode})
+        assert answer.status_code == (200 if (path, mode) == ("/", "navigate") else 403)
+
+
+@pytest.mark.parametrize("path", ["/live", "/view?run=night"])
+def test_of_a_stream_without_end_nobody_gets_the_head_alone(runs, path):
+    answer = client_of(runs).head(path)
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
+
+
+@pytest.mark.parametrize(
+    "asked", ["", "run=", "run=No", "run=a&worker=--out", "run=a&worker=a/../b", "run=a&worker=a/0a1b2c3d%0a",
+              "run=a&generation=-1", "run=a&generation=1;2", "run=a&generation=%D9%A1x", "run=--help"],
+)  # fmt: skip
+def test_what_cannot_be_watched_is_refused_in_words(runs, asked):
+    answer = client_of(runs).get(f"/view?{asked}")
+    assert (answer.status_code, answer.text.count("\n")) == (400, 1)
 
 
 @pytest.mark.parametrize("host", ["localhost:8420", "127.0.0.1", "[::1]:8420", "LOCALHOST"])

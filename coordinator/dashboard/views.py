@@ -1,0 +1,218 @@
+"""Live views for the page: a `dreamfleet live` for each thing that somebody looks at, shared by all who look at it.
+
+The page's own process has no simulator and no world model. A view's process begins with the first who looks and ends
+soon after the last, so that workers publish frames only while somebody sees them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import subprocess
+from base64 import b64encode
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from dreamfleet.common import keys
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.parts import read_parts
+from dreamfleet.common.printable import shortened
+from dreamfleet.common.processes import Child, leash
+from dreamfleet.coordinator.dashboard.plain import event
+
+RATE = 10  # pictures a second
+LINGER = 5.0  # seconds that a view goes on after the last who looked: perhaps the page is only loaded anew
+LOOK = 0.5  # seconds between looks at whether anybody is there
+STALLED = 15.0  # seconds after which who takes nothing looks no more
+PATIENCE = 3.0  # seconds that a process whose stream has ended has to end
+MOST_LOOKERS = 200
+LONGEST = 500  # characters of what a process said as it ended
+POLITE = ("nice", "-n", "10")  # whoever scores on this host goes first
+WORKER, BEST, GENERATION = "worker", "best", "generation"
+_NUMBER = re.compile(r"\d{1,9}")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is looked at: a worker by `name/life`, the best mean, an evaluated generation's mean, or who is busiest."""
+
+    run: str
+    kind: str = ""
+    name: str = ""
+
+    @classmethod
+    def of(cls, asked: Mapping[str, str]) -> Subject:
+        """As an address asks for it; `UsageError` for what nothing can be named."""
+        run, worker, generation = keys.check_run_name(asked.get("run", "")), asked.get(WORKER), asked.get(GENERATION)
+        if worker is not None:
+            if not keys.is_worker(worker):
+                raise UsageError("worker must be name/life, as the page shows it")
+            return cls(run, WORKER, worker)
+        if generation is not None:
+            if not _NUMBER.fullmatch(generation):
+                raise UsageError("generation must be a number")
+            return cls(run, GENERATION, generation)
+        return cls(run, BEST if BEST in asked else "")
+
+    def words(self, connect: Sequence[str], runs_dir: Path) -> list[str]:
+        """The flags that say so."""
+        if self.kind == GENERATION:
+            return [f"--controller={self.run}", f"--generation={self.name}", f"--runs-dir={runs_dir}"]
+        whom = {WORKER: [f"--worker={self.name}"], BEST: ["--best"]}.get(self.kind, [])
+        return [f"--run={self.run}", *(word for each in connect for word in ("--connect", each)), *whom]
+
+
+class Views:
+    """All that is looked at now; used by one event loop."""
+
+    def __init__(self, connect: Sequence[str], runs_dir: Path, most: int) -> None:
+        """`most` processes at a time; 0: there are none to look at."""
+        self._connect, self._runs_dir, self._most = connect, runs_dir, most
+        self._views: dict[Subject, _View] = {}
+        self._lives: set[asyncio.Task[None]] = set()
+        self._closed = False
+
+    @property
+    def are_offered(self) -> bool:
+        """Whether there is anything to look at."""
+        return self._most > 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no room for another who looks."""
+        return sum(each.lookers for each in self._views.values()) >= MOST_LOOKERS
+
+    async def events(self, subject: Subject) -> AsyncIterator[bytes]:
+        """The newest picture, each time that there is one, and what is to be said instead; until it is over."""
+        view = self._views.get(subject)
+        if view is None or view.is_leaving:
+            if self._closed or not self._has_room():
+                yield told("ended", f"{self._most} live views are open, and no more are allowed here: leave another")
+                return
+            view = self._views[subject] = _View(subject.words(self._connect, self._runs_dir))
+            self._lives.add(view.life)
+            view.life.add_done_callback(self._lives.discard)
+        async for each in view.events():
+            yield each
+
+    def _has_room(self) -> bool:
+        """Whether there may be one more; a view that nobody looks at makes room."""
+        self._views = {subject: each for subject, each in self._views.items() if not each.is_leaving}
+        if len(self._views) < self._most:
+            return True
+        idle = next((each for each in self._views.values() if not each.lookers), None)
+        if idle is not None:
+            idle.life.cancel()
+        return idle is not None
+
+    async def close(self) -> None:
+        """Let everybody go, and end every process."""
+        self._closed = True
+        for each in self._lives:
+            each.cancel()
+        await asyncio.gather(*self._lives, return_exceptions=True)
+
+
+class _View:
+    """One process, and all who look at its pictures. Who is slow misses some, and holds back nobody."""
+
+    def __init__(self, words: Sequence[str]) -> None:
+        self.lookers = 0
+        self.is_leaving = False  # its process is to end
+        self._over = False  # nothing comes after the latest
+        self._latest = told("starting", "Starting: the first picture takes some seconds.")
+        self._pictures = 0
+        self._taking: dict[object, float] = {}  # since when each of those to whom something is being sent takes it
+        self._changed = asyncio.Event()  # set, and replaced, as something becomes the latest
+        self._ended = asyncio.Event()  # its process closed the stream
+        self._loop = asyncio.get_running_loop()
+        # It hears of the death of the thread that started it, so this is the loop's own.
+        self._child = Child("live", *words, "--fps", RATE, "--out", "-", inside=(*POLITE, *leash()), read=self._read)
+        self.life = asyncio.create_task(self._live())
+
+    async def events(self) -> AsyncIterator[bytes]:
+        """The latest, then each that is newer."""
+        self.lookers += 1
+        seen, looker = None, object()
+        try:
+            while True:
+                changed = self._changed
+                if self._latest is not seen:
+                    seen = self._latest
+                    self._taking[looker] = self._loop.time()
+                    yield seen
+                    del self._taking[looker]
+                elif self._over:
+                    return
+                else:
+                    await changed.wait()
+        finally:
+            self._taking.pop(looker, None)
+            self.lookers -= 1
+
+    @property
+    def _is_seen(self) -> bool:
+        late = self._loop.time() - STALLED
+        return self.lookers > sum(since < late for since in self._taking.values())
+
+    async def _live(self) -> None:
+        """Until the process ends, or nobody looks any more."""
+        clock = self._loop.time
+        left = clock() + LINGER
+        try:
+            while not self._ended.is_set() and clock() < left:
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._ended.wait(), LOOK)
+                if self._is_seen:
+                    left = clock() + LINGER
+                if not self._pictures and self._child.lines:
+                    self._tell(told("waiting", self._child.lines[-1]))
+        finally:
+            self.is_leaving = True
+            await asyncio.shield(asyncio.create_task(asyncio.to_thread(self._finish)))
+            self._over = True
+            self._tell(told("ended", _why(self._child)))
+
+    def _finish(self) -> None:
+        """In a thread: a process that has ended its stream ends by itself, any other holds nothing and is killed."""
+        if self._ended.is_set():
+            with suppress(subprocess.TimeoutExpired):
+                self._child.popen.wait(PATIENCE)
+        self._child.end(patience=0)
+
+    def _read(self, stream: IO[bytes]) -> None:
+        """In a thread: what was drawn twice is sent once."""
+        before = b""
+        with suppress(RuntimeError), stream:  # the loop may be closed
+            for picture, facts in read_parts(stream):
+                if picture != before:
+                    before = picture
+                    self._loop.call_soon_threadsafe(self._show, _picture(picture, facts))
+            self._loop.call_soon_threadsafe(self._ended.set)
+
+    def _show(self, picture: bytes) -> None:
+        self._pictures += 1
+        self._tell(picture)
+
+    def _tell(self, latest: bytes) -> None:
+        self._latest = latest
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+
+def told(state: str, text: str) -> bytes:
+    """What stands in a picture's place: `starting`, `waiting`, or `ended`."""
+    return event("told", {"state": state, "text": shortened(text.strip(), LONGEST)})
+
+
+def _picture(picture: bytes, facts: Mapping[str, Any]) -> bytes:
+    shown = {name: shortened(value, LONGEST) if isinstance(value, str) else value for name, value in facts.items()}
+    return event("picture", {"facts": shown, "jpeg": b64encode(picture).decode()})
+
+
+def _why(child: Child) -> str:
+    code = child.popen.returncode
+    return f"The process that draws it was ended by signal {-code}." if code < 0 else child.last_words()

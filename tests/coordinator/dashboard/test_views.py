@@ -1,0 +1,28 @@
+"""Live views without a browser: what is said where nothing can be watched."""
+
+import asyncio
+import json
+
+from dreamfleet.coordinator.dashboard.views import Subject, Views
+
+
+def ending(views, subject):
+    """What is said last to whoever watches what cannot be watched."""
+
+    async def watch():
+        said = [each async for each in views.events(subject)]
+        await views.close()
+        return json.loads(said[-1].split(b"data: ")[1])
+
+    return asyncio.run(watch())
+
+
+def test_what_its_process_says_as_it_ends_is_told(tmp_path):
+    views = Views(("tcp/127.0.0.1:1",), tmp_path, 1)
+    told = ending(views, Subject("night", "generation", "3"))
+    assert (told["state"], "no run 'night'" in told["text"]) == ("ended", True), told
+
+
+def test_where_no_views_are_allowed_none_begins(tmp_path):
+    told = ending(Views(("tcp/127.0.0.1:1",), tmp_path, 0), Subject("night"))
+    assert "no more are allowed" in told["text"]

@@ -1,0 +1,127 @@
+"""The page's live view in a real browser: a process for what is watched, while somebody watches."""
+
+import os
+import re
+import signal
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.support import tasks
+from tests.support.browser import PATIENCE, chromium, tab
+
+pytestmark = pytest.mark.timeout(240)
+PICTURE = "[data-part=view-picture]:not([hidden])"
+WHOM = "[data-part=view-whom]"
+HIDE = "hidden => { Object.defineProperty(document, 'hidden', {value: hidden, configurable: true}); " \
+       "document.dispatchEvent(new Event('visibilitychange')) }"  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as started:
+        yield started
+
+
+@pytest.fixture
+def run(processes, random_bundle):
+    """A run whose episodes are pictures, with a worker; its coordinator."""
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--population", 3, "--episodes", 1, "--evaluate-every", 1,
+        "--evaluation-episodes", 1, "--task", tasks.PAINTED, "--generations", 1000,
+    )  # fmt: skip
+    coordinator.worker = processes.worker("--task", tasks.PAINTED, "--name", "alpha")
+    return coordinator
+
+
+@contextmanager
+def dashboard(processes, *flags):
+    started = processes.start(
+        "dashboard", "--connect", processes.endpoint, "--runs-dir", processes.runs, "--port", 0, *flags
+    )
+    started.address = re.search(r"http://\S+", started.wait_for("the dashboard is at")).group()
+    yield started
+    started.end()
+
+
+def children(process):
+    """The processes that it has started."""
+    told = Path(f"/proc/{process.popen.pid}/task/{process.popen.pid}/children").read_text()
+    return [int(each) for each in told.split()]
+
+
+def say(page, text, part="view-told"):
+    page.wait_for_function(
+        "([part, text]) => document.querySelector(`[data-part=${part}]`)?.textContent.includes(text)", arg=[part, text],
+        timeout=PATIENCE,
+    )  # fmt: skip
+
+
+def choose(page, kind):
+    """The first of the workers, or of the generations, once there is one."""
+    option = page.wait_for_selector(f"{WHOM} option[value^={kind}]", state="attached")
+    page.select_option(WHOM, option.get_attribute("value"))
+
+
+def facts(page):
+    names, values = (page.locator(f"[data-part=view-facts] {each}").all_text_contents() for each in ("dt", "dd"))
+    return dict(zip(names, values, strict=False))
+
+
+def test_pictures_come_with_their_facts_while_somebody_sees_them(browser, processes, run):
+    with dashboard(processes) as started, tab(browser) as page, tab(browser) as other:
+        page.goto(started.address)
+        page.locator("[data-part=view]").scroll_into_view_if_needed()
+        page.wait_for_selector(PICTURE)
+        assert page.get_attribute(PICTURE, "src").startswith("data:image/jpeg;base64,/9j/")
+        assert "the busiest worker" in page.get_attribute(PICTURE, "alt")
+        assert facts(page)["worker"].startswith("alpha/")
+        assert {"generation", "seed", "step", "score so far"} <= facts(page).keys()
+        before = page.get_attribute(PICTURE, "src")
+        page.wait_for_function("src => document.querySelector('[data-part=view-picture]').src !== src", arg=before)
+        other.goto(started.address)
+        other.wait_for_selector(PICTURE)
+        (only,) = children(started)
+        os.kill(only, signal.SIGKILL)
+        for each in (page, other):
+            say(each, "was ended by signal 9")
+            each.click("[data-part=view-again]")
+            each.wait_for_selector("[data-part=view-again][hidden]", state="attached")
+            each.wait_for_selector(PICTURE)
+        other.goto("about:blank")
+        (only,) = children(started)
+        page.evaluate(HIDE, True)
+        while children(started):
+            page.wait_for_timeout(50)
+        page.evaluate(HIDE, False)
+        page.wait_for_function("src => document.querySelector('[data-part=view-picture]').src !== src",
+                               arg=page.get_attribute(PICTURE, "src"))  # fmt: skip
+        page.focus("[data-part=view-pause]")
+        page.keyboard.press("Enter")
+        assert page.inner_text("[data-part=view-pause]") == "Watch"
+
+
+def test_a_worker_a_mean_and_an_earlier_generations_are_chosen_and_what_is_gone_is_said(browser, processes, run):
+    with dashboard(processes, "--views", 1) as started, \
+            tab(browser, viewport={"width": 390, "height": 844}, reduced_motion="reduce") as page:  # fmt: skip
+        page.goto(started.address)
+        say(page, "Paused")
+        assert not children(started)
+        choose(page, "worker")
+        page.locator("[data-part=view-pause]").click()
+        page.wait_for_selector(PICTURE)
+        assert page.evaluate("document.documentElement.scrollWidth") == 390
+        with tab(browser) as other:
+            other.goto(started.address)
+            other.locator("[data-part=view]").scroll_into_view_if_needed()
+            say(other, "1 live views are open, and no more")
+        page.wait_for_selector(f"{WHOM} option[value^=generation]", state="attached")
+        run.worker.popen.kill()
+        say(page, "has left run test")
+        choose(page, "generation")
+        say(page, "draws no pictures")
+        run.popen.kill()
+        say(page, "lost", "state")
+        page.select_option(WHOM, "best=")
+        say(page, "nobody answers")
