@@ -122,10 +122,16 @@ class Client:
 
         `worker` is a worker, or the host's name in its name; `job` a candidate as generation/index; else all.
         """
-        document = self.document(run, "story", f"worker={worker};job={job}")
+        try:
+            document = self.document(run, "story", f"worker={worker};job={job}")
+        except ConnectionFailedError:
+            document = self.document(run)  # one from before this part answers for its status alone
         rows = document.get("story")
         if not isinstance(rows, list):
-            raise MalformedError("the run's coordinator tells no story: install a newer dreamfleet there")
+            raise MalformedError(
+                f"the coordinator of run {document.get('run')} tells no story: its dreamfleet is older than this verb; "
+                "install a newer one there"
+            )
         return [from_plain(Event, known(Event, row)) for row in rows], int(document.get("total", len(rows)))
 
     def evaluations(self, run: str) -> list[StoredEvaluation]:

@@ -22,6 +22,8 @@ ROLES = {
     "worker": ("everything", "worker"),
     "views": ("everything", "worker", "views"),
     "train": ("everything", "worker", "train"),
+    "dashboard": ("everything", "dashboard"),
+    "export": ("everything", "export"),
 }
 # distribution -> (module, extra); the empty extra is what every role needs
 PACKAGES = {
@@ -38,6 +40,11 @@ PACKAGES = {
     "torch": ("torch", "train"),
     "onnx": ("onnx", "train"),
     "safetensors": ("safetensors", "train"),
+    "plotly": ("plotly", "dashboard"),
+    "starlette": ("starlette", "dashboard"),
+    "uvicorn": ("uvicorn", "dashboard"),
+    "pyarrow": ("pyarrow", "export"),
+    "tensorboardX": ("tensorboardX", "export"),
 }
 LEAST_FREE_BYTES = 200_000_000
 

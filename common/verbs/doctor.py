@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "check this installation: versions, fingerprint, what each role lacks and the remedy"
 EXTRAS = ()
-ALL_ROLES = ("coordinator", "worker", "views", "train")
+ALL_ROLES = ("coordinator", "worker", "views", "train", "dashboard", "export")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

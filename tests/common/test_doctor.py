@@ -47,7 +47,10 @@ def test_it_says_of_each_role_whether_it_can_be_played_and_the_whole_remedy(bare
     assert "pip install 'dreamfleet[worker]'" in out
 
 
-@pytest.mark.parametrize(("role", "code"), [("coordinator", 0), ("worker", 1), ("views", 1), ("train", 1)])
+@pytest.mark.parametrize(
+    ("role", "code"),
+    [("coordinator", 0), ("worker", 1), ("views", 1), ("train", 1), ("dashboard", 1), ("export", 1)],
+)
 def test_its_exit_code_is_of_the_role_that_is_asked_about(bare, tmp_path, role, code):
     left, out = doctor(bare, tmp_path, "--role", role, "--json")
     report = json.loads(out)

@@ -1,5 +1,6 @@
 """The demonstration, seconds long."""
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -60,3 +61,17 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         assert (processes.runs / made).stat().st_size > 1000
     assert "evolving in the dream" in out
     assert "the dashboard is at http://127.0.0.1:" in out
+
+
+def test_without_the_page_none_is_begun(processes, random_bundle):
+    demo = processes.start(
+        "demo", "--run", "demo", "--runs-dir", processes.runs, "--port", processes.port, "--bundle", random_bundle.path,
+        "--workers", 1, "--no-page",
+    )  # fmt: skip
+    while not ((status := processes.status()) and status["workers"]["present"]):  # the page would have come before
+        assert demo.popen.poll() is None
+    started = Path(f"/proc/{demo.popen.pid}/task/{demo.popen.pid}/children").read_text().split()
+    words = [Path(f"/proc/{each}/cmdline").read_bytes().split(b"\0") for each in started]
+    demo.popen.send_signal(signal.SIGINT)
+    assert demo.finish()[0] == 130
+    assert not any(b"dashboard" in each for each in words)

@@ -5,7 +5,11 @@ import shlex
 
 import pytest
 
+from dreamfleet.common import keys
+from dreamfleet.common.session import Network, open_session
+from dreamfleet.coordinator.answers import answer
 from tests.support import tasks
+from tests.support.served import snapshot
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -48,3 +52,15 @@ def test_the_story_of_a_killed_workers_jobs_is_told_while_the_run_lives(processe
     assert {each["job"].split("/")[1] for each in story("--job", "0/3")} == {"3"}
     code, _, err = processes.call("story", "test", "--connect", processes.endpoint, "--job", "three")
     assert (code, "write generation/index" in err) == (2, True)
+
+
+def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(processes):
+    status = answer(snapshot(), "", {})
+    with open_session(Network(listen=(processes.endpoint,))) as session:
+        key = keys.status("night")
+        session.declare_queryable(key, lambda query: query.reply(key, status))
+        for run in ((), ("night",)):
+            code, _, err = processes.call("story", *run, "--connect", processes.endpoint)
+            assert (code, "run night tells no story: its dreamfleet is older" in err) == (1, True), err
+    code, _, err = processes.call("story", "night", "--connect", processes.endpoint)
+    assert (code, "nobody answers" in err) == (1, True), err
