@@ -34,7 +34,6 @@ class SiteConfig:
 
     connect: tuple[str, ...] = option((), f"the run's router, or several to try (default {DEFAULT_ENDPOINT})")
     listen: tuple[str, ...] = option((), f"listen here (default {DEFAULT_ENDPOINT}, unless --connect is given)")
-    join: Path | None = option(None, "join file: where to connect, and by which credentials")  # noqa: RUF009
     runs_dir: Path = option(Path("runs"), "where runs live")  # noqa: RUF009 - a field, and paths do not change
     log_level: Literal["debug", "info", "warning", "error"] = option("info", "the least that is logged on stderr")
     log_format: Literal["text", "json", "auto"] = option("text", "as lines, as JSON, or auto: JSON but in a terminal")

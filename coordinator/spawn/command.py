@@ -6,12 +6,9 @@ import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 from dreamfleet.common.config import add_flags
-from dreamfleet.common.errors import UsageError
 from dreamfleet.common.eta import duration
-from dreamfleet.common.files import read_regular
 from dreamfleet.common.listing import add_json, print_rows
 from dreamfleet.common.printable import one_line, printable
 from dreamfleet.common.site import offer
@@ -19,12 +16,10 @@ from dreamfleet.coordinator.spawn.config import Host, SpawnConfig
 from dreamfleet.coordinator.spawn.many import bring_up, look
 from dreamfleet.coordinator.spawn.visit import FAILED, Reach, Row
 
-MOST_JOIN = 1 << 20  # bytes of a join file
-
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the flags of a verb that brings workers up."""
-    offer(parser, "connect", "join")
+    offer(parser, "connect")
     parser.add_argument("--follow", action="store_true", help="show the workers' logs until Ctrl-C; they go on")
     parser.add_argument("--check", action="store_true", help="look at each host alone, and change nothing there")
     add_flags(parser, SpawnConfig)
@@ -33,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, hosts: Sequence[Host]) -> int:
     """Bring a worker up on each host, or look at it; exit 1 if one failed."""
-    reach = _reach(args)
+    reach = Reach(args.connect)
     if args.check:
         rows = look(hosts, reach)
         show_rows(args, rows)
@@ -64,14 +59,3 @@ def _cells(row: Row) -> dict[str, object]:
 def _show(args: argparse.Namespace, host: str, line: str) -> None:
     text = json.dumps({"host": host, "line": line}) if args.json else f"{host} | {printable(line)}"
     print(text, flush=True)  # noqa: T201 - the answer
-
-
-def _reach(args: argparse.Namespace) -> Reach:
-    """Endpoints that were given, a join file, or by default this host's own."""
-    join: Path | None = args.site.join
-    if join is None:
-        return Reach(args.connect)
-    try:
-        return Reach(args.site.connect, read_regular(join, MOST_JOIN))
-    except OSError as error:
-        raise UsageError(f"--join {join}: {error.strerror}: `dreamfleet access issue` writes one") from error

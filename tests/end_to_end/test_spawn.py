@@ -235,22 +235,6 @@ def test_a_worker_that_ends_at_once_says_why_and_a_number_in_anothers_hands_is_l
     assert list(a.home.iterdir()) == []
 
 
-def test_a_join_file_is_handed_over_by_no_command_line_for_its_reader_alone(processes, hosts, tmp_path):
-    a = hosts.add("a")
-    join = tmp_path / "secret.join"
-    join.write_text("not a join file: a secret")
-    watched = tmp_path / "python"
-    watched.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/words\nexec {sys.executable} "$@"\n')
-    watched.chmod(0o755)
-    told(processes, "spawn", "a", "--ssh", hosts.ssh, "--remote-python", watched, "--join", join, code=1)
-    there = a.root() / "workers" / "a" / "join"
-    assert there.read_bytes() == join.read_bytes()
-    assert there.stat().st_mode & 0o777 == 0o600
-    assert "secret" not in (tmp_path / "words").read_text()
-    told(processes, "down", "a", *words(hosts))
-    assert list(a.home.iterdir()) == []
-
-
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 def test_three_hosts_install_from_wheels_alone_one_of_them_after_it_was_killed_at_that(processes, hosts, tmp_path):
