@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.errors import BundleError, DatasetError, JournalError
+from dreamfleet.common.errors import BundleError, DatasetError, JournalError, MissingExtraError, UsageError
 from dreamfleet.common.files import is_file
 from dreamfleet.common.runs import RunFolder, open_run
 from dreamfleet.common.stages import begun_stages, in_turn
 from dreamfleet.common.store import find_bundle, shipped_names
 from dreamfleet.worker.dream.daydream import can_dream
 from dreamfleet.worker.inspection import curves, memory, vision
+from dreamfleet.worker.inspection.eyes import CHECKPOINT, Eyes, held_out_drive
+from dreamfleet.worker.inspection.own import own_pictures
 from dreamfleet.worker.inspection.page import Page
 from dreamfleet.worker.inspection.rollout import DriveConfig, EncodedRollout, drive
 from dreamfleet.worker.inspection.section import Section
 from dreamfleet.worker.inspection.tables import measured_rows
 from dreamfleet.worker.inspection.trainings import MODELS, Training, trainings
-from dreamfleet.worker.worldmodel.inference import Decoder
 
 PAGE = "index.html"
 DRIVEN = ("episodes", "frames", "held_out_episodes")  # of a bundle's provenance
@@ -64,14 +65,17 @@ def find_subject(name: str, runs_dir: Path) -> Iterator[Subject]:
 
 def inspect(
     subject: Subject, out: Path, config: DriveConfig, data: Sequence[Path] = (),
-    on_section: Callable[[int, str], None] = lambda _done, _name: None,
+    on_section: Callable[[int, str], None] = lambda _done, _name: None, pictures: Sequence[Path] = (),
 ) -> Path:  # fmt: skip
-    """Write a PNG a section and the page, with the trainings in the folders of `data`; returns the page's path."""
+    """Write a PNG a section and the page, with the trainings in the folders of `data`; returns the page's path.
+
+    `pictures` are files of one's own, which the bundle's VAE looks at, else that of the first folder.
+    """
     sections: list[Section] = []
     try:
         out.mkdir(parents=True, exist_ok=True)
         trained = trainings(data)
-        for section in sections_of(subject, config, trained):
+        for section in sections_of(subject, config, data, pictures, trained):
             sections.append(section)
             on_section(len(sections), section.name)
             if section.picture is not None:
@@ -102,21 +106,59 @@ def _page(subject: Subject, trained: Sequence[Training], sections: list[Section]
     return Page(f"{subject.run.name}, a run without a world model", f"run {subject.run.uid}", rows + told, sections)
 
 
-def sections_of(subject: Subject, config: DriveConfig, trained: Sequence[Training]) -> Iterator[Section]:
+def sections_of(
+    subject: Subject, config: DriveConfig, data: Sequence[Path], pictures: Sequence[Path], trained: Sequence[Training]
+) -> Iterator[Section]:
     """The sections of the page, each as it is drawn."""
+    if pictures:
+        yield own_pictures(_eyes(subject, data), pictures)
     if subject.bundle is not None:
         yield from _looks(subject.bundle, subject.controller, config)
+    else:
+        yield from _vaes(data, config)
     yield from _fitness(subject)
     yield from curves.losses(trained)
 
 
+def _eyes(subject: Subject, data: Sequence[Path]) -> Eyes:
+    if subject.bundle is not None:
+        return Eyes.of_bundle(subject.bundle)
+    if not data:
+        raise UsageError(
+            "--picture is looked at by a VAE, and this run has none: name a bundle, or a training's --data"
+        )
+    return Eyes.of_folder(data[0])
+
+
+def _vaes(data: Sequence[Path], config: DriveConfig) -> Iterator[Section]:
+    """What VAEs keep that no bundle need hold yet: of one folder everything, of several the pictures of each."""
+    folders = [each for each in data if (each / CHECKPOINT).exists() and any(each.glob("episodes/[0-9]*.npz"))]
+    for number, folder in enumerate(folders, 1):
+        try:
+            eyes = Eyes.of_folder(folder)
+        except MissingExtraError as error:
+            yield Section("reconstructions", "What it sees, and what it keeps", f"Not shown: {error}")
+            return
+        driven = held_out_drive(folder, eyes, config)
+        section = vision.reconstructions(driven, eyes)
+        if len(folders) > 1:
+            yield replace(section, name=f"{section.name}-{number}", title=f"{section.title}: {folder.resolve().name}")
+            continue
+        yield section
+        yield from _latents(driven, eyes)
+
+
 def _looks(bundle: Bundle, controller: Controller | None, config: DriveConfig) -> Iterator[Section]:
-    driven, decoder = drive(bundle, controller, config), Decoder(bundle)
-    yield vision.reconstructions(driven, decoder)
-    yield vision.traversals(driven, decoder)
+    driven, eyes = drive(bundle, controller, config), Eyes.of_bundle(bundle)
+    yield vision.reconstructions(driven, eyes)
+    yield from _latents(driven, eyes)
+    yield from _dreams(bundle, driven, eyes)
+
+
+def _latents(driven: EncodedRollout, eyes: Eyes) -> Iterator[Section]:
+    yield vision.traversals(driven, eyes)
     yield vision.moments(driven)
-    yield vision.samples(bundle.manifest.latent, decoder)
-    yield from _dreams(bundle, driven, decoder)
+    yield vision.samples(eyes)
 
 
 def _fitness(subject: Subject) -> Iterator[Section]:
@@ -124,12 +166,12 @@ def _fitness(subject: Subject) -> Iterator[Section]:
         yield evolved
 
 
-def _dreams(bundle: Bundle, driven: EncodedRollout, decoder: Decoder) -> Iterator[Section]:
+def _dreams(bundle: Bundle, driven: EncodedRollout, eyes: Eyes) -> Iterator[Section]:
     if not can_dream(bundle):
         text = "This bundle is from before dreams; build it again with `dreamfleet bundle` to see one."
         yield Section("dream", "A dream beside the drive", text)
         return
-    yield memory.dream_beside(bundle, driven, decoder)
+    yield memory.dream_beside(bundle, driven, eyes)
     if bundle.manifest.models.get("mdnrnn", {}).get("reward", "none") != "none":
         yield memory.rewards(bundle, driven)
     if looked := memory.attention(bundle, driven):

@@ -9,9 +9,10 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.worker.dream.noise import Draw, Noise
 from dreamfleet.worker.dream.world import DreamWorld, check_temperature
 from dreamfleet.worker.inspection.charts import FONT, heat, new_figure, picture_grid, png
+from dreamfleet.worker.inspection.eyes import Eyes
 from dreamfleet.worker.inspection.rollout import EncodedRollout
 from dreamfleet.worker.inspection.section import Section
-from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, RewardLabel
+from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
 
 Floats = NDArray[np.float32]
 STEPS = (0, 5, 10, 20, 50, 100)  # shown of a dream
@@ -43,13 +44,13 @@ def dream_latents(bundle: Bundle, drive: EncodedRollout, temperature: float, see
     return np.stack(latents)
 
 
-def dream_beside(bundle: Bundle, drive: EncodedRollout, decoder: Decoder) -> Section:
+def dream_beside(bundle: Bundle, drive: EncodedRollout, eyes: Eyes) -> Section:
     """Frames of the drive and of dreams under the same actions."""
     steps = [step for step in STEPS if step < len(drive)]
-    rows = [("drive", drive.picture[steps]), ("decoded", decoder.decode(drive.mu[steps]))]
+    rows = [("drive", drive.picture[steps]), ("decoded", eyes.decode(drive.mu[steps]))]
     for temperature in TEMPERATURES:
         dreamt = dream_latents(bundle, drive, temperature)[steps]
-        rows.append((f"dream,\ntemperature\n{temperature}", decoder.decode(dreamt)))
+        rows.append((f"dream,\ntemperature\n{temperature}", eyes.decode(dreamt)))
     return Section(
         "dream", "A dream beside the drive",
         "The drive's own actions in the model's dream. It begins at the drive's first latent and sees nothing of the "

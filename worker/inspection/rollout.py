@@ -1,4 +1,4 @@
-"""A fresh rollout in a bundle's own world, and what the encoder makes of it."""
+"""A drive, and what the encoder makes of it: a fresh one in a bundle's own world."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class EncodedRollout:
     logvar: Floats
     action: Floats
     reward: NDArray[np.float64]
-    driver: str
+    told: str  # what drive it is
 
     def __len__(self) -> int:
         return len(self.action)
@@ -85,4 +85,4 @@ def drive(bundle: Bundle, controller: Controller | None, config: DriveConfig) ->
     seen = np.stack([moment.seen for moment in moments])
     mu, logvar = Encoder(bundle).encode(seen)
     actions, rewards = np.stack([moment.action for moment in moments]), np.array([each.reward for each in moments])
-    return EncodedRollout(seen, mu, logvar, actions, rewards, driver)
+    return EncodedRollout(seen, mu, logvar, actions, rewards, f"a fresh drive by {driver}")

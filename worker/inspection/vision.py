@@ -5,30 +5,30 @@ from __future__ import annotations
 import numpy as np
 
 from dreamfleet.worker.inspection.charts import FONT, heat, new_figure, picture_grid, png
+from dreamfleet.worker.inspection.eyes import Eyes
 from dreamfleet.worker.inspection.rollout import EncodedRollout
 from dreamfleet.worker.inspection.section import Section
-from dreamfleet.worker.worldmodel.inference import Decoder
 
 SHOWN = 8  # pictures a row, latents a table
 TRAVERSED = np.linspace(-3, 3, 7)
 
 
-def reconstructions(drive: EncodedRollout, decoder: Decoder) -> Section:
+def reconstructions(drive: EncodedRollout, eyes: Eyes) -> Section:
     """Pictures of the drive, and what the decoder makes of their means."""
     steps = np.linspace(0, len(drive) - 1, SHOWN).astype(int)
-    decoded = decoder.decode(drive.mu)
+    decoded = eyes.decode(drive.mu)
     difference = decoded.astype(np.float64) - drive.picture
     error = (np.square(difference / 255)).sum(axis=(1, 2, 3)).mean()
     rows = [("seen", drive.picture[steps]), ("decoded", decoded[steps])]
     return Section(
         "reconstructions", "What it sees, and what it keeps",
-        f"Pictures of a fresh drive by {drive.driver}, and the decoder's picture of each one's mean latent. "
+        f"Pictures of {drive.told}, and the decoder's picture of each one's mean latent. "
         f"Summed squared error a picture over all {len(drive)} steps: {error:.1f}.",
         picture_grid(rows, [f"step {step}" for step in steps]),
     )  # fmt: skip
 
 
-def traversals(drive: EncodedRollout, decoder: Decoder) -> Section:
+def traversals(drive: EncodedRollout, eyes: Eyes) -> Section:
     """The most active latents, one moved at a time around a picture of the drive."""
     step = drive.richest
     base = drive.mu[step]
@@ -36,7 +36,7 @@ def traversals(drive: EncodedRollout, decoder: Decoder) -> Section:
     for latent in drive.most_active[:SHOWN]:
         moved = np.tile(base, (len(TRAVERSED), 1))
         moved[:, latent] = TRAVERSED
-        rows.append((f"z{latent}\n{drive.nats[latent]:.1f} nats", decoder.decode(moved)))
+        rows.append((f"z{latent}\n{drive.nats[latent]:.1f} nats", eyes.decode(moved)))
     return Section(
         "traversals", "What a latent means",
         "The latents that carry most on this drive, in nats. In each row one of them is set to -3 to 3, the others "
@@ -64,10 +64,10 @@ def moments(drive: EncodedRollout) -> Section:
     )  # fmt: skip
 
 
-def samples(latent: int, decoder: Decoder) -> Section:
+def samples(eyes: Eyes) -> Section:
     """Decodings of latents that no picture stands behind."""
-    normal = np.random.default_rng(0).standard_normal((SHOWN, latent)).astype(np.float32)
-    rows = [(f"N({mean}, 1)", decoder.decode(normal + np.float32(mean))) for mean in (0, -2, 2)]
+    normal = np.random.default_rng(0).standard_normal((SHOWN, eyes.latent)).astype(np.float32)
+    rows = [(f"N({mean}, 1)", eyes.decode(normal + np.float32(mean))) for mean in (0, -2, 2)]
     return Section(
         "samples", "Latents out of nothing",
         "The decoder's pictures of random latents: where the latents of real pictures lie, N(0, 1) looks like the "

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "look into a world model: what it sees, keeps and dreams, and how it learnt, as one page, or as figures"
 EXTRAS = ("worker", "views")
-SECTIONS = 10  # at most
+SECTIONS = 11  # at most, and one more a data folder
 DRIVES, LOSSES = 20, 30
 FEWEST_DRIVES, FEWEST_LOSSES = 2, 4
 
@@ -38,7 +38,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--data", type=Path, nargs="+", default=[], metavar="FOLDER",
         help="data folders, whose loss curves are drawn on one axis: the one that it was trained in, or trainings to "
-        "compare, with or without a bundle before them",
+        "compare, with or without a bundle before them; without one, their VAEs are looked into too",
+    )  # fmt: skip
+    parser.add_argument(
+        "--picture", type=Path, nargs="+", default=[], metavar="FILE",
+        help="pictures of your own, PNG or JPEG: what the bundle's VAE, else that of --data, sees and decodes of them",
     )  # fmt: skip
     first = VALIDATION.start
     parser.add_argument("--seed", type=int, default=first, help=f"the (first) track that is driven (default {first})")
@@ -60,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
     """Draw and print where the page lies, or measure and print figures."""
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     if args.probe or args.losses or args.likeness:
+        if args.picture:
+            raise UsageError("--picture is of the page: leave --probe, --losses and --likeness out")
         return _measure(args)
     if args.controller or args.driver:
         raise UsageError("--controller and --driver drive for figures: give --probe, --losses or --likeness too")
@@ -77,9 +83,10 @@ def _draw(args: argparse.Namespace) -> int:
 
     with ExitStack() as held:
         subject = _found(args, held)
-        bar = held.enter_context(progress_bar("inspect", SECTIONS, "sections"))
-        page = inspect(subject, args.out, DriveConfig(args.seed, args.steps), args.data, bar.move)
-        bar.move(SECTIONS)
+        sections = SECTIONS + len(args.data)
+        bar = held.enter_context(progress_bar("inspect", sections, "sections"))
+        page = inspect(subject, args.out, DriveConfig(args.seed, args.steps), args.data, bar.move, args.picture)
+        bar.move(sections)
     answer(args, str(page), page=page)
     return 0
 

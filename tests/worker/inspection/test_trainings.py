@@ -91,8 +91,12 @@ def test_trainings_stand_side_by_side_each_under_its_folders_name(trained, tmp_p
     assert "attentive, the MDN-RNN</th><td>20 updates</td>" in page
     assert sorted(each.name for each in (tmp_path / "out").iterdir()) == [
         "index.html",
+        "latents.png",
         "loss-mdnrnn.png",
         "loss-vae.png",
+        "reconstructions.png",
+        "samples.png",
+        "traversals.png",
     ]
 
 
