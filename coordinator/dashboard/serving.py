@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import socket
 from collections.abc import Callable
 from pathlib import Path
 
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.coordinator.dashboard.app import make_app
@@ -17,6 +19,8 @@ from dreamfleet.coordinator.dashboard.views import Views
 from dreamfleet.coordinator.dashboard.watching import Watcher
 
 LEAVE = 2  # seconds that open pages have to go
+HURRY = 8.0  # seconds within which a connection asks for something whole
+MOST_CONNECTIONS = 800  # that are answered: a process may hold some thousand descriptors
 
 
 def serve(
@@ -29,13 +33,31 @@ def serve(
         server = _Server(
             uvicorn.Config(
                 app, log_config=None, access_log=False, server_header=False, proxy_headers=False, lifespan="off",
-                ws="none", timeout_graceful_shutdown=LEAVE,
+                ws="none", http=_Connection, limit_concurrency=MOST_CONNECTIONS, timeout_graceful_shutdown=LEAVE,
             ),
             feed,
             views,
         )  # fmt: skip
         ready(config.address(listening.getsockname()[1]))
         server.run(sockets=[listening])
+
+
+class _Connection(H11Protocol):
+    """Is closed while nothing is asked or answered on it: whoever sends half a request would hold it for ever."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """As uvicorn does it, and watch it."""
+        super().connection_made(transport)
+        self._watch()
+
+    def _watch(self) -> None:
+        if not self.transport.is_closing():
+            self.loop.call_later(HURRY, self._drop_idle)
+
+    def _drop_idle(self) -> None:
+        if self.cycle is None or self.cycle.response_complete:
+            self.transport.close()
+        self._watch()
 
 
 class _Server(uvicorn.Server):

@@ -8,10 +8,12 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from statistics import median
 
 import pytest
 
@@ -69,11 +71,21 @@ def part(page, name):
     return page.locator(f"[data-part={name}]").first.text_content()  # also of rows out of sight
 
 
+def gone(page, worker, name):
+    """Kill a worker that the page shows; seconds until the page shows that it is gone."""
+    row = f".workers tr[data-state=present] td:has-text('{name}')"
+    page.wait_for_selector(row, state="attached")
+    began = time.monotonic()
+    worker.popen.kill()
+    page.wait_for_selector(row, state="detached")
+    return time.monotonic() - began
+
+
 def without_absence(page):
     page.said[:] = [each for each in page.said if not each.startswith(LEFT_OUT)]
 
 
-def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes, settings):
+def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes, settings, record_property):
     wait(page, "no coordinator")
     assert processes.endpoint in part(page, "sentence")
     assert "dreamfleet coordinator --run NAME" in part(page, "task")
@@ -87,8 +99,7 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     assert page.locator("[data-part=cells] .cell").count() == 4
     assert "of 1,000 generations" in part(page, "eta")
     assert "alpha" in part(page, "workers")
-    worker.popen.kill()
-    page.wait_for_selector(".workers tr[data-state=present]", state="detached")
+    record_property("seconds until a killed worker went", gone(page, worker, "alpha"))
     wait(page, "waiting for workers")
     coordinator.popen.kill()
     wait(page, "coordinator lost since")
@@ -110,6 +121,15 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     assert "4 generations" in part(page, "sentence")
     wait(page, "Generation 3:", "fitness-caption")
     without_absence(page)
+
+
+@pytest.mark.long
+def test_a_killed_worker_goes_from_the_page_within_two_seconds(page, processes, settings):
+    processes.coordinator(*settings, "--generations", 1000)
+    names = [f"host-{number}" for number in range(5)]
+    fleet = [processes.worker("--task", tasks.SLOW_TOY, "--name", name) for name in names]
+    seconds = [gone(page, worker, name) for name, worker in zip(names, fleet, strict=True)]
+    assert median(seconds) < 2, seconds
 
 
 def test_a_run_that_is_paused_says_why_and_one_that_is_left_how_to_go_on(page, processes, settings):
@@ -350,3 +370,40 @@ def test_it_leaves_at_once_although_pages_are_open(processes):
         assert started.popen.wait(10) is not None
         with pytest.raises(urllib.error.URLError):
             urllib.request.urlopen(started.address, timeout=5)
+
+
+def told(port, request, deadline=120):
+    """What the server says to these bytes until it closes the connection, or the head alone of what goes on."""
+    with socket.create_connection(("127.0.0.1", port), timeout=deadline) as connection:
+        connection.sendall(request)
+        said = b""
+        while b"\r\n\r\n" not in said and (more := connection.recv(65536)):
+            said += more
+    return said
+
+
+def test_clients_that_are_no_browsers_neither_stop_it_nor_see_more(processes):
+    with dashboard(processes, "--port", 0) as started, ExitStack() as stack:
+        port = int(started.address.split(":")[-1].strip("/"))
+        host = b"\r\nHost: 127.0.0.1\r\n"
+        half = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=120)) for _ in range(50)]
+        for each in half:
+            each.sendall(b"GET / HTTP/1.1\r\nHost: 127")
+        for request, code in (
+            (b"GET / HTTP/1.1" + host + b"X: " + b"x" * 200_000, b"400"),
+            (b"\x16\x03\x01\x02\x00\r\n\r\n", b"400"),
+            (b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n", b"421"),
+            (b"POST / HTTP/1.1" + host + b"Content-Length: 1000000000\r\n\r\n", b"405"),
+            (b"OPTIONS * HTTP/1.1" + host + b"\r\n", b"405"),
+            (b"HEAD /live HTTP/1.1" + host + b"\r\n", b"200"),
+            (b"GET /files/../../../../../../../../../../../etc/passwd HTTP/1.1" + host + b"\r\n", b"404"),
+            (b"GET /files/x/%2e%2e%2f%2e%2e%2fguard.py HTTP/1.1" + host + b"\r\n", b"404"),
+            (b"GET //etc/passwd HTTP/1.1" + host + b"\r\n", b"404"),
+            (b"GET /view?run=%00%0d%0aX:1 HTTP/1.1" + host + b"\r\n", b"400"),
+        ):
+            said = told(port, request)
+            assert said.split()[1:2] == [code], (request[:60], said[:200])
+            assert b"root:" not in said
+        assert all(each.recv(1) == b"" for each in half), "half a request is not waited for"
+        with urllib.request.urlopen(started.address, timeout=60) as answer:
+            assert answer.status == 200
