@@ -57,20 +57,20 @@ class Subject:
             return cls(run, GENERATION, generation)
         return cls(run, BEST if BEST in asked else "")
 
-    def words(self, connect: Sequence[str], runs_dir: Path) -> list[str]:
-        """The flags that say so."""
+    def words(self, place: Sequence[str], runs_dir: Path) -> list[str]:
+        """The flags that say so; `place` are those that lead to the fleet."""
         if self.kind == GENERATION:
             return [f"--controller={self.run}", f"--generation={self.name}", f"--runs-dir={runs_dir}"]
         whom = {WORKER: [f"--worker={self.name}"], BEST: ["--best"]}.get(self.kind, [])
-        return [f"--run={self.run}", *(word for each in connect for word in ("--connect", each)), *whom]
+        return [f"--run={self.run}", *place, *whom]
 
 
 class Views:
     """All that is looked at now; used by one event loop."""
 
-    def __init__(self, connect: Sequence[str], runs_dir: Path, most: int) -> None:
-        """`most` processes at a time; 0: there are none to look at."""
-        self._connect, self._runs_dir, self._most = connect, runs_dir, most
+    def __init__(self, place: Sequence[str], runs_dir: Path, most: int) -> None:
+        """`place` are the flags that lead to the fleet; `most` processes at a time, 0: there are none to look at."""
+        self._place, self._runs_dir, self._most = place, runs_dir, most
         self._views: dict[Subject, _View] = {}
         self._lives: set[asyncio.Task[None]] = set()
         self._closed = False
@@ -92,7 +92,7 @@ class Views:
             if self._closed or not self._has_room():
                 yield told("ended", f"{self._most} live views are open, and no more are allowed here: leave another")
                 return
-            view = self._views[subject] = _View(subject.words(self._connect, self._runs_dir))
+            view = self._views[subject] = _View(subject.words(self._place, self._runs_dir))
             self._lives.add(view.life)
             view.life.add_done_callback(self._lives.discard)
         async for each in view.events():

@@ -27,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.dashboard.views import Views
     from dreamfleet.coordinator.dashboard.watching import Watcher
 
-    views = Views(args.connect, args.runs_dir, config.views)
+    views = Views(("--connect", *args.connect), args.runs_dir, config.views)
     serve(config, Watcher(args.connect, args.run, args.runs_dir), views, args.runs_dir, _tell)
     return 0
 

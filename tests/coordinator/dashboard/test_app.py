@@ -31,7 +31,7 @@ def runs(tmp_path):
 
 def client_of(runs, host="127.0.0.1", base=HOME, **config):
     feed = Feed(Watcher(("tcp/127.0.0.1:1",), None, runs))
-    app = make_app(feed, Views(("tcp/127.0.0.1:1",), runs, 1), runs, DashboardConfig(host=host, **config))
+    app = make_app(feed, Views(("--connect", "tcp/127.0.0.1:1"), runs, 1), runs, DashboardConfig(host=host, **config))
     return TestClient(app, base_url=base, follow_redirects=False)
 
 

@@ -18,11 +18,22 @@ def ending(views, subject):
 
 
 def test_what_its_process_says_as_it_ends_is_told(tmp_path):
-    views = Views(("tcp/127.0.0.1:1",), tmp_path, 1)
+    views = Views(("--connect", "tcp/127.0.0.1:1"), tmp_path, 1)
     told = ending(views, Subject("night", "generation", "3"))
     assert (told["state"], "no run 'night'" in told["text"]) == ("ended", True), told
 
 
 def test_where_no_views_are_allowed_none_begins(tmp_path):
-    told = ending(Views(("tcp/127.0.0.1:1",), tmp_path, 0), Subject("night"))
+    told = ending(Views(("--connect", "tcp/127.0.0.1:1"), tmp_path, 0), Subject("night"))
     assert "no more are allowed" in told["text"]
+
+
+def test_what_is_watched_becomes_flags_that_nothing_can_be_added_to(tmp_path):
+    place = ("--connect", "tcp/a:1", "tcp/b:2")
+    for asked, flags in (
+        ({"run": "night"}, ["--run=night", *place]),
+        ({"run": "night", "best": ""}, ["--run=night", *place, "--best"]),
+        ({"run": "night", "worker": "a/0a1b2c3d"}, ["--run=night", *place, "--worker=a/0a1b2c3d"]),
+        ({"run": "night", "generation": "7"}, ["--controller=night", "--generation=7", f"--runs-dir={tmp_path}"]),
+    ):
+        assert Subject.of(asked).words(place, tmp_path) == flags
