@@ -92,7 +92,11 @@ class Views:
             if self._closed or not self._has_room():
                 yield told("ended", f"{self._most} live views are open, and no more are allowed here: leave another")
                 return
-            view = self._views[subject] = _View(subject.words(self._place, self._runs_dir))
+            try:
+                view = self._views[subject] = _View(subject.words(self._place, self._runs_dir))
+            except OSError as error:
+                yield told("ended", f"no process can be started here: {error}")
+                return
             self._lives.add(view.life)
             view.life.add_done_callback(self._lives.discard)
         async for each in view.events():
@@ -161,15 +165,16 @@ class _View:
     async def _live(self) -> None:
         """Until the process ends, or nobody looks any more."""
         clock = self._loop.time
-        left = clock() + LINGER
+        left, heard = clock() + LINGER, ""
         try:
             while not self._ended.is_set() and clock() < left:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(self._ended.wait(), LOOK)
                 if self._is_seen:
                     left = clock() + LINGER
-                if not self._pictures and self._child.lines:
-                    self._tell(told("waiting", self._child.lines[-1]))
+                if not self._pictures and self._child.lines and (said := self._child.lines[-1]) != heard:
+                    heard = said
+                    self._tell(told("waiting", said))
         finally:
             self.is_leaving = True
             await asyncio.shield(asyncio.create_task(asyncio.to_thread(self._finish)))

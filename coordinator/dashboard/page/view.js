@@ -8,6 +8,7 @@ const KINDS = { score: "a candidate", evaluate: "the mean, in reality", collect:
 let page = null; // the parts, once they stand
 let offered = false; // whether the dashboard has views at all
 let run = ""; // that is live
+let lost = false; // whether its coordinator was, when last heard of
 let whom = ""; // as the address of a view asks for it
 let paused = matchMedia("(prefers-reduced-motion: reduce)").matches;
 let inSight = null; // an observer, and below what it saw
@@ -54,10 +55,11 @@ export const fill = (frame) => {
   page.view.hidden = !there;
   page.body.classList.toggle("viewed", there);
   if (!there) run = "";
-  else if (run !== frame.run) {
+  else if (run !== frame.run || (over && lost && frame.link === "live")) {
     run = frame.run;
     restart();
   }
+  lost = frame.link === "lost";
   rates = new Map(frame.workers?.worker.map((name, index) => [name, frame.workers.rate[index]]));
   if (there) choices(frame);
   settle();
