@@ -14,6 +14,7 @@ class Looks:
 
     def __init__(self):
         self.count, self.rests = 0, 0
+        self.are_single = False  # whether each has to be let anew
         self.gate = threading.Event()
         self.gate.set()
 
@@ -22,6 +23,8 @@ class Looks:
         self.count += 1
         if self.count == 2:
             raise ValueError("a look that fails")
+        if self.are_single:
+            self.gate.clear()
         return Picture({}, None, str(self.count).encode())
 
     def rest(self):
@@ -38,13 +41,19 @@ def looks():
 
 
 def test_every_viewer_gets_the_same_pictures_from_one_look_each(looks):
-    async def viewer(feed, pictures):
-        source = feed.pictures()
-        return [await anext(source) for _ in range(pictures)]
+    looks.are_single = True
+
+    async def viewer(feed, pictures, everybody):
+        source, seen = feed.pictures(), []
+        for _ in range(pictures):
+            seen.append(await anext(source))
+            if await everybody.wait() == 0:  # all have it: let the next look begin
+                looks.gate.set()
+        return seen
 
     async def play():
-        feed = Feed(looks, refresh=0.01, linger=0.05)
-        found = await asyncio.gather(*(viewer(feed, 3) for _ in range(50)))
+        feed, everybody = Feed(looks, refresh=0.01, linger=0.05), asyncio.Barrier(50)
+        found = await asyncio.gather(*(viewer(feed, 3, everybody) for _ in range(50)))
         assert len({tuple(map(id, seen)) for seen in found}) == 1
         assert looks.count <= 6, "the second failed, and cost itself alone"
 
