@@ -6,7 +6,6 @@ The copy is a run like any other.
 
 from __future__ import annotations
 
-import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from dreamfleet.common.errors import JournalError, UsageError
-from dreamfleet.common.files import sync_folder
+from dreamfleet.common.files import sync
 from dreamfleet.common.runs import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS, RunFolder, open_run, run_lock
 
 
@@ -28,10 +27,7 @@ def back_up(source: RunFolder, target: Path) -> None:
     aside, former = (target.with_name(f".{target.name}.{word}") for word in ("part", "former"))
     with _translated(target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        if former.exists() and not target.exists():  # an earlier call ended between two names
-            former.rename(target)
-        for left in (aside, former):
-            shutil.rmtree(left, ignore_errors=True)
+        _clear(target, aside, former)  # an earlier call may have been killed
         try:
             aside.mkdir(mode=0o700)
             _fill(source, aside)
@@ -39,10 +35,17 @@ def back_up(source: RunFolder, target: Path) -> None:
                 if target.exists():
                     target.rename(former)
                 aside.rename(target)
-            sync_folder(target.parent)
+            sync(target.parent)
         finally:
-            for left in (aside, former):
-                shutil.rmtree(left, ignore_errors=True)
+            _clear(target, aside, former)
+
+
+def _clear(target: Path, aside: Path, former: Path) -> None:
+    """Leave one copy under its name: the new one if it has come to be, else the earlier one."""
+    if former.exists() and not target.exists():
+        former.rename(target)
+    for left in (aside, former):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _check_target(source: RunFolder, target: Path) -> None:
@@ -74,8 +77,7 @@ def _fill(source: RunFolder, folder: Path) -> None:
     for drive in drives:
         shutil.copy2(source.path / ROLLOUTS / drive.name, folder / ROLLOUTS / drive.name)
     for path in (*folder.rglob("*"), folder):
-        with suppress(FileNotFoundError):
-            _sync(path)
+        sync(path)
 
 
 def _copy_journal(source: RunFolder, path: Path) -> None:
@@ -108,11 +110,3 @@ def _translated(target: Path) -> Iterator[None]:
     except OSError as error:
         why = error.strerror or error
         raise JournalError(f"cannot back up into {target}: {why}; an earlier copy, if there is one, is kept") from error
-
-
-def _sync(path: Path) -> None:
-    number = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(number)
-    finally:
-        os.close(number)

@@ -24,7 +24,7 @@ from dreamfleet.common.bounds import LARGEST_FITNESS, LONGEST_EPISODE, finite, m
 from dreamfleet.common.classes import Classes, class_of, count
 from dreamfleet.common.effort import Effort
 from dreamfleet.common.errors import DreamfleetError, JournalError
-from dreamfleet.common.files import sync_folder, write_aside
+from dreamfleet.common.files import sync, write_aside
 from dreamfleet.common.messages import Job, Result
 from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, counted_query, efforts_query
 from dreamfleet.common.stages import begun_stages
@@ -97,7 +97,7 @@ class Journal:
                 connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", {**own, **(facts or {})}.items())
                 connection.commit()
             aside.replace(path)
-            sync_folder(folder)
+            sync(folder)
         except OSError as error:
             raise JournalError(f"cannot write in {folder}: {error.strerror}; choose another --runs-dir") from error
         return cls(path)
@@ -138,7 +138,7 @@ class Journal:
             with aside.open("rb") as file:
                 os.fsync(file.fileno())
             aside.replace(path)
-            sync_folder(path.parent)
+            sync(path.parent)
         finally:
             for left in (aside, *beside(aside)):
                 left.unlink(missing_ok=True)

@@ -69,22 +69,31 @@ class Contrast:
         own = dict(self.kinds)[trial.kind]
         return (*words("mdnrnn_flags", self.mdnrnn_flags), *words("kind", own), "--seed", str(trial.seed))
 
+    @property
+    def of_all(self) -> tuple[str, ...]:
+        """What all trials' `coordinator` have in common."""
+        return ("--preset", "dream", *words("run_flags", self.run_flags))
+
     def evolution(self, trial: Trial) -> tuple[str, ...]:
         """The flags of a trial's `coordinator` but for its place and its world model."""
-        return ("--preset", "dream", *words("run_flags", self.run_flags), "--seed", str(trial.seed))
+        return (*self.of_all, "--seed", str(trial.seed))
 
-    def begun_as(self, told: dict[str, Any]) -> None:
-        """`UsageError` if a folder that was begun by `told` would hold what cannot be compared with this.
+    def after(self, told: dict[str, Any]) -> dict[str, Any]:
+        """What a folder keeps that was begun by `told` and goes on by this: kinds and seeds are added, none is changed.
 
-        Seeds may be added, and kinds; what is there already keeps its flags.
+        `UsageError` if what is there already could not be compared with this.
         """
-        mine, kinds = asdict(self), dict(self.kinds)
-        differing = [name for name in ("mdnrnn_flags", "run_flags") if told.get(name) != mine[name]]
-        differing += [f"kind {name}" for name, flags in told.get("kinds", ()) if kinds.get(name, flags) != flags]
+        mine, kinds, known = asdict(self), dict(self.kinds), dict(told.get("kinds", ()))
+        differing: list[str] = [
+            name for name in ("mdnrnn_flags", "run_flags") if name in told and told[name] != mine[name]
+        ]
+        differing += [f"kind {name}" for name, flags in known.items() if kinds.get(name, flags) != flags]
         if differing:
             raise UsageError(
                 f"it was begun with other {', '.join(differing)}: leave that out, or begin in another --out"
             )
+        seeds = tuple(dict.fromkeys((*told.get("seeds", ()), *self.seeds)))
+        return {**mine, "kinds": tuple((known | kinds).items()), "seeds": seeds}
 
 
 def _check(flag: str, text: str) -> None:

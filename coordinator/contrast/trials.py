@@ -42,13 +42,12 @@ class Trials:
         if not any((self._data / "encoded").iterdir()):
             raise DatasetError(f"{self._data} has no encoded drives: dreamfleet encode --data {self._data}")
         path = self._folder / SETTINGS
-        begun = _read(path)
-        if begun is not None:
-            if begun.get("data") != str(self._data.resolve()):
-                raise UsageError(f"{self._folder} was begun on {begun.get('data')}: begin in another --out")
-            self._contrast.begun_as(begun)
+        begun, data = _read(path), str(self._data.resolve())
+        if begun.get("data", data) != data:
+            raise UsageError(f"{self._folder} was begun on {begun['data']}: begin in another --out")
+        kept = self._contrast.after(begun)
         self._parameters = {trial: self._count(trial) for trial in self._contrast.trials}
-        _write(path, {**asdict(self._contrast), "data": str(self._data.resolve())})
+        _write(path, {**kept, "data": data})
 
     def do(self, trial: Trial, before: Callable[[str], None]) -> Outcome:
         """Do what is left of it; `before` hears each part as it begins."""
@@ -99,7 +98,7 @@ class Trials:
         if is_there(runs / trial.name / JOURNAL):
             return ("coordinator", "--resume", trial.name, *where)
         model = ("--run", trial.name, "--bundle", str(self._model(trial)))
-        return ("coordinator", *self._contrast.evolution(trial), *model, *where)
+        return ("coordinator", *crew.coordinator, *self._contrast.evolution(trial), *model, *where)
 
     def _ended(self, trial: Trial) -> bool:
         runs = self._folder / "runs"
@@ -121,11 +120,12 @@ class Trials:
         return Outcome(**{**asdict(of), **told, "confirmed": confirmed is not None})
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def _read(path: Path) -> dict[str, Any]:
+    """What the folder was begun by; nothing if it is new."""
     try:
         found = json.loads(read_text(path, MOST_BYTES))
     except FileNotFoundError:
-        return None
+        return {}
     except (OSError, ValueError, RecursionError) as error:
         raise DatasetError(f"{path} is damaged ({error}); put it back from a copy") from error
     if not isinstance(found, dict):

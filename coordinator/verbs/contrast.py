@@ -48,13 +48,16 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.stopping import heeding_signals
     from dreamfleet.coordinator.contrast.trials import LOCK, Trials
     from dreamfleet.coordinator.iteration.evolving import Crew
+    from dreamfleet.coordinator.iteration.rounds import run_of
 
     contrast = Contrast(kinds_of(args.kind), tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
+    run_of(contrast.of_all, args.sources, "contrast")  # what is wrong with them is said now
+    file = ("--config", str(args.config)) if args.config else ()
     for package in PACKAGES:
         if find_spec(package) is None:  # said now rather than after hours
             raise ModuleNotFoundError(name=package)
     with held(args.out / LOCK, "contrast"), heeding_signals() as stop:
-        trials = Trials(contrast, args.data, args.out, lambda: Crew.of((), args.local, (), ()), stop)
+        trials = Trials(contrast, args.data, args.out, lambda: Crew.of((), args.local, file, ()), stop)
         outcomes = _do(trials, contrast)
     _tell(args, outcomes)
     return 0

@@ -14,7 +14,7 @@ from dreamfleet.common.files import is_file
 from dreamfleet.common.listing import add_json, answer, print_rows
 from dreamfleet.common.site import offer
 from dreamfleet.common.variants import Variant
-from dreamfleet.coordinator.config import DEFAULT_BUNDLE, LimitsConfig, RunConfig
+from dreamfleet.coordinator.config import DEFAULT_BUNDLE, RunConfig
 from dreamfleet.coordinator.iteration.config import IterateConfig
 
 if TYPE_CHECKING:
@@ -27,9 +27,7 @@ if TYPE_CHECKING:
 SUMMARY = "make world models and evolve in their dreams in turn, each learning from what the last one's means drove"
 EXTRAS = ("train", "views")
 PACKAGES = ("gymnasium", "matplotlib", "onnx", "onnxruntime", "safetensors", "torch")
-OURS = {"run_name": "run", "resume": None, "init": None}  # of the rounds' runs, beside those of the next line
 NOT_COMMON = ("preset", "schedule", "bundle", "searched")  # to the rounds' runs, of all settings
-OURS |= dict.fromkeys(("bundle", "seed", "runs_dir", "listen", "connect", "config", "subspace"))
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -69,6 +67,7 @@ def _open(args: argparse.Namespace, layout: Layout, stop: Stop) -> Iteration:
     from dreamfleet.coordinator.iteration.ledger import Ledger
     from dreamfleet.coordinator.iteration.phases import find_init
     from dreamfleet.coordinator.iteration.plan import INIT, Phase
+    from dreamfleet.coordinator.iteration.rounds import run_of
 
     begun = Ledger.load(layout.ledger)
     config = load(IterateConfig, "iterate", base=begun.settings if begun else None, **args.sources)
@@ -77,8 +76,8 @@ def _open(args: argparse.Namespace, layout: Layout, stop: Stop) -> Iteration:
     # Until an iteration has what it goes on from, nothing was made, and all may change.
     new = begun is None or (not begun.entries and bool(config.init))
     more = _flags_before(args)
-    first, limits = _run_config(args, [*more, *config.flags_of_run(1)])
-    later, _ = _run_config(args, [*more, *config.flags_of_run(2)])  # what is wrong with them is said now
+    first, limits = run_of([*more, *config.flags_of_run(1)], args.sources, "iterate")
+    later, _ = run_of([*more, *config.flags_of_run(2)], args.sources, "iterate")  # what is wrong with them is said now
     settings = {**asdict(first), **asdict(limits), **dict.fromkeys(NOT_COMMON)}
     if new:
         for run in (first, later):
@@ -124,24 +123,6 @@ def _check_run(config: IterateConfig, run: RunConfig, layout: Layout) -> None:
         raise UsageError(
             "--go-on fits a controller to the next model, and one with feedback=last cannot be: leave one out"
         )
-
-
-def _run_config(args: argparse.Namespace, flags: list[str]) -> tuple[RunConfig, LimitsConfig]:
-    """What the rounds' runs are, and when they end, as their flags, the environment and the file say."""
-    from dreamfleet.common.cli import parser_of
-    from dreamfleet.coordinator.verbs import coordinator
-
-    told = parser_of("coordinator", coordinator).parse_all(flags)
-    if taken := [name for name, default in OURS.items() if getattr(told, name, default) != default]:
-        names = ", ".join(f"--{name.replace('_name', '').replace('_', '-')}" for name in taken)
-        raise UsageError(f"{names} in --run-flags: each round's run has its own, and --config is a flag of iterate")
-    sources = {**args.sources, "flags": told}
-    config, limits = coordinator.configured(
-        argparse.Namespace(sources=sources, given=frozenset(vars(told))), base={}
-    )  # fmt: skip
-    if limits == LimitsConfig():
-        raise UsageError("a round's run would never end: give --run-flags a limit, such as --generations 32")
-    return config, limits
 
 
 def _crew(args: argparse.Namespace, config: IterateConfig, more: tuple[str, ...], task: str) -> Crew:

@@ -2,11 +2,13 @@
 
 import shutil
 import sqlite3
+from pathlib import Path
 
 import pytest
 
 from dreamfleet.common.runs import BUNDLE, JOURNAL, ROLLOUTS, open_run
 from dreamfleet.common.store import find_bundle
+from dreamfleet.coordinator import backup
 from tests.end_to_end.test_same_bits import GENERATIONS, SETTINGS, outcome
 
 pytestmark = pytest.mark.timeout(300)
@@ -25,14 +27,14 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
 
     safe = tmp_path / "safe"
     served = processes.coordinator(*FLAGS)
-    worker = processes.worker("--run", "test")
     for generation in (0, 1):
+        worker = processes.worker("--run", "test")
         served.wait_for(f"generation {generation}: mean")
+        worker.end()  # the run goes no further while it is copied
         code, out, err = back_up(processes, safe)
         assert code == 0, err
         assert "--resume test" in out
     served.popen.kill()
-    worker.end()
     shutil.rmtree(processes.runs / "test")
     assert [path.name for path in safe.iterdir()] == ["test"], "the earlier copy is gone"
     with open_run(safe, "test") as copy:
@@ -88,6 +90,24 @@ def test_a_call_that_was_killed_between_two_names_is_made_good(processes, finish
     code, _, err = back_up(processes, safe)
     assert code == 0, err
     assert [path.name for path in safe.iterdir()] == ["test"]
+
+
+def test_a_call_that_is_interrupted_leaves_the_earlier_copy(processes, finished, tmp_path, monkeypatch):
+    safe = tmp_path / "safe"
+    assert back_up(processes, safe)[0] == 0
+    rename = Path.rename
+
+    def interrupted(self, target):
+        if self.name == ".test.part":
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with open_run(processes.runs, "test") as source, pytest.raises(KeyboardInterrupt):
+        backup.back_up(source, safe / "test")
+    assert [path.name for path in safe.iterdir()] == ["test"]
+    with open_run(safe, "test") as copy:
+        assert len(copy.history()) == 2
 
 
 def test_a_world_model_is_copied_too(processes, tmp_path):

@@ -328,7 +328,7 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(proces
     ("flags", "said"),
     [
         (("--run-flags", "--population 4"), "would never end"),
-        (("--run-flags", "--generations 1 --bundle tiny"), "--bundle in --run-flags: each round's run has its own"),
+        (("--run-flags", "--generations 1 --bundle tiny"), "--bundle in --run-flags: each run has its own"),
         (("--run-flags", "--generations 1 --sigma0 -1"), "--sigma0 must be a positive number"),
         (("--vae-flags", "--updates 0"), "--vae-flags: --updates must be at least 1"),
         (
@@ -341,7 +341,7 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(proces
         (("--views", 8), "--views are beside the features of --subspace"),
         (
             ("--run-flags", "--generations 1 --subspace few.npz"),
-            "--subspace in --run-flags: each round's run has its own",
+            "--subspace in --run-flags: each run has its own",
         ),
     ],
 )

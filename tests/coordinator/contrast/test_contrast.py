@@ -48,12 +48,15 @@ def test_what_is_no_contrast_is_refused(settings, why):
 
 
 def test_seeds_and_kinds_may_be_added_but_none_changed():
-    begun = asdict(Contrast())
-    Contrast(seeds=(1, 2, 3, 4), kinds=(*KINDS, ("wide", "--hidden 512"))).begun_as(begun)
+    wide = ("wide", "--hidden 512")
+    kept = Contrast(seeds=(4,), kinds=(KINDS[0], wide)).after(asdict(Contrast()))
+    assert kept["kinds"] == (*KINDS, wide), "one that is not asked for this time is not forgotten"
+    assert kept["seeds"] == (1, 2, 3, 4)
     with pytest.raises(UsageError, match="other kind attentive"):
-        Contrast(kinds=(KINDS[0], ("attentive", "--window 4"))).begun_as(begun)
+        Contrast(kinds=(KINDS[0], ("attentive", "--window 4"))).after(kept)
     with pytest.raises(UsageError, match="other run_flags"):
-        Contrast(run_flags="--generations 3").begun_as(begun)
+        Contrast(run_flags="--generations 3").after(kept)
+    assert Contrast().after({}) == asdict(Contrast())
 
 
 def outcome(kind, seed, nats, score):
