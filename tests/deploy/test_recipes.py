@@ -1,0 +1,175 @@
+"""Recipes under the tools that read them: linters, schemas, systemd, and our own command line."""
+
+import dataclasses
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import kubernetes_validate
+import promql_parser
+import pytest
+import yaml
+from cloudcoil.models.keda import v1alpha1 as keda
+
+from dreamfleet.common import cli
+from dreamfleet.common.metrics import exposition
+from tests.support import tasks
+from tests.support.processes import environment
+from tests.support.samples import STATUS
+
+ROOT = Path(__file__).parents[2]
+DEPLOY = ROOT / "deploy"
+BIN = Path(sys.executable).parent
+KUBERNETES = "1.31"
+UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
+EXPOSURE = 2.0  # of ten: what systemd-analyze calls OK ends at 5
+
+
+def checked(*words, **more):
+    """What a tool says; it must be content."""
+    done = subprocess.run([str(each) for each in words], capture_output=True, text=True, check=False, **more)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def documents(path):
+    return list(yaml.safe_load_all(path.read_text()))
+
+
+def understood(verb, words):
+    """Whether the verb knows these words; an unknown one exits."""
+    (point,) = (each for each in entry_points(group=cli.GROUP) if each.name == verb)
+    cli.parser_of(verb, point.load()).parse_all([str(each) for each in words])
+
+
+def test_the_linters_are_content():
+    checked(BIN / "hadolint", "--failure-threshold", "style", DEPLOY / "Containerfile")
+    checked(BIN / "shellcheck", *DEPLOY.rglob("*.sh"))
+    checked(BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", DEPLOY / "compose.yaml")
+
+
+def test_compose_starts_what_our_verbs_know():
+    (told,) = documents(DEPLOY / "compose.yaml")
+    services = told["services"]
+    understood("coordinator", ["--run", *services["coordinator"]["command"]])
+    understood("worker", services["worker"]["command"])
+    stages = set(re.findall(r"^FROM \S+ AS (\S+)", (DEPLOY / "Containerfile").read_text(), re.MULTILINE))
+    for service in services.values():
+        assert service["build"]["target"] in stages
+        assert service["read_only"]
+        assert service["environment"]["DREAMFLEET_JOIN"] == f"/run/secrets/{service['secrets'][0]}"
+        assert service["secrets"][0] in told["secrets"]
+
+
+def test_the_cluster_takes_what_the_kustomization_lists():
+    folder = DEPLOY / "kubernetes"
+    (whole,) = documents(folder / "kustomization.yaml")
+    listed = [document for name in whole["resources"] for document in documents(folder / name)]
+    assert {*whole["resources"], "kustomization.yaml"} == {path.name for path in folder.iterdir()}
+    secrets = {each["name"] for each in whole["secretGenerator"]}
+    for document in (each for each in listed if each["kind"] != "ScaledObject"):
+        kubernetes_validate.validate(document, KUBERNETES, strict=True)
+    for kind, verb, first in (("StatefulSet", "coordinator", ["--run"]), ("Deployment", "worker", [])):
+        (pod,) = (each["spec"]["template"]["spec"] for each in listed if each["kind"] == kind)
+        (container,) = pod["containers"]
+        understood(verb, [*first, *container["args"]])
+        assert {each["name"] for each in whole["images"]} >= {container["image"]}
+        mounted = {each["name"] for each in container["volumeMounts"]}
+        offered = {each["name"] for each in pod["volumes"]} | ({"runs"} if kind == "StatefulSet" else set())
+        assert mounted == offered
+        assert {each["secret"]["secretName"] for each in pod["volumes"] if "secret" in each} <= secrets
+        ports = {each["name"] for each in container.get("ports", ())}
+        probes = [each for name, each in container.items() if name.endswith("Probe") and "exec" not in each]
+        asked = [each["tcpSocket" if "tcpSocket" in each else "httpGet"]["port"] for each in probes]
+        assert set(asked) <= ports
+        assert ("metrics" in ports) == ("--metrics-port" in container["args"])
+    (probe,) = (each["spec"]["template"]["spec"]["containers"][0]["startupProbe"] for each in listed
+                if each["kind"] == "Deployment")  # fmt: skip
+    understood("doctor", probe["exec"]["command"][2:])
+
+
+def test_workers_are_scaled_by_metrics_that_are_there():
+    (scaled,) = documents(DEPLOY / "kubernetes" / "autoscaling.yaml")
+    found = keda.ScaledObject.model_validate(scaled)
+    assert found.model_dump(by_alias=True, exclude_unset=True, mode="json") == scaled  # nothing that it does not know
+    query = scaled["spec"]["triggers"][0]["metadata"]["query"]
+    promql_parser.parse(query)
+    names = set(re.findall(r"dreamfleet_[a-z_]+", query))
+    told = exposition(dataclasses.replace(STATUS, run="night"))
+    assert names
+    assert all(f'{name}{{run="night"}}' in told for name in names)
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd")
+@pytest.mark.parametrize("unit", UNITS, ids=lambda path: path.stem)
+def test_systemd_takes_the_units_and_finds_them_shut(unit, tmp_path):
+    text = unit.read_text()
+    (start,) = re.findall(r"^ExecStart=(.*)$", text, re.MULTILINE)
+    program, *words = start.split()
+    if Path(program).name == "dreamfleet":
+        understood(words[0], words[1:])
+    real = BIN / "dreamfleet" if Path(program).name == "dreamfleet" else DEPLOY / Path(program).name
+    (tmp_path / unit.name).write_text(text.replace(program, str(real)))
+    assert checked("systemd-analyze", "verify", "--man=no", tmp_path / unit.name) == ""
+    said = checked("systemd-analyze", "security", "--offline=true", tmp_path / unit.name)
+    assert float(re.search(r"exposure level for \S+: ([0-9.]+)", said)[1]) <= EXPOSURE
+
+
+def test_the_spot_machine_runs_the_unit():
+    (told,) = documents(DEPLOY / "cloud-init" / "worker.yaml")
+    written = {each["path"]: each for each in told["write_files"]}
+    unit = written["/etc/systemd/system/dreamfleet-worker.service"]["content"]
+    own = (DEPLOY / "systemd" / "dreamfleet-worker.service").read_text()
+    assert unit == own[own.index("[Unit]") :]
+    assert written["/etc/dreamfleet/worker.join"]["permissions"] == "0600"
+    for words in told["runcmd"]:
+        if words[0].endswith("/dreamfleet"):
+            understood(words[1], words[2:])
+
+
+@pytest.mark.long
+def test_cloud_init_takes_the_user_data(tmp_path):
+    """By cloud-init's own schema: that of an installed one, else of Debian's package."""
+    schema = "usr/lib/python3/dist-packages/cloudinit/config/schemas/schema-cloud-config-v1.json"
+    where = Path("/", schema)
+    if not where.exists():
+        if shutil.which("apt-get") is None:
+            pytest.skip("needs cloud-init, or Debian's package of it")
+        subprocess.run(["apt-get", "download", "cloud-init"], cwd=tmp_path, check=True, capture_output=True)
+        (package,) = tmp_path.glob("*.deb")
+        subprocess.run(["dpkg-deb", "--extract", package, tmp_path], check=True)
+        where = tmp_path / schema
+    checked(BIN / "check-jsonschema", "--schemafile", where, DEPLOY / "cloud-init" / "worker.yaml")
+
+
+def test_one_command_begins_a_run_and_goes_on_with_it(processes, random_bundle):
+    """As a container or a unit is started again after every stop."""
+    settings = ("--bundle", random_bundle.path, "--task", tasks.TOY, "--population", 4, "--episodes", 1,
+                "--evaluate-every", 0, "--generations", 3, "--listen", processes.endpoint)  # fmt: skip
+    surroundings = environment(processes.cache) | {
+        "PATH": f"{BIN}:{os.environ['PATH']}", "DREAMFLEET_RUNS_DIR": str(processes.runs)
+    }  # fmt: skip
+    words = [str(DEPLOY / "begin.sh"), "night", *map(str, settings)]
+    with subprocess.Popen(words, env=surroundings, stderr=subprocess.PIPE, text=True) as begun:
+        while "incarnation 1" not in begun.stderr.readline():
+            assert begun.poll() is None
+        begun.send_signal(signal.SIGTERM)
+        assert begun.wait(60) == 130
+        begun.stderr.read()
+    with subprocess.Popen(words, env=surroundings, stderr=subprocess.PIPE, text=True) as again:
+        processes.worker("--run", "night", "--task", tasks.TOY, "--exit-when-done")
+        said = again.stderr.read()
+        assert again.wait(60) == 0, said
+    assert "incarnation 2" in said
+    assert "generation 2: mean" in said
+
+
+def test_what_a_recipe_is_and_how_it_is_tested_stands_in_the_table():
+    table = (DEPLOY / "README.md").read_text()
+    names = {path.name for path in DEPLOY.iterdir() if path.suffix != ".lock"} - {"README.md", "__pycache__"}
+    assert {name for name in names if f"`{name}" not in table} == set()
