@@ -16,9 +16,9 @@ from dreamfleet.common.fingerprint import package_version
 from dreamfleet.common.store import default_cache, shipped_bundles
 
 GROUP = "dreamfleet.checks"
-# What a role stands on, as findings name it; each extra installs the last part.
+# What a role stands on, as findings name it; but for the coordinator's, the extra of that name installs the last part.
 ROLES = {
-    "coordinator": ("everything",),
+    "coordinator": ("everything", "coordinator"),
     "worker": ("everything", "worker"),
     "views": ("everything", "worker", "views"),
     "train": ("everything", "worker", "train"),
@@ -67,7 +67,7 @@ class Finding:
 def examine(runs_dir: Path) -> list[Finding]:
     """Every check, ours and those that the sides register under `dreamfleet.checks`."""
     registered = [finding for point in entry_points(group=GROUP) for finding in point.load()()]
-    folders = [_writable("cache", default_cache()), _writable("runs", runs_dir)]
+    folders = [_writable("cache", default_cache(), "everything"), _writable("runs", runs_dir, "coordinator")]
     return [*_packages(), _one_box2d(), *_bundles(), *registered, *folders]
 
 
@@ -102,7 +102,7 @@ def _bundles() -> Iterator[Finding]:
         yield Finding("bundle", False, True, "none shipped", "everything", "reinstall dreamfleet")
 
 
-def _writable(name: str, path: Path) -> Finding:
+def _writable(name: str, path: Path, role: str) -> Finding:
     """Whether a folder, or the nearest parent that exists, can be written and has room."""
     where = next(each for each in (path, *path.absolute().parents) if each.exists())
     remedy = f"make {where} writable, or point $DREAMFLEET_{'CACHE' if name == 'cache' else 'RUNS_DIR'} elsewhere"
@@ -110,7 +110,6 @@ def _writable(name: str, path: Path) -> Finding:
         with tempfile.TemporaryFile(dir=where):
             free = shutil.disk_usage(where).free
     except OSError as error:
-        return Finding(f"{name} folder", False, True, f"{path}: {error.strerror}", "everything", remedy)
-    return Finding(
-        f"{name} folder", free > LEAST_FREE_BYTES, True, f"{path}, {free / 1e9:.1f} GB free", "everything", remedy
-    )
+        return Finding(f"{name} folder", False, True, f"{path}: {error.strerror}", role, remedy)
+    found = f"{path}, {free / 1e9:.1f} GB free"
+    return Finding(f"{name} folder", free > LEAST_FREE_BYTES, True, found, role, remedy)

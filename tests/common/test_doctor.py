@@ -5,9 +5,11 @@ import os
 import subprocess
 import sys
 from importlib.metadata import distribution
+from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.health import examine, lacking
 from tests.support.processes import ROOT, environment
 
 COORDINATOR = ("cma", "eclipse-zenoh", "msgpack", "numpy", "rich", "pygments", "markdown-it-py", "mdurl", "dreamfleet")
@@ -58,3 +60,10 @@ def test_its_exit_code_is_of_the_role_that_is_asked_about(bare, tmp_path, role, 
     assert report["ok"] is (code == 0)
     assert report["roles"]["coordinator"]
     assert not report["roles"]["worker"]
+
+
+def test_a_worker_needs_no_folder_for_runs():
+    """Its root may be read-only but for the cache."""
+    findings = examine(Path("/dev/null/runs"))
+    assert lacking("worker", findings) == []
+    assert [each.name for each in lacking("coordinator", findings)] == ["runs folder"]

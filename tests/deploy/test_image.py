@@ -1,0 +1,188 @@
+"""The image's own steps, carried out in a fresh Debian instead of the base image, and what comes of them at work.
+
+No container engine is needed, but root and debootstrap are. Packages are fetched by their hashes beforehand, so that
+the steps run without any index.
+"""
+
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from tests.support.processes import free_port
+
+ROOT = Path(__file__).parents[2]
+RECIPE = ROOT / "deploy" / "Containerfile"
+LOCKS = [ROOT / "deploy" / f"{name}.lock" for name in ("build", "coordinator", "worker")]
+INSTRUCTION = re.compile(r"^([A-Z]+)\s+(.*)$", re.DOTALL)
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.timeout(1800),
+    pytest.mark.skipif(os.geteuid() != 0 or shutil.which("debootstrap") is None, reason="needs root and debootstrap"),
+]
+
+
+@dataclass
+class Stage:
+    """One stage: its root, and what it says of the processes in it."""
+
+    root: Path
+    variables: dict[str, str] = field(default_factory=dict)
+    folder: str = "/"
+    user: str = "0:0"
+    entry: list[str] = field(default_factory=list)
+
+    def derived(self, root):
+        subprocess.run(["cp", "-a", self.root, root], check=True)
+        return Stage(root, dict(self.variables), self.folder, self.user)
+
+    def command(self, *words, read_only=False, mounts=(), **variables):
+        """A command line that runs words inside, with nothing of this process's surroundings."""
+        root = shlex.quote(str(self.root))
+        script = [f"mount --rbind {root} {root}", *([f"mount -o remount,bind,ro {root}"] if read_only else [])]
+        script += [f"mount --rbind /dev {root}/dev", f"mount -t proc proc {root}/proc"]
+        script += [f"mount -t tmpfs -o mode=1777 tmpfs {root}/tmp"] if read_only else []
+        script += [f"mount --bind {shlex.quote(str(ours))} {root}{theirs}" for ours, theirs in mounts]
+        given = {"PATH": "/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin", "HOME": "/tmp"} | self.variables | variables
+        inside = ["env", "-i", "-C", self.folder, *(f"{name}={text}" for name, text in given.items()), *map(str, words)]
+        leave = ["setpriv", "--reuid", self.user.split(":")[0], "--regid", self.user.split(":")[1], "--clear-groups",
+                 "--no-new-privs", "--bounding-set=-all"]  # fmt: skip
+        script += [shlex.join(["exec", "chroot", str(self.root), *(leave if self.user != "0:0" else []), *inside])]
+        return ["unshare", "--mount", "--pid", "--fork", "sh", "-ec", "\n".join(script)]
+
+
+class Build:
+    """Carries out a Containerfile, stage by stage; of each instruction what this project's file uses."""
+
+    def __init__(self, base, folder, wheels):
+        self._base, self._folder, self._wheels = base, folder, wheels
+        self.stages = {}
+
+    def run(self, text):
+        for line in self._instructions(text):
+            name, rest = INSTRUCTION.match(line).groups()
+            getattr(self, f"_{name.lower()}")(rest)
+
+    def _instructions(self, text):
+        kept = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
+        return [line for line in re.split(r"(?<!\\)\n", kept) if line.strip()]
+
+    def _arg(self, rest):
+        assert rest.startswith("PYTHON=python:3.11-")  # Debian's own is of that version too
+
+    def _from(self, rest):
+        origin, _, name = rest.split()
+        before = Stage(self._base) if origin == "${PYTHON}" else self.stages[origin]
+        self.now = self.stages[name] = before.derived(self._folder / f"stage-{name}")
+
+    def _run(self, rest):
+        wheels = self.now.root / "given"
+        wheels.mkdir(exist_ok=True)
+        words = self.now.command("sh", "-c", rest, mounts=[(self._wheels, "/given")], PIP_NO_INDEX="1",
+                                 PIP_FIND_LINKS="/given", DEBIAN_FRONTEND="noninteractive")  # fmt: skip
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        wheels.rmdir()
+        assert done.returncode == 0, f"{rest}\n{done.stdout[-3000:]}{done.stderr[-3000:]}"
+
+    def _copy(self, rest):
+        found = re.match(r"--from=(\S+)\s+(.*)", rest)
+        source = self.stages[found[1]].root if found else ROOT
+        *names, target = (found[2] if found else rest).split()
+        there = self.now.root / (Path(self.now.folder) / target).as_posix().lstrip("/")
+        for name in names:
+            path = source / name.lstrip("/")
+            if path.is_dir():  # its content, as an image's builder copies it
+                shutil.copytree(path, there, symlinks=True, dirs_exist_ok=True, ignore=None if found else
+                                shutil.ignore_patterns("__pycache__", "*.so"))  # fmt: skip
+            else:
+                into = there / path.name if target.endswith("/") or target in (".", "./") else there
+                into.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(path, into)
+
+    def _workdir(self, rest):
+        self.now.folder = rest
+        (self.now.root / rest.lstrip("/")).mkdir(parents=True, exist_ok=True)
+
+    def _env(self, rest):
+        self.now.variables |= dict(each.split("=", 1) for each in rest.replace("\\\n", " ").split())
+
+    def _user(self, rest):
+        self.now.user = rest
+
+    def _entrypoint(self, rest):
+        self.now.entry = [word.strip('"') for word in rest.strip("[]").split(", ")]
+
+    def _volume(self, rest):
+        assert (self.now.root / rest.lstrip("/")).is_dir()
+
+    def _ignored(self, rest):
+        """What tells engines something and does nothing."""
+
+    _expose = _cmd = _ignored
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("image")
+    base, wheels = folder / "debian", folder / "wheels"
+    fetch = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--require-hashes", "--dest", wheels]
+    for lock in LOCKS:
+        subprocess.run([*fetch, "--requirement", lock], check=True)
+    packages = "--include=python3,python3-venv,python3-dev"
+    subprocess.run(["debootstrap", "--variant=minbase", packages, "bookworm", base], check=True, capture_output=True)
+    (base / "usr/local/bin/python").symlink_to("/usr/bin/python3")
+    build = Build(base, folder, wheels)
+    build.run(RECIPE.read_text())
+    yield build.stages
+    shutil.rmtree(folder)
+
+
+def packages_of(stage):
+    (folder,) = (stage.root / "opt/dreamfleet").glob("lib/python*/site-packages")
+    return {path.name for path in folder.iterdir()}
+
+
+def test_an_image_holds_no_more_than_it_needs(images):
+    worker, coordinator = packages_of(images["worker"]), packages_of(images["coordinator"])
+    assert not {"torch", "pip", "onnx"} & worker
+    assert not {"torch", "pip", "onnxruntime", "gymnasium", "pygame", "Box2D"} & coordinator
+    for stage in ("worker", "coordinator"):
+        assert images[stage].user == "10001:10001"
+        assert not list(images[stage].root.glob("usr/bin/*gcc*"))
+        said = subprocess.run(images[stage].command("sh", "-c", "id -u; touch /opt/x", read_only=True),
+                              capture_output=True, text=True, check=False)  # fmt: skip
+        assert said.stdout == "10001\n"
+        assert "Read-only file system" in said.stderr
+
+
+def test_two_images_make_a_run_on_a_read_only_root(images, tmp_path):
+    coordinator, worker = images["coordinator"], images["worker"]
+    runs, endpoint = tmp_path / "volume", f"tcp/127.0.0.1:{free_port()}"
+    runs.mkdir(mode=0o700)
+    os.chown(runs, 10001, 10001)
+    fit = subprocess.run(worker.command("/opt/dreamfleet/bin/dreamfleet", "doctor", "--role", "worker", read_only=True),
+                         capture_output=True, text=True, check=False)  # fmt: skip
+    assert fit.returncode == 0, fit.stdout + fit.stderr
+    settings = ("night", "--population", 4, "--episodes", 1, "--horizon", 20, "--evaluate-every", 0, "--generations", 2,
+                "--listen", endpoint)  # fmt: skip
+    served = coordinator.command(*coordinator.entry, *settings, read_only=True, mounts=[(runs, "/runs")])
+    scoring = worker.command(*worker.entry, "--run", "night", "--slots", 1, read_only=True, DREAMFLEET_CONNECT=endpoint)
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
+    with subprocess.Popen(served, **streams) as one, subprocess.Popen(scoring, **streams) as other:
+        try:
+            assert "generation 1: mean" in (said := one.communicate(timeout=300)[0])
+            assert one.returncode == 0, said
+        finally:
+            for process in (one, other):
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)  # what is inside is another user's and outlives its parent
+            other.communicate()
+    assert (runs / "night" / "controller.npz").is_file()
