@@ -12,11 +12,11 @@ import zenoh
 from dreamfleet.common.runs import open_run
 from tests.support import tasks
 from tests.support.hosts import new_host
-from tests.support.processes import free_port
+from tests.support.processes import free_port, processes_in
 
 pytestmark = pytest.mark.timeout(300)
 RECIPES = Path(__file__).parents[2] / "deploy" / "zenoh"
-GENERATIONS, POPULATION = 8, 4
+GENERATIONS, POPULATION = 5, 4
 SETTINGS = ("--task", tasks.SLOW_TOY, "--population", POPULATION, "--episodes", 1, "--generations", GENERATIONS,
             "--evaluate-every", 0, "--beat", 0.2)  # fmt: skip
 
@@ -41,14 +41,17 @@ def fitness(processes, name):
         return [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
 
 
-def alone(processes, bundle):
-    coordinator = processes.coordinator("--bundle", bundle.path, *SETTINGS, name="alone")
-    processes.worker("--run", "alone", "--task", tasks.SLOW_TOY, "--slots", 4)
-    assert coordinator.finish(120)[0] == 0
-    return fitness(processes, "alone")
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory, random_bundle):
+    """What the run comes to where nothing stands between."""
+    with processes_in(tmp_path_factory.mktemp("alone")) as processes:
+        coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS, name="alone")
+        processes.worker("--run", "alone", "--task", tasks.SLOW_TOY, "--slots", 4)
+        assert coordinator.finish(120)[0] == 0
+        return fitness(processes, "alone")
 
 
-def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe, random_bundle):
+def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe, random_bundle, alone):
     ports = {"router": free_port(), "second": free_port()}
     first = recipe("one.toml", **{"0_0_0_0:7447": f"127.0.0.1:{ports['router']}",
                                   "router_example:7447": f"127.0.0.1:{ports['router']}"})  # fmt: skip
@@ -71,11 +74,11 @@ def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe
     linked.popen.send_signal(signal.SIGTERM)
     assert linked.finish()[0] == 0
     assert "1 routers" in linked.lines[-1]
-    assert fitness(processes, "far") == alone(processes, random_bundle)
+    assert fitness(processes, "far") == alone
 
 
 def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a_router(
-    processes, recipe, random_bundle
+    processes, recipe, random_bundle, alone
 ):
     """Each on a cable of its own to the router's host, which passes no packets on."""
     with new_host() as inside, new_host() as elsewhere:
@@ -92,7 +95,7 @@ def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a
                                  inside=elsewhere.inside)  # fmt: skip
         worker.wait_for("joined")
         assert coordinator.finish(120)[0] == 0
-    assert fitness(processes, "nat") == alone(processes, random_bundle)
+    assert fitness(processes, "nat") == alone
 
 
 @pytest.mark.parametrize("name", ["one.toml", "linked.toml"])
