@@ -36,12 +36,14 @@ class Client:
     ...     print(client.status("my-run").state)
     """
 
-    def __init__(self, connect: tuple[str, ...] | str) -> None:
+    def __init__(self, connect: Network | tuple[str, ...] | str) -> None:
+        """`connect` are addresses, or with them a join file's credentials: `site.reached`."""
         connect = (connect,) if isinstance(connect, str) else connect
-        if not connect:
+        network = connect if isinstance(connect, Network) else Network(connect=connect)
+        if not network.connect:
             raise UsageError("a client needs an address: tcp/HOST:PORT")
-        self._where = ", ".join(connect)
-        self.session = open_session(Network(connect=connect))  # also for what asks in other words, as for a bundle
+        self._where = ", ".join(network.connect)
+        self.session = open_session(network)  # also for what asks in other words, as for a bundle
 
     def __enter__(self) -> Client:
         return self

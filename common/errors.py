@@ -39,6 +39,10 @@ class ConnectionFailedError(DreamfleetError):
     """Nobody answered over Zenoh, or the address cannot be listened on."""
 
 
+class AccessError(DreamfleetError):
+    """A join file or an authority's folder is missing, damaged, expired, or of another role than is needed."""
+
+
 class RefusedError(DreamfleetError):
     """The other side answered, and said no."""
 

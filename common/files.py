@@ -14,8 +14,10 @@ from typing import BinaryIO
 
 
 @contextmanager
-def write_aside(path: Path) -> Iterator[BinaryIO]:
+def write_aside(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
     """Open a neighbour of `path` for writing; on success it is synced and takes the name, on failure it vanishes.
+
+    A `private` file is its owner's alone (mode 600), from the first byte on.
 
     The folder is synced too: a name that a power cut takes back would be no file at all. `OSError` where there is
     something that is no file: a device would become one.
@@ -24,7 +26,7 @@ def write_aside(path: Path) -> Iterator[BinaryIO]:
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with aside.open("wb") as file:
+        with _opened(aside, private) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -32,6 +34,13 @@ def write_aside(path: Path) -> Iterator[BinaryIO]:
         sync(path.parent)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def _opened(path: Path, private: bool) -> BinaryIO:
+    if not private:
+        return path.open("wb")
+    path.unlink(missing_ok=True)  # one of another mode
+    return open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "wb")  # noqa: PTH123
 
 
 @contextmanager

@@ -6,12 +6,14 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
 from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.credentials import SOON, read_join, told_left
+from dreamfleet.common.errors import AccessError, DreamfleetError
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.common.store import default_cache, shipped_bundles
 
@@ -64,11 +66,24 @@ class Finding:
     remedy: str
 
 
-def examine(runs_dir: Path) -> list[Finding]:
-    """Every check, ours and those that the sides register under `dreamfleet.checks`."""
+def examine(runs_dir: Path, join: Path | None = None) -> list[Finding]:
+    """Every check, ours, of a join file that is used, and those that the sides register under `dreamfleet.checks`."""
     registered = [finding for point in entry_points(group=GROUP) for finding in point.load()()]
     folders = [_writable("cache", default_cache(), "everything"), _writable("runs", runs_dir, "coordinator")]
-    return [*_packages(), _one_box2d(), *_bundles(), *registered, *folders]
+    joined = [] if join is None else [_join_file(join)]
+    return [*_packages(), _one_box2d(), *_bundles(), *registered, *folders, *joined]
+
+
+def _join_file(path: Path) -> Finding:
+    """Whether it lets anybody in, and for how long; a week before its end it is no more as it should be."""
+    try:
+        credentials = read_join(path)
+    except AccessError as error:
+        return Finding("join file", False, True, str(error), "everything", "have another issued")
+    left = credentials.left(datetime.now(UTC))
+    found = f"{path}: {credentials.role} {credentials.name}, {told_left(left)}"
+    remedy = f"have {credentials.role} {credentials.name} issued again"
+    return Finding("join file", left > SOON, False, found, "everything", remedy)
 
 
 def lacking(role: str, findings: list[Finding]) -> list[Finding]:

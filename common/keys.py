@@ -58,6 +58,11 @@ def hello(run: str) -> str:
     return f"{ROOT}/hello/{run}"
 
 
+def hello_of(run: str, worker: str) -> str:
+    """Where a worker asks to join a secured run, under its own name, to which the router holds it."""
+    return f"{ROOT}/hello/{run}/{worker}"
+
+
 def job(run: str, worker: str) -> str:
     """Coordinator to one worker: numbered batches."""
     return f"{_PREFIX}/{run}/job/{worker}"

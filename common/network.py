@@ -6,23 +6,48 @@ import re
 from dataclasses import dataclass
 from ipaddress import ip_address
 
+from dreamfleet.common.credentials import Credentials
 from dreamfleet.common.errors import UsageError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LOOPBACK = "127.0.0.1"
+SECURED = "tls/"  # how endpoints of a fleet with join files begin
+SECURED_ENDPOINT = "tls/0.0.0.0:7447"  # where such a coordinator listens by default
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[0-9a-fA-F:]+\]|[^:/\s]+):(\d{1,5})")
 
 
 @dataclass(frozen=True)
 class Network:
-    """Where to listen and what to connect to; endpoints such as `tcp/HOST:7447`."""
+    """Where to listen and what to connect to, endpoints such as `tcp/HOST:7447`, and as whom.
+
+    `barred` are the seats that a secured router lets do nothing.
+    """
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
+    credentials: Credentials | None = None
+    barred: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         for endpoint in (*self.listen, *self.connect):
             check_endpoint(endpoint)
+            if self.credentials is not None and not endpoint.startswith(SECURED):
+                raise UsageError(f"{endpoint} is not encrypted: with a join file it is {_secured(endpoint)}")
+            if self.credentials is None and endpoint.startswith(SECURED):
+                raise UsageError(f"{endpoint} is encrypted: give --join FILE, which `dreamfleet access issue` makes")
+
+    def check_open(self, *, insecure: bool) -> None:
+        """`UsageError` where others could reach a router that lets everybody do all, and nobody said `insecure`."""
+        for endpoint in self.listen:
+            if self.credentials is None and not insecure and not is_loopback(endpoint):
+                raise UsageError(
+                    f"{endpoint} can be reached from other hosts, and whoever reaches it owns the run: give --join "
+                    "FILE (`dreamfleet access`, docs/security.md), or --insecure inside a network that you trust"
+                )
+
+
+def _secured(endpoint: str) -> str:
+    return SECURED + endpoint.partition("/")[2]
 
 
 def is_loopback(endpoint: str) -> bool:

@@ -6,22 +6,32 @@ slower; 1000 sessions are the most. None of that stands here.
 
 from __future__ import annotations
 
+import base64
 import json
 import queue
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import zenoh
 
+from dreamfleet.common.credentials import SEATS, Credentials, identity, password_of
 from dreamfleet.common.descriptors import room_for_connections
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
+from dreamfleet.common.handshake import trouble_with
 from dreamfleet.common.network import Network, check_endpoint
+from dreamfleet.common.rules import access_control
 
 LEASE_MS = 4000  # announced by each side: after so long without a sign the other side drops its token
 MOST_SESSIONS = 10_000
 MAX_RECEIVED = (
     128 * 1024
 )  # bytes of a message: above it Zenoh itself lets go; the largest of the protocol is MAX_MESSAGE
+# Bytes of a message that a router passes on; the room beside the protocol's own limit is for messages that show as
+# too large in a coordinator's status. Zenoh drops what is larger silently.
+MAX_PASSED = 64 * 1024
 _NO_ROOM = "no network session can be opened: {}; give this host more room (ulimit -n, ulimit -u)"
 __all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_session", "settings_of"]
 
@@ -33,7 +43,11 @@ def open_session(network: Network, *, timeout: float | None = 3.0) -> zenoh.Sess
     client in native code where no signal is heard, so whoever wants to wait calls again. A router does not block:
     without a `timeout` it opens at once, and links to others as they come.
     """
-    settings = settings_of(network, timeout)
+    with _dictionary(network) as dictionary:
+        return _open(network, settings_of(network, timeout, dictionary))
+
+
+def _open(network: Network, settings: dict[str, Any]) -> zenoh.Session:
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
     except zenoh.ZError as error:
@@ -46,12 +60,15 @@ def open_session(network: Network, *, timeout: float | None = 3.0) -> zenoh.Sess
         raise DreamfleetError(_NO_ROOM.format(_first_line(error))) from error
 
 
-def settings_of(network: Network, timeout: float | None) -> dict[str, Any]:
-    """Zenoh's own configuration for `network`; a stand-alone `zenohd` reads a router's as well."""
-    router = bool(network.listen)
+def settings_of(network: Network, timeout: float | None, dictionary: str | None = None) -> dict[str, Any]:
+    """Zenoh's own configuration for `network`; a stand-alone `zenohd` reads a router's as well.
+
+    With credentials it holds their secrets; `dictionary` is a file of the users' passwords.
+    """
+    router, credentials = bool(network.listen), network.credentials
     room = room_for_connections()  # else strangers who connect could keep a coordinator from writing a file
     bounds = {"max_sessions": min(MOST_SESSIONS, room * 3 // 4), "accept_pending": min(MOST_SESSIONS, room // 4)}
-    transport = {
+    transport: dict[str, Any] = {
         "unicast": bounds if router else {},
         "shared_memory": {"enabled": False},
         "link": {
@@ -63,6 +80,16 @@ def settings_of(network: Network, timeout: float | None) -> dict[str, Any]:
             },
         },
     }
+    guards: dict[str, Any] = {}
+    if router:
+        passed = {"messages": ["put", "query", "reply"], "flows": ["ingress"], "key_exprs": ["**"]}
+        guards["low_pass_filter"] = [{"id": "all", **passed, "size_limit": MAX_PASSED}]
+    if credentials is not None:
+        transport["link"] |= {"protocols": ["tls"], "tls": _tls(credentials)}
+        if credentials.with_passwords:
+            transport["auth"] = {"usrpwd": _user(credentials, dictionary)}
+        if router:
+            guards["access_control"] = access_control(credentials.with_passwords, network.barred)
     retry = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
     return {
         "mode": "router" if router else "client",
@@ -75,7 +102,42 @@ def settings_of(network: Network, timeout: float | None) -> dict[str, Any]:
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": transport,
+        **guards,
     }
+
+
+def _tls(credentials: Credentials) -> dict[str, Any]:
+    """Both ends of a link show their certificates; where passwords are in force, only who listens does."""
+    settings = {"root_ca_certificate_base64": _base64(credentials.ca), "enable_mtls": not credentials.with_passwords,
+                "verify_name_on_connect": True, "close_link_on_expiration": True}  # fmt: skip
+    if credentials.certificate:
+        for side in ("listen", "connect"):
+            settings[f"{side}_certificate_base64"] = _base64(credentials.certificate)
+            settings[f"{side}_private_key_base64"] = _base64(credentials.key)
+    return settings
+
+
+def _base64(text: str) -> str:
+    return base64.b64encode(text.encode()).decode()
+
+
+def _user(credentials: Credentials, dictionary: str | None) -> dict[str, str]:
+    own = credentials.password or password_of(credentials.secret, credentials.identity)
+    return {"user": credentials.identity, "password": own, **({"dictionary_file": dictionary} if dictionary else {})}
+
+
+@contextmanager
+def _dictionary(network: Network) -> Iterator[str | None]:
+    """The file that Zenoh reads the users' passwords from as it opens, and nobody else; it is gone afterwards."""
+    secret = network.credentials.secret if network.credentials and network.listen else ""
+    if not secret:
+        yield None
+        return
+    users = [identity(role, seat) for role, seats in SEATS.items() for seat in range(1, seats + 1)]
+    with TemporaryDirectory(prefix="dreamfleet-") as folder:  # mode 700
+        path = Path(folder) / "users"
+        path.write_text("".join(f"{each}:{password_of(secret, each)}\n" for each in users))
+        yield str(path)
 
 
 def _explain(network: Network, error: zenoh.ZError) -> str:
@@ -84,6 +146,8 @@ def _explain(network: Network, error: zenoh.ZError) -> str:
         return f"{taken} is in use: stop what listens there, or choose another with --listen tcp/127.0.0.1:PORT"
     if network.listen:
         return f"cannot listen on {', '.join(network.listen)}: {_first_line(error)}"
+    if network.credentials is not None and (found := trouble_with(network.connect, network.credentials)):
+        return found
     return (
         f"nobody answers at {', '.join(network.connect)}: start `dreamfleet coordinator` or `dreamfleet router` "
         "there, or name another address with --connect tcp/HOST:PORT"

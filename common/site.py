@@ -10,16 +10,19 @@ import argparse
 import difflib
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
 from dreamfleet.common.config import add_flags, load, option, read_toml
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.credentials import SOON, Credentials, read_join, told_left
+from dreamfleet.common.errors import AccessError, UsageError
 from dreamfleet.common.logs import choose_format
-from dreamfleet.common.network import DEFAULT_ENDPOINT, check_endpoint
+from dreamfleet.common.network import DEFAULT_ENDPOINT, Network, check_endpoint
 
+log = logging.getLogger(__name__)
 ARRAYS = ("stage", "host")  # tables that a file may hold several of
 # Of every verb: one file serves all of them.
 TABLES = ("run", "limits", "network", "worker", "dashboard", "demo", "iterate", "router", "spawn")
@@ -34,6 +37,10 @@ class SiteConfig:
 
     connect: tuple[str, ...] = option((), f"the run's router, or several to try (default {DEFAULT_ENDPOINT})")
     listen: tuple[str, ...] = option((), f"listen here (default {DEFAULT_ENDPOINT}, unless --connect is given)")
+    join: Path | None = option(  # noqa: RUF009 - as below
+        None, "join file of `dreamfleet access issue`: where the fleet is, and as whom this joins it, over TLS"
+    )
+    access_dir: Path = option(Path("access"), "where the fleet's own authority lies, and what it revoked")  # noqa: RUF009
     runs_dir: Path = option(Path("runs"), "where runs live")  # noqa: RUF009 - a field, and paths do not change
     log_level: Literal["debug", "info", "warning", "error"] = option("info", "the least that is logged on stderr")
     log_format: Literal["text", "json", "auto"] = option("text", "as lines, as JSON, or auto: JSON but in a terminal")
@@ -44,8 +51,11 @@ class SiteConfig:
 
 
 def offer(parser: argparse.ArgumentParser, *names: str, texts: Mapping[str, str] | None = None) -> None:
-    """Flags for some of the site's settings; `texts` says what is meant here where the common text does not fit."""
-    add_flags(parser, SiteConfig, only=names, texts=texts)
+    """Flags for some of the site's settings; `texts` says what is meant here where the common text does not fit.
+
+    Whatever connects may do so with a join file.
+    """
+    add_flags(parser, SiteConfig, only=(*names, *(("join",) if "connect" in names else ())), texts=texts)
 
 
 def offer_everywhere(parser: argparse.ArgumentParser) -> None:
@@ -80,6 +90,31 @@ def settle(args: argparse.Namespace, environment: Mapping[str, str] = os.environ
     args.runs_dir, args.log_level = site.runs_dir, site.log_level
     logging.getLogger("dreamfleet").setLevel(site.log_level.upper())
     choose_format(site.log_format)
+
+
+def joined(args: argparse.Namespace, roles: Collection[str] = ()) -> Credentials | None:
+    """What the join file holds, if there is one; `AccessError` if it is of none of the `roles` that this verb needs."""
+    path: Path | None = args.site.join
+    if path is None:
+        return None
+    credentials = read_join(path)
+    if roles and credentials.role not in roles:
+        raise AccessError(
+            f"{path} is a {credentials.role}'s, and this needs one whose role is {' or '.join(roles)}: have it issued "
+            f"with `dreamfleet access issue {next(iter(roles))} NAME --out FILE`"
+        )
+    left = credentials.left(datetime.now(UTC))
+    if left < SOON:
+        log.warning("%s expires soon (%s): have %s %s issued again", path, told_left(left), credentials.role,
+                    credentials.name)  # fmt: skip
+    return credentials
+
+
+def reached(args: argparse.Namespace, *roles: str) -> Network:
+    """Where the fleet is found, and as whom: where flags, environment or file say, else where the join file does."""
+    credentials = joined(args, roles)
+    found = credentials.connect if credentials is not None else ()
+    return Network(connect=args.site.connect or found or (DEFAULT_ENDPOINT,), credentials=credentials)
 
 
 def _check_variables(environment: Mapping[str, str]) -> dict[str, str]:

@@ -212,6 +212,8 @@ class Status:
     confirming: Progress = field(default=Progress(0, 0), metadata=OPTIONAL)  # one round of a confirmation
     strict: bool = field(default=False, metadata=OPTIONAL)  # hosts of another class than the first result's are refused
     classes: Classes = field(default=Classes(), metadata=OPTIONAL)  # of the hosts that scored, by accepted results
+    # When the coordinator's join file ends, in seconds since 1970; `None` where it has none.
+    expires: float | None = field(default=None, metadata=OPTIONAL)
 
     @property
     def over(self) -> bool:

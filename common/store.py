@@ -74,7 +74,7 @@ class BundleStore:
         """
         partial = self._partial(sha256)
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             lock = open_growing(partial.with_suffix(".lock"))
         except OSError as error:
             raise self.unwritable(error) from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import zip_longest
 
 from rich.cells import cell_len, chop_cells
@@ -13,6 +14,7 @@ from rich.panel import Panel
 from rich.text import Text
 
 from dreamfleet.common.cells import bar, bars, cell_lines, cells_wanted
+from dreamfleet.common.credentials import SOON, told_left
 from dreamfleet.common.eta import eta_of, sentence
 from dreamfleet.common.printable import printable
 from dreamfleet.common.roster import Roster
@@ -141,6 +143,9 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
     yield 4, "waste", f"{waste.share:.1%}, {waste.reissued} jobs issued again{resent}"
     if status.classes.total:
         yield 4 if status.classes.mixed else 7, "hosts", status.classes.told
+    if status.expires is not None:
+        left = datetime.fromtimestamp(status.expires, UTC) - datetime.now(UTC)
+        yield 0 if left < SOON else 8, "join file", f"the coordinator's: {told_left(left)}"
     if sum(status.dropped.values()):
         yield 8, "dropped messages", ", ".join(f"{count} {why}" for why, count in status.dropped.items())
 

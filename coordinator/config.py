@@ -380,6 +380,10 @@ class NetworkConfig:
     metrics_port: str = option(
         "", "answer Prometheus under /metrics at this port of 127.0.0.1, or at HOST:PORT; anybody there may read it"
     )
+    insecure: bool = option(
+        False, "listen beyond this host without a join file: anyone who reaches the port owns the run, may read, forge "
+        "and stop everything"
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         if self.metrics_port:

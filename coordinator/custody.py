@@ -126,7 +126,7 @@ class Custody:
     def _rescue_beside(self, parent: Path) -> str:
         """Into a folder of its own, as another run: its own is gone."""
         folder = free(parent / f"{self._folder.name[:50]}-{RESCUED}")
-        folder.mkdir(parents=True)
+        folder.mkdir(mode=0o700, parents=True)
         self._journal.save_copy(folder / JOURNAL)
         if self._bundle is not None:
             self._bundle.put_back(folder)

@@ -92,6 +92,7 @@ class Journal:
             if bundle is not None:
                 with bundle.open("rb") as source, write_aside(folder / BUNDLE) as copy:
                     shutil.copyfileobj(source, copy)
+            aside.touch(mode=0o600)  # its log has the same mode
             with _translated(path), closing(sqlite3.connect(aside)) as connection:
                 schema.migrate(connection, 0)
                 connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", {**own, **(facts or {})}.items())

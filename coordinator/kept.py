@@ -11,8 +11,9 @@ from dataclasses import fields, replace
 from typing import Any
 
 from dreamfleet.common.config import Table, read_table
+from dreamfleet.common.credentials import Credentials
 from dreamfleet.common.errors import JournalError, UsageError
-from dreamfleet.common.network import DEFAULT_ENDPOINT
+from dreamfleet.common.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.site import SiteConfig
 from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig
@@ -41,18 +42,21 @@ def kept_network(stored: RunFolder) -> Table:
     return {"strict": not mixed, **kept}
 
 
-def choose_addresses(own: NetworkConfig, site: SiteConfig, kept: Table) -> NetworkConfig:
+def choose_addresses(
+    own: NetworkConfig, site: SiteConfig, kept: Table, credentials: Credentials | None = None
+) -> NetworkConfig:
     """Where a coordinator is reached: as told, else as kept, else on this host alone.
 
     `connect` of the site says where everybody finds the router. A coordinator that listens is that router, and
-    connects to another one only if its own flag or table says so.
+    connects to another one only if its own flag or table says so. With a join file it is reached where that says.
     """
     listen, connect = own.listen or site.listen, own.connect
     if not listen and not connect:  # where everybody else connects to does not say where this one was
         listen, connect = kept.get("listen", ()), kept.get("connect", ())
     if not listen and not connect:
-        connect = site.connect
-    return replace(own, listen=listen or (() if connect else (DEFAULT_ENDPOINT,)), connect=connect)
+        connect = site.connect or (credentials.connect if credentials else ())
+    default = DEFAULT_ENDPOINT if credentials is None else SECURED_ENDPOINT
+    return replace(own, listen=listen or (() if connect else (default,)), connect=connect)
 
 
 def settle_strict(network: NetworkConfig, *, said: bool) -> NetworkConfig:

@@ -9,8 +9,10 @@ from pathlib import Path
 from time import monotonic
 
 from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.credentials import Credentials
 from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
 from dreamfleet.common.keys import check_run_name
+from dreamfleet.common.ledger import Revocations
 from dreamfleet.common.messages import Intervals
 from dreamfleet.common.processes import spoken
 from dreamfleet.common.runs import ARCHIVE, BUNDLE, JOURNAL, open_run, run_lock
@@ -38,6 +40,8 @@ class RunRequest:
     limits: LimitsConfig
     network: NetworkConfig
     start: Start | None = None  # of a new run; it begins with zero parameters otherwise
+    credentials: Credentials | None = None
+    access_dir: Path = Path("access")  # whose list says what is revoked
 
 
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
@@ -47,7 +51,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
     settings, bundle = _settle(request, folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise JournalError(
             f"cannot write in {request.runs_dir}: {error.strerror}; choose another --runs-dir"
@@ -71,8 +75,9 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
 def _service(request: RunRequest, custody: Custody, bundle: ServedBundle | None) -> Service:
     network = request.network
     intervals = Intervals(network.beat, network.beat)
-    return Service(request.name, Network(network.listen, network.connect), intervals, custody, bundle,
-                   network.metrics_port)  # fmt: skip
+    revocations = Revocations(request.access_dir, request.credentials)
+    reached = Network(network.listen, network.connect, request.credentials, revocations.barred)
+    return Service(request.name, reached, intervals, custody, bundle, network.metrics_port, revocations)
 
 
 def _open(request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None) -> Journal:

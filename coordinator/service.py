@@ -12,6 +12,7 @@ import secrets
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
+from datetime import UTC, datetime
 from itertools import islice
 from time import monotonic
 from typing import Any
@@ -20,7 +21,9 @@ import zenoh
 
 from dreamfleet.common import keys
 from dreamfleet.common.codec import Inbox, MalformedError, encode, encode_json, encoding
+from dreamfleet.common.credentials import SOON, seat_of_worker, told_left
 from dreamfleet.common.errors import DreamfleetError, RefusedError
+from dreamfleet.common.ledger import Revocations
 from dreamfleet.common.messages import (
     Beat,
     GenerationEvent,
@@ -32,6 +35,7 @@ from dreamfleet.common.messages import (
     UploadPart,
 )
 from dreamfleet.common.mishaps import Mishaps
+from dreamfleet.common.network import is_loopback
 from dreamfleet.common.session import Network, open_session
 from dreamfleet.coordinator import answers
 from dreamfleet.coordinator.arrivals import Arrivals
@@ -63,12 +67,14 @@ class Service:
 
     def __init__(
         self, name: str, network: Network, intervals: Intervals, custody: Custody, bundle: ServedBundle | None,
-        metrics_port: str = "",
+        metrics_port: str = "", revocations: Revocations | None = None,
     ) -> None:  # fmt: skip
         self._name = name
         self._custody = custody
         self._bundle = bundle
         self._network = network
+        self._secured = network.credentials is not None
+        self._revocations = revocations
         self._metrics_port = metrics_port
         self._intervals = intervals
         self._nonce = secrets.token_hex(8)
@@ -102,6 +108,7 @@ class Service:
                      self._run.generation.number, extra={"facts": {"event": "begin", **begun}})  # fmt: skip
             if self._network.listen:
                 log.info("listening on %s", ", ".join(self._network.listen))
+                self._tell_open()
             self._evaluations_told = len(self._run.slack.evaluations)
             on_ready(self._run)
             try:
@@ -126,7 +133,7 @@ class Service:
             session.liveliness().declare_subscriber(
                 keys.any_worker("live/worker", name), self._enqueue("token"), history=True
             ),
-            answer(keys.hello(name), self._enqueue("hello")),
+            answer(self._hello_key("*/*"), self._enqueue("hello")),
             answer(keys.control(name, "*"), self._enqueue("control")),
             *answer_status(session, name, lambda: self._snapshot, self._mishaps),
             *self._serve_bundle(session),
@@ -165,6 +172,7 @@ class Service:
             self._disband(session, now)
             self._custody.look(now)
             self._claim.look(now)
+            self._look_at_revocations(now)
 
     def _put(self, session: zenoh.Session, sends: list[Send]) -> None:
         for send in sends:
@@ -175,6 +183,11 @@ class Service:
                 self._exchange.dismiss(send.identity)
                 continue
             session.put(keys.job(self._name, send.identity), batch, encoding=encoding(JobBatch))
+
+    def _tell_open(self) -> None:
+        if not self._secured and not all(is_loopback(each) for each in self._network.listen):
+            log.warning("this is neither encrypted nor authenticated: anyone who reaches the port owns the run "
+                        "(docs/security.md)", extra={"facts": {"event": "insecure"}})  # fmt: skip
 
     def _tell_alone(self, now: float) -> None:
         """Say once that nobody works, when that has lasted a while: a run that stands still should not be silent."""
@@ -192,6 +205,15 @@ class Service:
             self._summed_up = now
             text, facts = summary(status_of(self._snapshot))
             log.info("%s", text, extra={"facts": facts})
+            self._tell_expiry()
+
+    def _tell_expiry(self) -> None:
+        """Say so from a week before on: links break when a certificate ends."""
+        credentials = self._network.credentials
+        if credentials is not None and (left := credentials.left(datetime.now(UTC))) < SOON:
+            facts = {"event": "expiry", "seconds": left.total_seconds()}
+            log.warning("this coordinator's join file: %s; issue another and start it again with that",
+                        told_left(left), extra={"facts": facts})  # fmt: skip
 
     def _write_notes(self) -> None:
         for note in self._exchange.take_notes():
@@ -235,10 +257,13 @@ class Service:
 
     def _hear(self, kind: str, sample: zenoh.Sample, now: float) -> None:
         """Pass on what a worker of this run says, if it is of the schema."""
+        worker = keys.worker_of(str(sample.key_expr))
+        if self._barred(worker):
+            self._inbox.dropped["revoked"] += 1
+            return
         message = self._inbox.decode(_REPEATED[kind], sample.payload.to_bytes())
         if message is None or not self._ours(message.run_uid):
             return
-        worker = keys.worker_of(str(sample.key_expr))
         if isinstance(message, ResultBatch):
             self._exchange.results(worker, message, now)
         elif isinstance(message, UploadPart):
@@ -251,11 +276,26 @@ class Service:
             self._inbox.dropped["foreign run"] += 1
         return run_uid == self._run.uid
 
+    def _barred(self, worker: str) -> bool:
+        """Whether the seat that a worker's name ends in, to which the router holds it, was taken back."""
+        return self._revocations is not None and seat_of_worker(worker) in self._revocations.barred
+
+    def _look_at_revocations(self, now: float) -> None:
+        """End the leases of workers whose seats were taken back since the last look."""
+        if self._revocations is None:
+            return
+        before = self._revocations.barred
+        self._revocations.look(now)
+        if self._revocations.barred != before:
+            for member in list(self._exchange.members):
+                if self._barred(member.identity):
+                    self._exchange.dismiss(member.identity)
+
     def _hello(self, query: zenoh.Query, now: float) -> None:
         with query:
             payload = query.payload.to_bytes() if query.payload is not None else b""
             request = self._inbox.decode_json(HelloRequest, payload)
-            refusal = misunderstanding(request)
+            refusal = misunderstanding(request) or self._impostor(request, query)
             if self._disbanding_since is not None:
                 refusal = refusal or ("the run ends with its workers", "wait until somebody goes on with it")
             if request is not None and refusal is None:
@@ -265,7 +305,23 @@ class Service:
                 numbering = self._exchange.admit(request, now)
             why, remedy = refusal or ("", "")
             reply = hello_reply(self._run, self._name, self._nonce, self._intervals, why, remedy, numbering)
-            query.reply(keys.hello(self._name), encode_json(reply), encoding="application/json")
+            key = self._hello_key(keys.worker_of(str(query.key_expr)))
+            query.reply(key, encode_json(reply), encoding="application/json")
+
+    def _hello_key(self, worker: str) -> str:
+        """Where hello is said: in a secured fleet under a worker's own name."""
+        return keys.hello_of(self._name, worker) if self._secured else keys.hello(self._name)
+
+    def _impostor(self, request: HelloRequest | None, query: zenoh.Query) -> tuple[str, str] | None:
+        """Why nobody of this name is let in, in a secured fleet, and what to do about it."""
+        if not self._secured or request is None:
+            return None
+        if request.worker != keys.worker_of(str(query.key_expr)):
+            return "it says hello in another's name", "update dreamfleet on the worker's host"
+        if self._barred(request.worker):
+            self._exchange.refusals.add(request.worker, "its join file is revoked")
+            return "its join file is revoked", "have another issued"
+        return None
 
     def _control(self, query: zenoh.Query) -> None:
         verbs: dict[str, Callable[[], None]] = {
@@ -352,7 +408,9 @@ class Service:
     def _take_snapshot(self) -> Snapshot:
         now = monotonic()
         dropped = self._inbox.dropped + self._exchange.dropped + self._events.dropped + self._mishaps.counts
-        return take_snapshot(self._run, self._name, dropped, now - self._started, now)
+        credentials = self._network.credentials
+        expires = None if credentials is None else credentials.expires.timestamp()
+        return take_snapshot(self._run, self._name, dropped, now - self._started, now, expires)
 
     def _serve_bundle(self, session: zenoh.Session) -> list[Any]:
         """Serve the run's world model, if its task needs one."""

@@ -53,11 +53,14 @@ class Snapshot:
     now: float  # of the clock that the story tells time by
 
 
-def take_snapshot(run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float) -> Snapshot:
-    """The run as it is at `now`, seconds of the monotonic clock; `uptime` in seconds."""
+def take_snapshot(
+    run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float, expires: float | None = None
+) -> Snapshot:
+    """The run as it is at `now`, seconds of the monotonic clock; `uptime` in seconds, `expires` since 1970."""
     workers = tuple(_worker(member, now) for member in run.exchange.members)
     standing = run.generation.standing()
-    status = replace(_status(run, name, standing, now), uptime=round(uptime, 1), dropped=dict(dropped))
+    status = _status(run, name, standing, now)
+    status = replace(status, uptime=round(uptime, 1), dropped=dict(dropped), expires=expires)
     evaluations = run.slack.evaluations.rows
     return Snapshot(status, workers, run.history.view(), evaluations, standing, run.last, run.slack.report.current,
                     run.fleet.story.view(), now)  # fmt: skip

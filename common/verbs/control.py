@@ -6,7 +6,7 @@ import argparse
 from dataclasses import dataclass
 
 from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.site import offer
+from dreamfleet.common.site import offer, reached
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class ControlVerb:
         from dreamfleet.common.client import Client
 
         asked = self.with_workers if self.with_workers and args.workers else self.name
-        with Client(args.connect) as client:
+        with Client(reached(args, "operator", "coordinator")) as client:
             name = args.run_name or client.status().run
             client.control(name, asked)
         answer(args, f"run {name} {self.outcome.format(run=name)}", run=name, asked=asked, accepted=True)

@@ -26,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--role", choices=ALL_ROLES, default="coordinator",
         help="exit 1 if this role cannot be played here (default coordinator, on which every other stands)",
     )  # fmt: skip
-    offer(parser, "runs_dir")
+    offer(parser, "runs_dir", "join")
     add_json(parser)
 
 
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.fingerprint import fingerprint
     from dreamfleet.common.health import examine, lacking
 
-    findings = examine(args.runs_dir)
+    findings = examine(args.runs_dir, args.site.join)
     roles = {role: lacking(role, findings) for role in ALL_ROLES}
     host = {"python": platform.python_version(), "platform": platform.platform(), "cores": cores(),
             "fingerprint": fingerprint()}  # fmt: skip

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.errors import ConnectionFailedError
-from dreamfleet.common.site import offer
+from dreamfleet.common.site import offer, reached
 
 if TYPE_CHECKING:
     from dreamfleet.common.client import Client
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the status."""
     from dreamfleet.common.client import Client
 
-    with Client(args.connect) as client:
+    with Client(reached(args)) as client:
         document = client.document(args.run)
         if args.watch:
             name = str(document.get("run"))

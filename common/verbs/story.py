@@ -9,7 +9,7 @@ import sys
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, print_rows
-from dreamfleet.common.site import offer
+from dreamfleet.common.site import offer, reached
 
 SUMMARY = "tell what happened to a live run's workers and jobs of late: given, seen, silent, reissued, accepted, ..."
 EXTRAS = ()
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--job {args.job!r}: write generation/index, such as 3/0")
     if args.worker is not None and not re.fullmatch(r"[A-Za-z0-9._/-]+", args.worker):
         raise UsageError(f"--worker {args.worker!r}: give a name as `dreamfleet status` shows it")
-    with Client(args.connect) as client:
+    with Client(reached(args)) as client:
         events, total = client.story(args.run_name, args.worker or "", args.job or "")
     if args.json:
         print(json.dumps([vars(each) for each in events]))

@@ -16,6 +16,7 @@ from dreamfleet.common.client import Client
 from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
 from dreamfleet.common.fields import known
+from dreamfleet.common.network import Network
 from dreamfleet.common.printable import shortened
 from dreamfleet.common.runs import RunFolder, open_run
 from dreamfleet.common.session import enqueue_into
@@ -62,8 +63,8 @@ class Picture:
 class Watcher:
     """Follows every live run, or one; called by one thread at a time."""
 
-    def __init__(self, connect: tuple[str, ...], run: str | None, runs_dir: Path) -> None:
-        self._connect = connect
+    def __init__(self, network: Network, run: str | None, runs_dir: Path) -> None:
+        self._network = network
         self._only = None if run is None else keys.check_run_name(run)
         self._runs_dir = runs_dir
         self._client: Client | None = None
@@ -98,7 +99,7 @@ class Watcher:
         """The answers of live runs by their names."""
         try:
             if self._client is None:
-                self._client = Client(self._connect)
+                self._client = Client(self._network)
                 heard = enqueue_into(self._farewells, "status", most=MOST_RUNS)
                 self._client.session.declare_subscriber(keys.event_status("*"), heard)
             found = self._client.statuses(ANSWER)
@@ -151,7 +152,7 @@ class Watcher:
             "link": "absent",
             "run": "",
             "live": sorted(live),
-            "address": ", ".join(self._connect),
+            "address": ", ".join(self._network.connect),
             "trouble": shortened(self._trouble, 1000),
             "only": self._only or "",
         }

@@ -126,9 +126,9 @@ class Commands:
                     "--seed", self.seed(Phase(number, EVOLVE)), *begun, *self._reached(listen)),
         )  # fmt: skip
 
-    def resume_run(self, number: int, listen: Sequence[str]) -> Words:
+    def resume_run(self, number: int, listen: Sequence[str], security: Sequence[str] = ()) -> Words:
         """The same evolution, continued."""
-        return _spelt("coordinator", "--resume", self.layout.run_name(number), *self._reached(listen))
+        return _spelt("coordinator", "--resume", self.layout.run_name(number), *security, *self._reached(listen))
 
     def _reached(self, listen: Sequence[str]) -> Words:
         return _spelt("--runs-dir", self.layout.runs, "--json", "--listen", *listen)

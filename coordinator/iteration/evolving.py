@@ -27,14 +27,19 @@ class Crew:
     slots: int
     coordinator: tuple[str, ...] = ()
     worker: tuple[str, ...] = ()
+    security: tuple[str, ...] = ()  # of its coordinators, begun or resumed
 
     @classmethod
     def of(
-        cls, listen: tuple[str, ...], local: int | None, coordinator: tuple[str, ...], worker: tuple[str, ...]
-    ) -> Crew:
+        cls, listen: tuple[str, ...], local: int | None, coordinator: tuple[str, ...], worker: tuple[str, ...],
+        join: Path | None = None, *, insecure: bool = False,
+    ) -> Crew:  # fmt: skip
         """As it was asked for: without an address on a free port of this host, scored by a slot a core."""
+        joined = () if join is None else ("--join", str(join))
+        security = (*joined, *(("--insecure",) if insecure else ()))
+        here = f"{'tcp' if join is None else 'tls'}/127.0.0.1:{_free_port()}"
         slots = local if local is not None else 0 if listen else cores()
-        return cls(listen or (f"tcp/127.0.0.1:{_free_port()}",), slots, coordinator, worker)
+        return cls(listen or (here,), slots, coordinator, (*worker, *joined), security)
 
     @property
     def near(self) -> str:

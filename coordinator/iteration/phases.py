@@ -195,13 +195,13 @@ class Phases:
 
     def _run_words(self, number: int, crew: Crew) -> Words:
         if is_there(self._layout.run(number) / JOURNAL):
-            return self._commands.resume_run(number, crew.listen)
+            return self._commands.resume_run(number, crew.listen, crew.security)
         start, subspace = None, None
         if self._config.go_on and not self._config.is_anew(number):
             start = self._layout.start(number)
             self._carry(number, start)
             subspace = self._find_subspace(number) if self._config.subspace else None
-        return self._commands.begin_run(number, crew.listen, crew.coordinator, start, subspace)
+        return self._commands.begin_run(number, crew.listen, (*crew.coordinator, *crew.security), start, subspace)
 
     def _find_subspace(self, number: int) -> Path | None:
         """Where a round's search goes; `None`, everywhere, if its model foretells nothing of the last drives."""

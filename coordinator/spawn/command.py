@@ -6,12 +6,15 @@ import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 from dreamfleet.common.config import add_flags
+from dreamfleet.common.credentials import MOST_BYTES
 from dreamfleet.common.eta import duration
+from dreamfleet.common.files import read_regular
 from dreamfleet.common.listing import add_json, print_rows
 from dreamfleet.common.printable import one_line, printable
-from dreamfleet.common.site import offer
+from dreamfleet.common.site import joined, offer
 from dreamfleet.coordinator.spawn.config import Host, SpawnConfig
 from dreamfleet.coordinator.spawn.many import bring_up, look
 from dreamfleet.coordinator.spawn.visit import FAILED, Reach, Row
@@ -28,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, hosts: Sequence[Host]) -> int:
     """Bring a worker up on each host, or look at it; exit 1 if one failed."""
-    reach = Reach(args.connect)
+    reach = _reach(args)
     if args.check:
         rows = look(hosts, reach)
         show_rows(args, rows)
@@ -36,6 +39,14 @@ def run(args: argparse.Namespace, hosts: Sequence[Host]) -> int:
         show = (lambda host, line: _show(args, host, line)) if args.follow else None
         rows = bring_up(hosts, reach, lambda rows: show_rows(args, rows), show)
     return exit_code(rows)
+
+
+def _reach(args: argparse.Namespace) -> Reach:
+    """Endpoints that were given, a worker's join file for all hosts, or by default this host's own."""
+    join: Path | None = args.site.join
+    if joined(args, ("worker",)) is None or join is None:
+        return Reach(args.connect)
+    return Reach(args.site.connect, read_regular(join, MOST_BYTES))
 
 
 def show_rows(args: argparse.Namespace, rows: Sequence[Row]) -> None:

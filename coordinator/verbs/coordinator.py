@@ -14,7 +14,8 @@ from dreamfleet.common.config import Table, add_flags, given, load
 from dreamfleet.common.descriptors import raise_limit
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.site import offer
+from dreamfleet.common.network import Network
+from dreamfleet.common.site import joined, offer
 from dreamfleet.common.unblocked import unblock_stderr
 from dreamfleet.coordinator.config import NO_SUBSPACE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.presets import find_preset
@@ -58,7 +59,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def add_settings(parser: argparse.ArgumentParser, default: str | None = None) -> None:
     """The arguments of whatever serves a run; `default` is shown instead of the settings' defaults."""
     add_json(parser)
-    offer(parser, "runs_dir")
+    offer(parser, "runs_dir", "join", "access_dir")
     add_flags(parser, RunConfig, default=default)
     add_flags(parser, LimitsConfig, NetworkConfig)
 
@@ -141,7 +142,10 @@ def request_of(
     if own.mixed:
         log.warning("--mixed is deprecated: a run takes any host unless it is --strict (--no-strict loosens one)")
     own = settle_strict(own, said="strict" in args.given)
-    return RunRequest(name, args.runs_dir, config, limits, choose_addresses(own, args.site, kept), start)
+    credentials = joined(args, ("coordinator",))
+    network = choose_addresses(own, args.site, kept, credentials)
+    Network(network.listen, network.connect, credentials).check_open(insecure=network.insecure)
+    return RunRequest(name, args.runs_dir, config, limits, network, start, credentials, args.site.access_dir)
 
 
 def serve_request(
@@ -223,7 +227,8 @@ def _report(
     from dreamfleet.common.runs import CONTROLLER
     from dreamfleet.common.stored import told
 
-    again = spoken("coordinator", "--resume", request.name, "--runs-dir", request.runs_dir)
+    join = () if args.site.join is None else ("--join", args.site.join)
+    again = spoken("coordinator", "--resume", request.name, "--runs-dir", request.runs_dir, *join)
     path = request.runs_dir / request.name / CONTROLLER
     controller = path if path.is_file() else None
     facts: dict[str, Any] = {"run": request.name, "ended": run.ended, "controller": controller, "continue": again}

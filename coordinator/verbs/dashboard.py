@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from dreamfleet.common.config import add_flags, load
-from dreamfleet.common.site import offer
+from dreamfleet.common.site import offer, reached
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 
 SUMMARY = "serve a read-only web page about live runs and those on this disk"
@@ -27,8 +27,10 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.dashboard.views import Views
     from dreamfleet.coordinator.dashboard.watching import Watcher
 
-    views = Views(("--connect", *args.connect), args.runs_dir, config.views)
-    serve(config, Watcher(args.connect, args.run, args.runs_dir), views, args.runs_dir, _tell)
+    network = reached(args)
+    joined = () if args.site.join is None else ("--join", str(args.site.join))
+    views = Views(("--connect", *network.connect, *joined), args.runs_dir, config.views)
+    serve(config, Watcher(network, args.run, args.runs_dir), views, args.runs_dir, _tell)
     return 0
 
 

@@ -12,9 +12,10 @@ from dreamfleet.common.config import add_flags, given, load
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files import is_file
 from dreamfleet.common.listing import add_json, answer, print_rows
-from dreamfleet.common.site import offer
+from dreamfleet.common.network import Network
+from dreamfleet.common.site import joined, offer
 from dreamfleet.common.variants import Variant
-from dreamfleet.coordinator.config import DEFAULT_BUNDLE, RunConfig
+from dreamfleet.coordinator.config import DEFAULT_BUNDLE, NetworkConfig, RunConfig
 from dreamfleet.coordinator.iteration.config import IterateConfig
 
 if TYPE_CHECKING:
@@ -37,7 +38,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--redo", metavar="ROUND/PHASE", help="first forget this phase and all behind it, such as 2/mdnrnn"
     )
     add_json(parser)
-    offer(parser, "listen", texts={"listen": "workers of any host find the rounds' runs here (default: none do)"})
+    listen = "workers of any host find the rounds' runs here (default: none do)"
+    offer(parser, "listen", "join", texts={"listen": listen, "join": "a coordinator's join file, for the rounds' runs"})
+    add_flags(parser, NetworkConfig, only=["insecure"])
     add_flags(parser, IterateConfig)
     parser.add_argument(
         "--from-zero", dest="go_on", action="store_const", const=False, default=argparse.SUPPRESS,
@@ -85,6 +88,7 @@ def _open(args: argparse.Namespace, layout: Layout, stop: Stop) -> Iteration:
     ledger = Ledger.begin(config, settings) if begun is None or new else begun.take(config, settings, layout.root)
     if config.local == 0 and not args.listen:
         raise UsageError("nobody would score: give --local slots here, or --listen for workers of other hosts")
+    Network(args.listen, credentials=joined(args, ("coordinator",))).check_open(insecure=_insecure(args))
     iteration = Iteration(layout, config, ledger, lambda: _crew(args, config, more, settings["task"]), stop)
     if args.redo:
         if (phase := Phase.of(args.redo)).name == INIT:
@@ -129,7 +133,12 @@ def _crew(args: argparse.Namespace, config: IterateConfig, more: tuple[str, ...]
     from dreamfleet.coordinator.iteration.evolving import Crew
 
     own = ("--task", task) if ":" in task else ()
-    return Crew.of(args.listen, config.local, more, own)
+    return Crew.of(args.listen, config.local, more, own, args.site.join, insecure=_insecure(args))
+
+
+def _insecure(args: argparse.Namespace) -> bool:
+    """What the flag, the environment or the file's [network] say, which the rounds' coordinators follow too."""
+    return load(NetworkConfig, "network", **args.sources).insecure
 
 
 def _go_on(iteration: Iteration) -> None:

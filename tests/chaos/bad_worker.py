@@ -38,7 +38,7 @@ class Bench:
         self._near = near
         self.coordinator = processes.start(
             "coordinator", "--run", "run", "--runs-dir", processes.runs, "--listen", processes.endpoint, near,
-            "--bundle", bundle, "--evaluate-every", 0, "--generations", 10**6, *settings,
+            "--insecure", "--bundle", bundle, "--evaluate-every", 0, "--generations", 10**6, *settings,
         )  # fmt: skip
         self.coordinator.wait_for("incarnation")
         self.good = self.worker("good", inside=("taskset", "-c", "0"))

@@ -37,7 +37,7 @@ def test_a_host_that_is_cut_off_costs_no_bit_and_comes_back(processes, hosts, ra
     near = [f"tcp/{host.address}:{processes.port}" for host in hosts]
     coordinator = processes.start(
         "coordinator", "--run", "two", "--runs-dir", processes.runs, "--beat", 0.2,
-        "--listen", processes.endpoint, *near, *settings,
+        "--listen", processes.endpoint, *near, "--insecure", *settings,
     )  # fmt: skip
     coordinator.wait_for("incarnation")
     for number, host in enumerate(hosts):

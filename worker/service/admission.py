@@ -36,17 +36,20 @@ class Admission:
     classes: bool = False  # whether the coordinator knows classes of hosts
 
 
-def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> Admission | None:
+def ask(
+    session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox, *, secured: bool = False
+) -> Admission | None:
     """Say hello to `run`, or to the only live one; `None` if nobody answers, `RefusedError` if the answer is no.
 
     A run that asks for a task which the request does not announce is refused in turn: its word imports nothing here.
+    In a `secured` fleet it is said under this worker's own name.
     Where the run's fingerprint names other packages than the request's, hello is said again about those.
     """
-    reply = _say(session, run, request, inbox)
+    reply = _say(session, run, request, inbox, secured)
     if reply is not None and not reply.accepted and reply.packages != request.packages:
         named = fingerprint(reply.packages)[:MAX_TEXT]  # the packages that they name are theirs to choose
         about = replace(request, packages=reply.packages, fingerprint=named)
-        reply = _say(session, reply.run, about, inbox)
+        reply = _say(session, reply.run, about, inbox, secured)
     if reply is None:
         return None
     admission = _admission(reply)
@@ -54,8 +57,11 @@ def ask(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: I
     return admission
 
 
-def _say(session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox) -> HelloReply | None:
-    replies = [reply for payload in ask_all(session, [keys.hello(run or "*")], HELLO_TIMEOUT, encode_json(request))
+def _say(
+    session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox, secured: bool
+) -> HelloReply | None:
+    key = keys.hello_of(run or "*", request.worker) if secured else keys.hello(run or "*")
+    replies = [reply for payload in ask_all(session, [key], HELLO_TIMEOUT, encode_json(request))
                if (reply := inbox.decode_json(HelloReply, payload)) is not None and _names_a_run(reply)]  # fmt: skip
     if not replies:
         return None

@@ -16,6 +16,7 @@ from dreamfleet.common import keys
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.cores import cores
+from dreamfleet.common.credentials import seated
 from dreamfleet.common.errors import ConnectionFailedError, RefusedError
 from dreamfleet.common.session import Network, open_session
 from dreamfleet.common.store import BundleStore, default_cache
@@ -42,6 +43,9 @@ class Worker:
                 name
             )  # one that cannot be loaded is an error now, and not once a run has taken this worker's word
         self.identity = keys.new_worker(config.name)
+        if network.credentials is not None:
+            label, _, life = self.identity.partition("/")
+            self.identity = f"{seated(label, network.credentials)}/{life}"
         self.inbox = Inbox()
         self._config = config
         self._network = network
@@ -137,7 +141,8 @@ class Worker:
         log.warning("%s; asking it again in %.0f s", error, self._refusals.add(run, monotonic()))
 
     def _ask(self, session: zenoh.Session, run: str | None, host_class: str = "") -> Admission | None:
-        return ask(session, run, replace(self._hello, host_class=host_class), self.inbox)
+        request, secured = replace(self._hello, host_class=host_class), self._network.credentials is not None
+        return ask(session, run, request, self.inbox, secured=secured)
 
     def _obtain_bundle(self, session: zenoh.Session, admission: Admission) -> Bundle | None:
         store = BundleStore(default_cache())

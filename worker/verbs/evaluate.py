@@ -11,7 +11,7 @@ from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.saving import check_out, saving
 from dreamfleet.common.seeds import TEST
-from dreamfleet.common.site import offer
+from dreamfleet.common.site import offer, reached
 from dreamfleet.common.threads import pin_thread_pools
 
 if TYPE_CHECKING:
@@ -75,9 +75,9 @@ def _choose(args: argparse.Namespace) -> tuple[str, Agent]:
     from dreamfleet.worker.scoring.agents import agent_of
     from dreamfleet.worker.service.bundle_fetch import fetch_for
 
-    live = bool(args.run_name) or "connect" in args.given
+    live = bool(args.run_name) or bool({"connect", "join"} & args.given)
     if live and not args.controller:
-        with Client(args.connect) as client:
+        with Client(reached(args)) as client:
             run = args.run_name or client.status().run
             reported = client.controller(run)
             if args.bundle is None:

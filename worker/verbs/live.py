@@ -13,7 +13,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.seeds import TEST
-from dreamfleet.common.site import offer
+from dreamfleet.common.site import offer, reached
 
 if TYPE_CHECKING:
     from dreamfleet.common.bundle import Bundle
@@ -120,7 +120,7 @@ def _pictures(args: argparse.Namespace) -> Iterator[Iterator[Shown | None]]:
     if args.controller:
         yield _drives(args, _found(args))
         return
-    with Client(args.connect) as client:
+    with Client(reached(args)) as client:
         if args.best:
             name = args.run_name or client.status().run
             yield _drives(args, lambda: _best(client, name))

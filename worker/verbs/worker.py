@@ -7,8 +7,7 @@ import signal
 
 from dreamfleet.common.config import add_flags, load
 from dreamfleet.common.descriptors import raise_limit
-from dreamfleet.common.network import Network
-from dreamfleet.common.site import offer
+from dreamfleet.common.site import offer, reached
 from dreamfleet.common.unblocked import unblock_stderr
 from dreamfleet.worker.service.config import WorkerConfig
 
@@ -30,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     unblock_stderr()
     raise_limit()
     config = load(WorkerConfig, "worker", **args.sources)
-    worker = Worker(config, Network(connect=args.connect), tuple(args.task))
+    worker = Worker(config, reached(args, "worker", "coordinator"), tuple(args.task))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: worker.stop())
     worker.serve()

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
+from dreamfleet.common.network import Network
 from dreamfleet.coordinator.dashboard.app import make_app
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.dashboard.feed import Feed
@@ -30,7 +31,7 @@ def runs(tmp_path):
 
 
 def client_of(runs, host="127.0.0.1", base=HOME, **config):
-    feed = Feed(Watcher(("tcp/127.0.0.1:1",), None, runs))
+    feed = Feed(Watcher(Network(connect=("tcp/127.0.0.1:1",)), None, runs))
     app = make_app(feed, Views(("--connect", "tcp/127.0.0.1:1"), runs, 1), runs, DashboardConfig(host=host, **config))
     return TestClient(app, base_url=base, follow_redirects=False)
 

@@ -1,0 +1,43 @@
+"""Why a secured router does not let somebody in, in words: Zenoh says only that nobody could be reached."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from collections.abc import Iterable
+
+from dreamfleet.common.credentials import Credentials
+
+PATIENCE = 2.0  # seconds
+
+
+def trouble_with(endpoints: Iterable[str], credentials: Credentials) -> str | None:
+    """What is wrong at the first endpoint where somebody listens; `None` if nobody does."""
+    for endpoint in endpoints:
+        host, _, port = endpoint.partition("/")[2].rpartition(":")
+        try:
+            link = socket.create_connection((host.strip("[]"), int(port)), PATIENCE)
+        except OSError:
+            continue
+        with link:
+            return (
+                f"{endpoint} lets {credentials.identity} ({credentials.name}) not in: {_said(link, host, credentials)}"
+            )
+    return None
+
+
+def _said(link: socket.socket, host: str, credentials: Credentials) -> str:
+    context = ssl.create_default_context(cadata=credentials.ca)
+    try:
+        with context.wrap_socket(link, server_hostname=host.strip("[]")):
+            return (
+                "it is of this fleet, and refuses this join file; it may be of another authority, expired or revoked: "
+                "have another issued"
+            )
+    except ssl.SSLCertVerificationError as error:
+        return (
+            f"its certificate is not good here ({error.verify_message.rstrip('.')}): it is another fleet's, has "
+            "expired, or was issued without --host for this name; have the coordinator's join file issued again"
+        )
+    except (OSError, ValueError):
+        return "it speaks no TLS: its coordinator was started without --join"

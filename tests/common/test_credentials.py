@@ -1,0 +1,134 @@
+"""Join files: made by an authority, read strictly, and of use to nobody but their owner."""
+
+import os
+import stat
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from dreamfleet.common.authority import Authority
+from dreamfleet.common.cli import main
+from dreamfleet.common.credentials import MOST_BYTES, read_join, seat_of_worker, seated
+from dreamfleet.common.errors import AccessError, UsageError
+from dreamfleet.common.ledger import ISSUED, Ledger, Revocations
+
+HERE = ["tls/127.0.0.1:7447"]
+
+
+@pytest.fixture(scope="module")
+def access(tmp_path_factory):
+    before = os.umask(0)  # whatever it is, nothing that is secret is anybody else's
+    try:
+        authority = Authority.create(tmp_path_factory.mktemp("keys") / "access")
+        authority.issue("worker", "box", authority._folder / "box.join", connect=HERE)
+    finally:
+        os.umask(before)
+    return authority
+
+
+@pytest.fixture
+def join(access, tmp_path):
+    path = tmp_path / "box.join"
+    path.write_bytes((access._folder / "box.join").read_bytes())
+    path.chmod(0o600)
+    return path
+
+
+def test_what_an_authority_writes_is_its_owners_alone(access):
+    assert stat.S_IMODE(access._folder.stat().st_mode) == 0o700
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in access._folder.iterdir() if path.name != "lock"}
+    assert modes == dict.fromkeys(("ca.pem", "ca.key", "issued.json", "box.join"), 0o600)
+
+
+def test_a_join_file_says_who_its_holder_is_and_shows_no_secret(join):
+    found = read_join(join)
+    assert (found.role, found.name, found.connect, found.identity) == ("worker", "box", tuple(HERE), "worker.1")
+    assert "PRIVATE KEY" in found.key
+    assert "BEGIN" not in repr(found)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda text: "", "no join file of this version"),
+        (lambda text: "not = [toml", "no TOML"),
+        (lambda text: text + "#" * MOST_BYTES, "larger than"),
+        (lambda text: text.replace("version = 1", "version = 2"), "of this version"),
+        (lambda text: text.replace('role = "worker"', 'role = "king"'), "means nothing here"),
+        (lambda text: text.replace("seat = 1", "seat = 0"), "means nothing here"),
+        (lambda text: text.replace("seat = 1", 'seat = "1"'), "'seat' is not of its kind"),
+        (lambda text: text.replace("Z\nconnect", "\nconnect"), "means nothing here"),
+        (lambda text: text.replace("name =", "nom ="), "'name' is missing"),
+        (lambda text: text + 'more = "x"\n', "'more' is unknown"),
+        (lambda text: text.replace('["tls/127.0.0.1:7447"]', "[1]"), "'connect' is not of its kind"),
+        (lambda text: text.partition("certificate =")[0], "what proves its role is missing"),
+    ],
+)  # fmt: skip
+def test_what_is_no_join_file_is_refused_in_a_line(join, damage, says):
+    join.write_text(damage(join.read_text()))
+    with pytest.raises(AccessError, match=says) as refused:
+        read_join(join)
+    assert "BEGIN" not in str(refused.value)
+
+
+def test_a_join_file_that_others_may_read_has_expired_or_is_none_is_refused(join, tmp_path):
+    with pytest.raises(AccessError, match="expired on"):
+        read_join(join, datetime.now(UTC) + timedelta(days=31))
+    with pytest.raises(AccessError, match="no join file at"):
+        read_join(tmp_path / "nowhere")
+    with pytest.raises(AccessError, match="Is a directory"):
+        read_join(tmp_path)
+    for mode in (0o640, 0o604):
+        join.chmod(mode)
+        with pytest.raises(AccessError, match="chmod 600"):
+            read_join(join)
+
+
+def test_a_workers_name_ends_in_its_seat(join):
+    assert seated("gpu", read_join(join)) == "gpu.1"
+    assert seated("x" * 63, read_join(join)) == "x" * 61 + ".1"
+    assert seat_of_worker("gpu.1/0badc0de") == "worker.1"
+
+
+def test_a_seat_is_its_names_until_it_is_revoked_and_then_nobodys(access, tmp_path):
+    seats = [access.issue("viewer", "anna", tmp_path / f"{number}", connect=HERE).seat for number in range(2)]
+    access.revoke("anna")
+    seats.append(access.issue("viewer", "anna", tmp_path / "2", connect=HERE).seat)
+    seats.append(access.issue("viewer", "ben", tmp_path / "3", connect=HERE).seat)
+    assert seats == [1, 1, 2, 3]
+    with pytest.raises(UsageError, match="exists"):
+        access.issue("viewer", "ben", tmp_path / "3", connect=HERE)
+    with pytest.raises(UsageError, match="nothing is issued to 'carl'"):
+        access.revoke("carl")
+
+
+def test_what_is_revoked_is_seen_while_it_is_watched_and_what_is_damaged_takes_nothing_back(access, join, tmp_path):
+    folder = tmp_path / "carried"
+    folder.mkdir()
+    watched = Revocations(folder, read_join(join))
+    assert not watched.barred
+    ledger = Ledger.load(access._folder / ISSUED)
+    ledger.with_revoked([each for each in ledger.issued if each.name == "box"], 1.0).save(folder / ISSUED)
+    watched.look(10.0)
+    assert "worker.1" in watched.barred
+    (folder / ISSUED).write_text("{")
+    watched.look(20.0)
+    assert "worker.1" in watched.barred
+
+
+def test_the_verbs_make_list_and_take_back(tmp_path, capsys):
+    folder = ("--access-dir", str(tmp_path / "access"))
+    out = tmp_path / "w.join"
+    assert main(["access", "init", *folder]) == 0
+    assert main(["access", "issue", "worker", "w1", *folder, "--connect", *HERE, "--out", str(out)]) == 0
+    assert read_join(out).name == "w1"
+    assert main(["access", "revoke", "w1", *folder]) == 0
+    assert main(["access", "list", *folder]) == 0
+    listed = capsys.readouterr().out
+    assert "revoked" in listed
+    assert "BEGIN" not in listed
+    assert main(["access", "init", *folder]) == 2
+    assert main(["access", "issue", "worker", "w2", *folder, "--connect", "tcp/h:1", "--out", f"{out}2"]) == 2
+    assert main(["access", "issue", "coordinator", "c", *folder, "--out", f"{out}2"]) == 2
+    assert main(["pause", "--join", str(out)]) == 1
+    assert "this needs one whose role is operator or coordinator" in capsys.readouterr().err

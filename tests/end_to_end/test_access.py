@@ -1,0 +1,224 @@
+"""A fleet with join files: who is let in, who may do what, and that a run is none the worse for the others."""
+
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from dreamfleet.common import keys
+from dreamfleet.common.authority import Authority
+from dreamfleet.common.client import Client
+from dreamfleet.common.codec import encode, encode_json
+from dreamfleet.common.credentials import read_join
+from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.runs import open_run
+from dreamfleet.common.session import MAX_PASSED, Network, open_session
+from dreamfleet.worker.service.admission import make_request
+from tests.support import tasks
+from tests.support.processes import free_port
+from tests.support.samples import MSGPACK
+
+LIFE = "0badc0de"
+PATIENCE = 60  # seconds
+
+
+class Access:
+    """An authority, with a join file for each actor."""
+
+    def __init__(self, folder, **how):
+        self.folder = folder
+        self.authority = Authority.create(folder, **how)
+        somewhere = ["tls/127.0.0.1:7447"]
+        self.authority.issue("coordinator", "home", self.path("coordinator"), hosts=["home.example"])
+        for role, name in (("worker", "first"), ("worker", "second"), ("viewer", "viewer"), ("operator", "operator")):
+            self.authority.issue(role, name, self.path(name), connect=somewhere)
+
+    def path(self, name):
+        return self.folder / f"{name}.join"
+
+    def network(self, name, endpoint):
+        return Network(connect=(endpoint,), credentials=read_join(self.path(name)))
+
+
+@pytest.fixture(scope="module")
+def access(tmp_path_factory):
+    return Access(tmp_path_factory.mktemp("certificates") / "access")
+
+
+@pytest.fixture
+def endpoint():
+    return f"tls/127.0.0.1:{free_port()}"
+
+
+def begin(processes, access, endpoint, bundle, *more, name="safe"):
+    process = processes.start(
+        "coordinator", "--run", name, "--runs-dir", processes.runs, "--beat", 0.2, "--listen", endpoint,
+        "--join", access.path("coordinator"), "--access-dir", access.folder, "--bundle", bundle.path,
+        "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0, *more,
+    )  # fmt: skip
+    process.wait_for("incarnation")
+    return process
+
+
+def work(processes, access, endpoint, who, name="safe"):
+    return processes.start(
+        "worker", "--join", access.path(who), "--connect", endpoint, "--run", name, "--slots", 1,
+        "--task", tasks.SLOW_TOY,
+    )  # fmt: skip
+
+
+def until(found, what):
+    deadline = time.monotonic() + PATIENCE
+    while not found():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+
+
+def fitness(processes, name, generations=3):
+    with open_run(processes.runs, name) as run:
+        return [[run.fitness(generation, index) for index in range(4)] for generation in range(generations)]
+
+
+def test_each_may_do_what_its_role_says_and_the_run_is_none_the_worse(processes, access, endpoint, random_bundle):
+    coordinator = begin(processes, access, endpoint, random_bundle, "--generations", 3)
+    own, foreign, garbage = f"x.1/{LIFE}", f"x.2/{LIFE}", b"\xc1"  # `first` has seat 1
+    asks = {
+        "status": keys.status("safe"), "best": keys.status("safe", "best"),
+        "bundle": keys.bundle("safe", random_bundle.sha256), "pause": keys.control("safe", "pause"),
+        "hello": keys.hello("safe"), "own hello": keys.hello_of("safe", own),
+        "another's hello": keys.hello_of("safe", foreign),
+    }  # fmt: skip
+    may, heard = {}, []
+    with Client(access.network("operator", endpoint)) as operator:
+        hello = encode_json(make_request(own, (tasks.SLOW_TOY,), 1))
+        with ExitStack() as stack:
+            sessions = {who: stack.enter_context(open_session(access.network(who, endpoint)))
+                        for who in ("first", "viewer", "operator")}  # fmt: skip
+            asked, kept = {}, []
+            for who, session in sessions.items():
+                for kind in (keys.result, keys.beat, keys.upload):
+                    session.put(kind("safe", foreign), garbage)
+                session.put(keys.job("safe", own), encode(MSGPACK["job"]))
+                session.put(keys.event_status("safe"), garbage)
+                kept.append(session.declare_subscriber(keys.job("safe", foreign), heard.append))
+                kept.append(session.liveliness().declare_token(keys.live_worker("safe", foreign)))
+                asked[who] = {name: session.get(key, payload=hello, timeout=4) for name, key in asks.items()}
+            for who, answers in asked.items():  # what is not allowed is answered by nobody
+                may[who] = [name for name, replies in answers.items() if any(reply.ok for reply in replies)]
+            # What may be said arrives, and nothing that was said before it.
+            sessions["first"].put(keys.result("safe", own), garbage)
+            sessions["first"].put(keys.result("safe", own), bytes(MAX_PASSED + 1))
+            until(lambda: operator.status().dropped, "what a worker may say did not arrive")
+            for each in kept:
+                each.undeclare()
+        assert may == {
+            "first": ["status", "bundle", "own hello"],
+            "viewer": ["status", "best"],
+            "operator": ["status", "best", "bundle", "pause"],
+        }
+        assert operator.status().dropped == {"not msgpack": 1}
+        assert operator.status().state == "paused"
+        assert not heard
+        operator.control("safe", "resume")
+        worker = work(processes, access, endpoint, "first")
+        worker.wait_for("joined")
+        assert {each.worker.split("/")[0].rpartition(".")[2] for each in operator.workers("safe")} == {"1"}
+        assert operator.status().expires > time.time() + 80 * 86400
+        until(lambda: not operator.runs(), "the run does not end")
+    assert coordinator.finish()[0] == 0
+
+    plain = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
+        "--generations", 3, name="plain",
+    )  # fmt: skip
+    processes.worker("--task", tasks.SLOW_TOY)
+    assert plain.finish()[0] == 0
+    assert fitness(processes, "safe") == fitness(processes, "plain")
+    body = read_join(access.path("coordinator")).key.splitlines()[1]
+    assert not [path for path in (processes.runs / "safe").iterdir() if body.encode() in path.read_bytes()]
+    assert not [line for line in (*coordinator.lines, *worker.lines) if body in line]
+    assert (processes.runs / "safe").stat().st_mode & 0o077 == 0
+    assert (processes.runs / "safe" / "journal.sqlite").stat().st_mode & 0o077 == 0
+
+
+def test_who_is_not_of_the_fleet_is_not_let_in_and_is_told_why(access, endpoint, tmp_path):
+    other = Access(tmp_path / "other")
+    good, elsewhere = read_join(access.path("viewer")), f"tls/127.0.0.2:{free_port()}"
+    expired = access.authority.issue(
+        "viewer", "late", tmp_path / "late", connect=[endpoint], now=datetime.now(UTC) - timedelta(days=91)
+    )
+    strangers = {
+        "of another authority": (read_join(other.path("viewer")), endpoint, "it is another fleet's"),
+        "without a certificate": (replace(good, certificate="", key=""), endpoint, "refuses this join file"),
+        "expired": (expired, endpoint, "refuses this join file"),
+        "at a wrong name": (good, elsewhere, "issued without --host for this name"),
+    }
+    with open_session(Network(listen=(endpoint, elsewhere), credentials=read_join(access.path("coordinator")))):
+        for who, (credentials, where, why) in strangers.items():
+            with pytest.raises(ConnectionFailedError) as refused:
+                open_session(Network(connect=(where,), credentials=credentials), timeout=1)
+            assert why in str(refused.value), who
+        open_session(Network(connect=(endpoint,), credentials=good)).close()
+        with pytest.raises(ConnectionFailedError):
+            open_session(Network(connect=(endpoint.replace("tls", "tcp"),)), timeout=1)
+
+
+def test_a_worker_that_is_revoked_counts_no_more_while_the_run_goes_on(processes, access, endpoint, random_bundle):
+    seats = {}
+    for name in ("fired", "newcomer"):
+        seats[name] = access.authority.issue("worker", name, access.path(name), connect=[endpoint]).seat
+        if name == "fired":  # the other one's file is made while the run is served
+            coordinator = begin(processes, access, endpoint, random_bundle, "--generations", 10_000)
+    work(processes, access, endpoint, "fired").wait_for("joined")
+    coordinator.wait_for("generation 1: mean")
+    assert processes.call("access", "revoke", "fired", "--access-dir", access.folder)[0] == 0
+    coordinator.wait_for(f"worker.{seats['fired']} is revoked")
+    with Client(access.network("operator", endpoint)) as client:
+        until(lambda: client.status().slots == 0, "the worker still counts")
+        until(lambda: any("revoked" in why for why in client.status().refused.values()), "it was not refused")
+        work(processes, access, endpoint, "newcomer").wait_for("joined")
+        before = client.status().generations
+        until(lambda: client.status().generations > before + 1, "the run does not go on")
+        client.control("safe", "stop")
+    coordinator.finish()
+    # The next start: the router itself lets it do nothing.
+    barred, said = frozenset({f"worker.{seats['fired']}"}), []
+    network = Network(listen=(endpoint,), credentials=read_join(access.path("coordinator")), barred=barred)
+    own = {name: keys.result("safe", f"x.{seat}/{LIFE}") for name, seat in seats.items()}
+    with open_session(network) as router:
+        listening = router.declare_subscriber(keys.any_worker("result", "safe"), said.append)
+        for name in ("fired", "newcomer"):
+            with open_session(access.network(name, endpoint)) as session:
+                session.put(own[name], b"")
+        until(lambda: said, "nothing arrives")
+        listening.undeclare()
+    assert [str(each.key_expr) for each in said] == [own["newcomer"]]
+
+
+def test_a_fleet_is_joined_by_passwords_too(processes, tmp_path, endpoint, random_bundle):
+    access = Access(tmp_path / "access", passwords=True)
+    assert not read_join(access.path("first")).certificate
+    coordinator = begin(processes, access, endpoint, random_bundle, "--generations", 1)
+    viewer = access.network("viewer", endpoint)
+    with Client(viewer) as client:
+        assert client.status().state == "waiting for workers"
+        assert not list(client.session.get(keys.control("safe", "stop"), timeout=2))
+    for wrong in (replace(viewer.credentials, password="0" * 64), replace(viewer.credentials, role="operator")):
+        with pytest.raises(ConnectionFailedError, match="refuses this join file"):
+            open_session(replace(viewer, credentials=wrong), timeout=1)
+    work(processes, access, endpoint, "first").wait_for("joined")
+    assert coordinator.finish()[0] == 0
+
+
+def test_nobody_listens_beyond_this_host_without_security_unless_that_is_said(processes, access):
+    anywhere = f"tcp/0.0.0.0:{processes.port}"
+    words = ("coordinator", "--run", "open", "--runs-dir", processes.runs, "--listen", anywhere)
+    code, _, err = processes.call(*words)
+    assert (code, "owns the run" in err, "--insecure" in err) == (2, True, True)
+    process = processes.start(*words, "--insecure")
+    process.wait_for("anyone who reaches the port owns the run")
+    process.end()
+    code, _, err = processes.call(*words, "--join", access.path("coordinator"))
+    assert (code, f"it is tls/0.0.0.0:{processes.port}" in err) == (2, True)
