@@ -222,3 +222,26 @@ def test_nobody_listens_beyond_this_host_without_security_unless_that_is_said(pr
     process.end()
     code, _, err = processes.call(*words, "--join", access.path("coordinator"))
     assert (code, f"it is tls/0.0.0.0:{processes.port}" in err) == (2, True)
+
+
+def test_a_router_of_its_own_holds_everybody_to_the_same_rules(processes, access, endpoint, random_bundle):
+    join = access.path("router")
+    access.authority.issue("router", "middle", join, hosts=["router.example"])
+    begun = ("router", "--join", join, "--access-dir", access.folder, "--listen", endpoint)
+    processes.start(*begun).wait_for("listening on")
+    code, out, err = processes.call(*begun, "--print-config")
+    assert (code, out, "secret" in err) == (2, "", True)
+    coordinator = processes.start(
+        "coordinator", "--run", "far", "--runs-dir", processes.runs, "--beat", 0.2, "--connect", endpoint,
+        "--join", access.path("coordinator"), "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY,
+        "--population", 4, "--evaluate-every", 0, "--generations", 1,
+    )  # fmt: skip
+    coordinator.wait_for("incarnation")
+    for who, may in (("viewer", False), ("operator", True)):
+        with open_session(access.network(who, endpoint)) as session:
+            replies = session.get(keys.control("far", "resume"), timeout=PATIENCE if may else 2)
+            assert any(reply.ok for reply in replies) == may
+    code, _, err = processes.call("pause", "far", "--join", access.path("viewer"), "--connect", endpoint)
+    assert (code, "needs one whose role is operator" in err) == (1, True)
+    work(processes, access, endpoint, "second", name="far").wait_for("joined")
+    assert coordinator.finish()[0] == 0

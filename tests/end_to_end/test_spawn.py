@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.authority import Authority
 from dreamfleet.coordinator.spawn.agent import birth
 from dreamfleet.coordinator.spawn.parcel import pack_wheel
 from tests.support import tasks
@@ -285,3 +286,19 @@ def pip_of(host):
             if str(host.home).encode() in words[0] and b"install" in words:
                 return int(path.name), int((path / "stat").read_text().rpartition(")")[2].split()[1])
     return None
+
+
+def test_a_join_file_is_handed_over_by_no_command_line_for_its_reader_alone(processes, hosts, tmp_path):
+    a, join = hosts.add("a"), tmp_path / "hosts.join"
+    authority = Authority.create(tmp_path / "access")
+    authority.issue("worker", "hosts", join, connect=[f"tls/127.0.0.1:{processes.port}"])
+    watched = tmp_path / "python"
+    watched.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/words\nexec {sys.executable} "$@"\n')
+    watched.chmod(0o755)
+    told(processes, "spawn", "a", "--ssh", hosts.ssh, "--remote-python", watched, "--join", join)
+    there = a.root() / "workers" / "a" / "join"
+    assert there.read_bytes() == join.read_bytes()
+    assert there.stat().st_mode & 0o777 == 0o600
+    assert "PRIVATE" not in (tmp_path / "words").read_text()
+    told(processes, "down", "a", *words(hosts))
+    assert list(a.home.iterdir()) == []
