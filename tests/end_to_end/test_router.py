@@ -88,7 +88,7 @@ def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a
                                       "router_example:7447": f"{host.address}:{processes.port}"}).rename(
                     processes.folder / f"{host.name}.toml") for host in (inside, elsewhere)]  # fmt: skip
         listen = [f"tcp/{host.address}:{processes.port}" for host in (inside, elsewhere)]
-        processes.start("router", "--listen", *listen).wait_for("listening on")
+        processes.start("router", "--insecure", "--listen", *listen).wait_for("listening on")
         coordinator = processes.start("coordinator", "--config", near[0], "--run", "nat", "--runs-dir", processes.runs,
                                       "--bundle", random_bundle.path, *SETTINGS, inside=inside.inside)  # fmt: skip
         worker = processes.start("worker", "--config", near[1], "--run", "nat", "--task", tasks.SLOW_TOY, "--slots", 2,
