@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-import os
+import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -79,37 +79,44 @@ class Ledger:
 
 
 class Revocations:
-    """Which seats are barred, by a ledger that may change while this lives; `None`: nothing is."""
+    """Which seats are barred, by a ledger that may change while this lives; without credentials nothing is."""
 
     def __init__(self, folder: Path, credentials: Credentials | None) -> None:
+        """`AccessError` where the folder's ledger is damaged or another authority's: what it revoked would stand."""
         self._path = folder / ISSUED
         self._authority = credentials.authority if credentials else None
         self._next = float("-inf")
         self._seen: tuple[int, int, int] | None = None
         self.barred: frozenset[str] = frozenset()
-        self.look(0.0)
+        if credentials is None:
+            return
+        if not self._path.exists():
+            log.warning("there is no %s: nothing is revoked (--access-dir)", self._path)
+        else:
+            self._take(time.monotonic())
 
     def look(self, now: float) -> None:
         """Read it again if it changed; what cannot be read leaves what is known."""
         if self._authority is None or now < self._next:
             return
+        try:
+            self._take(now)
+        except AccessError as error:
+            log.warning("%s; what was revoked until now stays so", error)
+
+    def _take(self, now: float) -> None:
         self._next = now + PACE
         try:
-            found = os.stat(self._path)  # noqa: PTH116 - all of it is wanted
-        except OSError:
+            found = self._path.stat()
+        except OSError:  # gone
             return
         seen = found.st_ino, found.st_mtime_ns, found.st_size
         if seen == self._seen:
             return
         self._seen = seen
-        try:
-            ledger = Ledger.load(self._path)
-        except AccessError as error:
-            log.warning("%s; what was revoked until now stays so", error)
-            return
+        ledger = Ledger.load(self._path)
         if ledger.authority != self._authority:
-            log.warning("%s is of another authority: nothing is revoked by it", self._path)
-            return
+            raise AccessError(f"{self._path} is of another authority than the join file: name its own --access-dir")
         for each in sorted(ledger.barred() - self.barred):
             log.warning("%s is revoked: nothing that it says counts", each)
         self.barred = ledger.barred()

@@ -58,6 +58,7 @@ LINGER = 0.005  # seconds that a commit waits for more to share it
 SNAPSHOT_INTERVAL = 0.2
 SUMMARY = 60.0  # seconds from one line about the run to the next
 DISBANDING = 10.0  # seconds that workers may take to leave a run that ends with them
+DAY = 86_400.0  # seconds from one warning of the join file's end to the next
 ALONE = 5.0  # seconds without a worker after which the log says so
 _REPEATED: dict[str, type[Message]] = {"result": ResultBatch, "beat": Beat, "upload": UploadPart}
 
@@ -85,6 +86,7 @@ class Service:
         self._disbanding_since: float | None = None  # every batch then says `leave`
         self._told_at = -math.inf
         self._evaluations_told = 0
+        self._expiry_at = 0.0
 
     def stop(self) -> None:
         """End the loop soon; the run can be continued. Safe in a signal handler."""
@@ -205,12 +207,15 @@ class Service:
             self._summed_up = now
             text, facts = summary(status_of(self._snapshot))
             log.info("%s", text, extra={"facts": facts})
-            self._tell_expiry()
+            self._tell_expiry(now)
 
-    def _tell_expiry(self) -> None:
-        """Say so from a week before on: links break when a certificate ends."""
+    def _tell_expiry(self, now: float) -> None:
+        """Say so once a day from a week before on: links break when a certificate ends."""
         credentials = self._network.credentials
-        if credentials is not None and (left := credentials.left(datetime.now(UTC))) < SOON:
+        if credentials is None or now < self._expiry_at:
+            return
+        self._expiry_at = now + DAY
+        if (left := credentials.left(datetime.now(UTC))) < SOON:
             facts = {"event": "expiry", "seconds": left.total_seconds()}
             log.warning("this coordinator's join file: %s; issue another and start it again with that",
                         told_left(left), extra={"facts": facts})  # fmt: skip

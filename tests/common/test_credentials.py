@@ -2,6 +2,7 @@
 
 import os
 import stat
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -114,6 +115,11 @@ def test_what_is_revoked_is_seen_while_it_is_watched_and_what_is_damaged_takes_n
     (folder / ISSUED).write_text("{")
     watched.look(20.0)
     assert "worker.1" in watched.barred
+    with pytest.raises(AccessError, match="damaged"):  # who begins with it would let everybody in
+        Revocations(folder, read_join(join))
+    replace(ledger, authority="0" * 64).save(folder / ISSUED)
+    with pytest.raises(AccessError, match="another authority"):
+        Revocations(folder, read_join(join))
 
 
 def test_the_verbs_make_list_and_take_back(tmp_path, capsys):
