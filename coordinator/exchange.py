@@ -9,7 +9,7 @@ from dataclasses import replace
 from dreamfleet.common.bounds import LONGEST_EPISODE, excess, most_steps
 from dreamfleet.common.classes import Classes, counted_as
 from dreamfleet.common.errors import DreamfleetError, InternalError
-from dreamfleet.common.messages import Beat, HelloRequest, Kind, Result, ResultBatch, UploadPart
+from dreamfleet.common.messages import Beat, HelloRequest, Job, Kind, Result, ResultBatch, UploadPart
 from dreamfleet.common.printable import shortened
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.admission import Refusals, differ, refusal
@@ -55,8 +55,10 @@ class Exchange:
         Its batches are counted anew, under the number that is returned.
         """
         self.refusals.admitted(request.worker)
+        known = self._fleet.members.get(request.worker)
         numbering = self._fleet.welcome(request.worker, request.slots, request.fingerprint, now)
-        self._fleet.members[request.worker].host_class = self._class_of(request.host_class, request.fingerprint)
+        if (member := self._fleet.members[request.worker]) is not known:
+            member.host_class = self._class_of(request.host_class, request.fingerprint)
         return numbering
 
     def beat(self, worker: str, beat: Beat, now: float) -> None:
@@ -66,6 +68,11 @@ class Exchange:
         if member is not None and beat.host_class:
             member.host_class = self._class_of(beat.host_class, member.fingerprint)
             self._keep_to_class(member)
+        for run in beat.running:
+            digest = self._fleet.jobs.named(run.tag)
+            work = None if digest is None else self._fleet.jobs.work(digest)
+            if work is not None and run.steps > self._most_steps(work.job):
+                self._fleet.overrun(worker, work.job.digest)
 
     def depart(self, worker: str, now: float) -> None:
         """A worker's token vanished."""
@@ -77,8 +84,8 @@ class Exchange:
         One that raises keeps none of the others from being counted; then the first such error is raised.
         """
         host_class = self._class_of(batch.host_class or None, batch.fingerprint)
-        if not self._takes(host_class):
-            self._turn_away(worker, host_class, batch.fingerprint)
+        if (why := self._disbelief(worker, host_class, batch.fingerprint)) is not None:
+            self._fleet.dropped[why] += len(batch.results)
             return
         errors = []
         for each in batch.results:
@@ -96,8 +103,9 @@ class Exchange:
 
     def _result(self, worker: str, said: Result, fingerprint: str, host_class: str, now: float) -> None:
         work = self._fleet.jobs.work(said.digest)
-        each = said if work is None else bounded(said, work.job.kind, work.job.horizon or self._horizon)
-        result = self._slack.collections.receive(worker, each, work)
+        kind, horizon = ("evaluate", None) if work is None else (work.job.kind, work.job.horizon)
+        each = bounded(said, kind, horizon or self._horizon)
+        result = self._slack.collections.receive(worker, each, self._fleet.asked_of(worker, each))
         if result is None:
             self._fleet.put_off(worker, each.digest, now)
             return
@@ -161,8 +169,27 @@ class Exchange:
 
     @property
     def dropped(self) -> Counter[str]:
-        """Parts of uploads that were dropped, by reason."""
-        return self._uploads.dropped
+        """Parts of uploads and results that were dropped, by reason."""
+        return self._uploads.dropped + self._fleet.dropped
+
+    def _most_steps(self, job: Job) -> int:
+        """Of which a beat can tell while a job runs."""
+        return most_steps(LONGEST_EPISODE if job.kind == "evaluate" else job.horizon or self._horizon)
+
+    def _disbelief(self, worker: str, host_class: str, fingerprint: str) -> str | None:
+        """Why nothing counts that this worker says under this class and fingerprint; `None` if it may.
+
+        A host that cannot add to the run is turned away. But in a worker's name anybody can say anything: what is not
+        of the fingerprint that it said hello with, is not its word.
+        """
+        member = self._fleet.members.get(worker)
+        if member is not None and member.fingerprint != fingerprint:
+            return "result of another fingerprint than its worker's"
+        if self._takes(host_class):
+            return None
+        if member is not None and not (member.host_class and self._takes(member.host_class)):
+            self._turn_away(worker, host_class, fingerprint)
+        return "result of another class than the run's"
 
     @property
     def classes(self) -> Classes:

@@ -24,6 +24,7 @@ DEPARTURE_GRACE = 0.05  # seconds: a token's end overtakes results that are stil
 CLOCK_GAP = 2.0  # seconds between ticks that mean a suspended host
 SILENT_BEATS = 5
 ABSENT_BEATS = 2
+LIVELY_BEATS = 2  # within which a worker has spoken that lives
 ANSWER_BEATS = 2  # after which a worker that was sent nothing hears that it is known
 FORGOTTEN = 600.0  # seconds of silence after which a worker must say hello again
 VISIT = 60.0  # the same for one that was welcomed and has not beaten yet: a guest
@@ -55,6 +56,7 @@ class Fleet:
         self.jobs = WantedJobs(evaluation_share)
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()  # what was not believed, by reason
         self.story = Story()  # of workers and jobs, for whoever asks
         self.notes: list[str] = []  # what happened, for whoever writes it down and clears it
         self.hurry = False  # nothing but evaluations and collected rollouts is left to wait for
@@ -69,9 +71,13 @@ class Fleet:
     def welcome(self, identity: str, slots: int, fingerprint: str, now: float) -> int:
         """A worker was admitted; it has credit from its first beat on, and until then it is one of a few guests.
 
-        Its batches are counted anew, under the number that is returned.
+        Its batches are counted anew, under the number that is returned. But a hello in the name of one that beats
+        changes nothing: the worker is told what it missed, and a stranger who greets as somebody else takes nothing.
         """
         old = self.members.get(identity)
+        if old is not None and old.known and old.present and now - old.heard <= LIVELY_BEATS * self._beat:
+            old.send_again(now - self._beat)
+            return old.numbering
         if old is not None:
             self._forget(old)
         if len(self._guests) >= MOST_GUESTS:
@@ -105,6 +111,10 @@ class Fleet:
         if beat.numbering != member.numbering:
             # It was late, or its worker has not heard of the welcome: what it had queued, it will then forget.
             beat = replace(beat, seen=0, queued=())
+        elif beat.seen > member.number:  # somebody else sent batches in this coordinator's name: they are counted anew
+            self._begin_anew(member)
+            self.dropped["count of batches"] += 1
+            beat = replace(beat, seen=0, queued=())
         if self.alone:
             beat = replace(beat, capacity=min(beat.capacity, beat.slots))
         for sent in member.observe(beat, now):
@@ -119,13 +129,16 @@ class Fleet:
                 self._drop_lease(member, digest)
         held = Handful(now, len(member.leases), alone=False)
         for found in shown - member.leases.keys():
-            if found is not None and len(self.jobs[found].holders) < 2:
+            if found is not None and self._may_take_up(found, identity):
                 self._take(member, found, Lease(beat.seen, held, steps=running.get(found), told=now))
         member.lose_before(max((lease.batch for each, lease in member.leases.items() if each in shown), default=0))
 
     def result(self, identity: str, result: Result, now: float) -> tuple[VerdictWord, Work | None]:
         """Judge one result; the work comes back when it is the first wanted one, for the journal."""
         member, self._now = self.members.get(identity), now
+        if self.asked_of(identity, result) is None and (member is None or not member.known):
+            self.dropped["result of a stranger"] += 1  # who says it again once the run knows him
+            return "refused", None
         if member is not None:
             self._hear(member, now)
             member.take_back(result)
@@ -134,8 +147,7 @@ class Fleet:
             self.story.add(now, verdict, identity, result.digest)
         if member is not None:
             member.leases.pop(result.digest, None)
-            if member.known or len(member.verdicts) < MOST_GUESTS:
-                member.verdicts.append(Verdict(result.digest, verdict))
+            member.verdicts.append(Verdict(result.digest, verdict))
             member.finished += verdict == "accepted"
             if work is not None and work.job.kind == "score":
                 member.record.took(result.seconds)
@@ -144,6 +156,27 @@ class Fleet:
         self.counts["accepted_steps" if verdict == "accepted" else "discarded_steps"] += result.steps
         self.counts[verdict] += 1
         return verdict, work
+
+    def asked_of(self, identity: str, result: Result) -> Work | None:
+        """The wanted job of which this worker may bring this result; `None` where there is none.
+
+        It brings what it was given in this life of the coordinator, whether or not it still holds the lease. What an
+        earlier life may have given counts from any worker that has been welcomed and has beaten, for nobody knows
+        whom it was given to. A failure counts only from who holds the lease.
+        """
+        wanted, member = self.jobs.get(result.digest), self.members.get(identity)
+        if wanted is None or not self.jobs.may_have(result.digest, identity):
+            return None
+        known = identity in wanted.given or (member is not None and member.known)
+        return wanted.work if known and (result.fitness is not None or identity in wanted.holders) else None
+
+    def overrun(self, identity: str, digest: bytes) -> None:
+        """A worker tells more steps of a job than it can have: it had better be scored elsewhere."""
+        if (member := self.members.get(identity)) and digest in member.leases:
+            self.dropped["lease with more steps than a job has"] += 1
+            self.jobs.overrun(digest, identity)
+            member.cancels.append(digest)
+            self._drop_lease(member, digest)
 
     def put_off(self, identity: str, digest: bytes, now: float) -> None:
         """A result came whose upload is still on its way: no verdict yet, and the lease stays."""
@@ -171,7 +204,7 @@ class Fleet:
             elif not member.silent and now - member.heard > SILENT_BEATS * self._beat:
                 member.silent = True
                 self._lose(member, now, "is silent")
-                member.begin_numbering(self._next_numbering())  # what it has not seen is not sent again
+                self._begin_anew(member)  # what it has not seen is not sent again
                 self.counts["silences"] += 1
 
     def dispatch(self, now: float, *, durable: bool = True) -> list[Send]:
@@ -233,6 +266,9 @@ class Fleet:
     def _judge(self, identity: str, result: Result) -> tuple[VerdictWord, Work | None]:
         if result.digest not in self.jobs:
             return ("duplicate" if self.jobs.is_accepted(result.digest) else "obsolete"), None
+        if self.asked_of(identity, result) is None:
+            self.dropped["result of a job that was not given"] += 1
+            return "refused", None
         if result.fitness is None:
             self.jobs.fail(identity, result)
             self.counts["errors"] += 1
@@ -254,6 +290,17 @@ class Fleet:
             if digest not in member.trials:  # which is worth its end
                 member.cancels.append(digest)
             self.counts["discarded_steps"] += (lease and lease.steps) or 0
+
+    def _may_take_up(self, digest: bytes, identity: str) -> bool:
+        """Whether a worker that shows a wanted job has its lease again."""
+        wanted = self.jobs[digest]
+        free = len(wanted.holders) < 2 and identity not in wanted.overrun
+        return free and self.jobs.may_have(digest, identity)
+
+    def _begin_anew(self, member: Member) -> None:
+        """Whatever a worker has is given again, in another numbering, unless it shows it."""
+        self._release(member)
+        member.begin_numbering(self._next_numbering())
 
     def _next_numbering(self) -> int:
         self._numberings += 1
@@ -352,7 +399,7 @@ class Fleet:
                 passed_over.append(turn.digest)
                 continue
             name = choice.pick(able)
-            if name is None and not wanted.failed:
+            if name is None and not wanted.shunned:
                 passed_over.append(turn.digest)
                 break  # nor the jobs after it: they had better wait for whoever is sooner
             name = name or min(able, key=lambda name: loads[name])
@@ -371,6 +418,6 @@ class Fleet:
 
         A killed child must not hang a run, nor may a stranger who only said hello.
         """
-        able = [name for name in loads if name not in wanted.failed]
+        able = [name for name in loads if name not in wanted.shunned]
         there = (name for name, member in self.members.items() if member.present and member.known)
-        return list(loads) if not able and all(name in wanted.failed for name in there) else able
+        return list(loads) if not able and all(name in wanted.shunned for name in there) else able

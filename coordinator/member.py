@@ -134,6 +134,11 @@ class Member:
             if number < batch and sent.times == 1:
                 sent.at = -math.inf
 
+    def send_again(self, since: float) -> None:
+        """It may have been out of reach: what it has not seen is sent again at once, unless it was sent since then."""
+        for sent in self.unseen.values():
+            sent.at = -math.inf if sent.at <= since else sent.at
+
     def awaits_word(self, now: float, patience: float) -> bool:
         """Whether it has spoken since it was last spoken to, so long ago."""
         return self.present and self.heard > self.spoken and now - self.spoken > patience

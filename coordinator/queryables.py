@@ -52,6 +52,9 @@ class BundleServer:
 
     def _answer(self, query: zenoh.Query) -> None:
         asked = query.parameters
+        if str(query.key_expr) != self._key:
+            query.reply_err(_why("a world model is asked for by its run and hash, without wildcards"))
+            return
         try:
             offset, length = int(asked.get("offset") or 0), int(asked.get("length") or MAX_PART)
         except ValueError:

@@ -54,9 +54,17 @@ def misunderstanding(request: HelloRequest | None) -> tuple[str, str] | None:
     )
 
 
-def control_reply(run: str, verb: str, known: Iterable[str]) -> ControlReply:
-    """Whether a control verb was obeyed: every known one is."""
-    known = list(known)
+def control_verb(asked_at: str) -> str:
+    """What a control query's key expression asks for."""
+    return asked_at.rsplit("/", 1)[-1]
+
+
+def control_reply(run: str, asked_at: str, known: Iterable[str]) -> ControlReply:
+    """Whether a control verb was obeyed: every known one is, if it was asked for at this run's own key."""
+    known, verb = list(known), control_verb(asked_at)
+    if asked_at != keys.control(run, verb):
+        why = f"one run is steered at a time, by its own key: ask {keys.control(run, 'VERB')}"
+        return ControlReply(v=keys.PROTOCOL_VERSION, run=run, accepted=False, why=why)
     asked = shortened(verb, LONGEST_VERB)
     why = "" if verb in known else f"{asked!r} is no control verb of this version; it knows: {', '.join(known)}"
     return ControlReply(v=keys.PROTOCOL_VERSION, run=run, accepted=not why, why=why)

@@ -62,6 +62,8 @@ class Run:
         self._generations = Generations(journal, settings, self._agenda, self.history, evaluated)
         self.opened = now
         self.generation = self._generations.begin()
+        if self.incarnation > 1:  # the last life may have given what follows too, and died before it was written
+            fleet.jobs.earlier = self.generation.number + 1
         self._begin(now)
 
     @property

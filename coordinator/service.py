@@ -45,7 +45,7 @@ from dreamfleet.coordinator.fleet import Send
 from dreamfleet.coordinator.lines import summary, worker_command
 from dreamfleet.coordinator.packing import Content
 from dreamfleet.coordinator.queryables import BundleServer, answer_status
-from dreamfleet.coordinator.replies import control_reply, hello_reply, misunderstanding
+from dreamfleet.coordinator.replies import control_reply, control_verb, hello_reply, misunderstanding
 from dreamfleet.coordinator.run import Run
 from dreamfleet.coordinator.scrape import metrics_served
 from dreamfleet.coordinator.served import ServedBundle
@@ -337,10 +337,11 @@ class Service:
             "disband": self._begin_to_disband,
         }
         with query:
-            verb = str(query.key_expr).rsplit("/", 1)[-1]
-            verbs.get(verb, lambda: None)()
+            asked_at = str(query.key_expr)
+            reply = control_reply(self._name, asked_at, verbs)
+            if reply.accepted:
+                verbs[control_verb(asked_at)]()
             self._snapshot = self._take_snapshot()  # who asks after the answer sees what came of it
-            reply = control_reply(self._name, verb, verbs)
             query.reply(query.key_expr, encode_json(reply), encoding="application/json")
 
     def _resume(self) -> None:

@@ -8,7 +8,7 @@ for them. Rule 8 of the protocol.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -29,7 +29,11 @@ class Wanted(Protocol):
 
     work: Work
     holders: set[str]
-    failed: dict[str, str]
+
+    @property
+    def shunned(self) -> Set[str]:
+        """Workers that are not to have it."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -165,7 +169,7 @@ class Tail:
 def _alone(digest: bytes, taker: Member, wanted: Mapping[bytes, Wanted]) -> bool:
     """Whether a job is in one worker's hands and may be given to another."""
     job = wanted.get(digest)
-    return job is not None and len(job.holders) == 1 and taker.identity not in job.failed
+    return job is not None and len(job.holders) == 1 and taker.identity not in job.shunned
 
 
 def _is_due(taker: Member, now: float) -> bool:

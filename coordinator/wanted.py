@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 from dreamfleet.common.messages import TAG_BYTES, Kind, Result
@@ -24,6 +24,8 @@ class Wanted:
     order: int
     queued: bool = False  # whether a queue names it, so that one does so once whatever its workers do
     holders: set[str] = field(default_factory=set)
+    given: set[str] = field(default_factory=set)  # lives of workers that held it, now or before
+    overrun: set[str] = field(default_factory=set)  # those that told more steps of it than it can have
     failed: dict[str, str] = field(default_factory=dict)  # worker -> error
     attempts: Counter[str] = field(default_factory=Counter)  # worker -> how often it failed there
 
@@ -31,6 +33,11 @@ class Wanted:
     def in_slack(self) -> bool:
         """Whether it fills what scoring leaves idle, and has a share of what it does not."""
         return self.work.job.kind != "score"
+
+    @property
+    def shunned(self) -> Set[str]:
+        """Who is given it again only where nobody else is there."""
+        return self.failed.keys() | self.overrun
 
     @property
     def failure(self) -> Failure:
@@ -50,6 +57,7 @@ class WantedJobs(Mapping[bytes, Wanted]):
     """Every wanted job by its digest. Workers are only names here."""
 
     def __init__(self, evaluation_share: float) -> None:
+        self.earlier = -1  # jobs up to this generation an earlier life of the coordinator may have given
         self._wanted: dict[bytes, Wanted] = {}
         self._tags: dict[bytes, bytes] = {}
         self._queue: list[tuple[int, bytes]] = []  # what is scored, in order of offer
@@ -77,6 +85,11 @@ class WantedJobs(Mapping[bytes, Wanted]):
     def named(self, tag: bytes) -> bytes | None:
         """The digest of the wanted job of which a beat tells the first bytes."""
         return self._tags.get(tag)
+
+    def may_have(self, digest: bytes, worker: str) -> bool:
+        """Whether a worker may have a wanted job: it was given to that very life, or may have been before ours."""
+        wanted = self._wanted[digest]
+        return worker in wanted.given or wanted.work.job.generation <= self.earlier
 
     def is_accepted(self, digest: bytes) -> bool:
         """Whether its result has come, in this generation or the last."""
@@ -134,6 +147,7 @@ class WantedJobs(Mapping[bytes, Wanted]):
         wanted = self._wanted[digest]
         self._in_slack += wanted.in_slack and not wanted.holders
         wanted.holders.add(worker)
+        wanted.given.add(worker)
         if by_share:
             self._share.take(digest)
 
@@ -152,6 +166,10 @@ class WantedJobs(Mapping[bytes, Wanted]):
         if worker in wanted.failed or len(wanted.failed) < MOST_FAILED:
             wanted.attempts[worker] += 1
             wanted.failed[worker] = result.error or "no fitness and no reason"
+
+    def overrun(self, digest: bytes, worker: str) -> None:
+        """A worker told more steps of this job than it can have."""
+        self._wanted[digest].overrun.add(worker)
 
     def accept(self, result: Result) -> Wanted:
         """A wanted job's first valid result: it is wanted no more."""

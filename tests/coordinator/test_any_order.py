@@ -56,20 +56,20 @@ class Worker:
         self.joined = None  # the coordinator's life that it obeys
 
     def take(self, send):
+        """Whether to say hello, for the batch is of a numbering that it has not heard of."""
         content = send.content
         batch = JobBatch(
             **HEAD, nonce="n", numbering=send.numbering, number=send.number,
             vectors=tuple(content.vectors), cancels=tuple(content.cancels),
             jobs=tuple(work.job for work in content.work), verdicts=tuple(content.verdicts),
         )  # fmt: skip
-        if batch.numbering < self.backlog.numbering:
-            return
-        if batch.numbering > self.backlog.numbering:
-            self.begin(batch.numbering)
+        if batch.numbering != self.backlog.numbering:
+            return batch.numbering > self.backlog.numbering
         assert not self.backlog.take_in(batch)
         self.outbox.settle(verdict.digest for verdict in batch.verdicts)
         self.running = [digest for digest in self.running if digest not in batch.cancels]
         self.fill()
+        return False
 
     def begin(self, numbering):
         self.backlog.begin(numbering)
@@ -101,6 +101,7 @@ class AnyOrder(RuleBasedStateMachine):
         """A coordinator's life, from the journal alone."""
         self.life += 1
         self.fleet = Fleet(BEAT)
+        self.fleet.jobs.earlier = self.number + 1 if self.life > 1 else -1  # as `Run` has it
         self.received, self.judged, self.sent = Counter(), Counter(), []
         for number in range(self.number):
             self.fleet.jobs.offer(work for work in slack_of(number) if work.job.digest not in self.journal)
@@ -151,7 +152,7 @@ class AnyOrder(RuleBasedStateMachine):
         if identity is not None:
             worker = self.workers[identity]
             numbering = self.fleet.welcome(identity, SLOTS, "f", self.now)
-            if worker.joined != self.life or heard:
+            if worker.joined != self.life or (heard and numbering != worker.backlog.numbering):
                 worker.joined = self.life
                 worker.begin(numbering)
 
@@ -193,8 +194,8 @@ class AnyOrder(RuleBasedStateMachine):
 
     def hand_over(self, identity, life, send):
         worker = self.workers.get(identity)
-        if worker is not None and worker.joined == life:
-            worker.take(send)
+        if worker is not None and worker.joined == life and worker.take(send):
+            self.hello(identity.partition("/")[0])
 
     @rule(name=names, fails=st.sampled_from([False] * 9 + [True]))
     def finish(self, name, fails=False):

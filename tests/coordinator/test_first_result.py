@@ -27,8 +27,6 @@ class Classed(Bench):
     def begin(self):
         self.told = {A: "", B: ""}
         super().begin()
-        for name in (A, B):
-            self.hello(name)
 
     def find_out(self, name):
         """Its children have, and its beat says so."""
@@ -131,6 +129,7 @@ def test_a_worker_from_before_there_were_classes_cannot_join_a_strict_run_of_one
 
 def test_hosts_of_one_fingerprint_may_be_of_two_classes_and_of_two_fingerprints_of_one(bench):
     bench.fingerprints = {A: "here", B: "here"}
+    bench.restart()
     jobs = bench.given()
     bench.deliver(B, done(jobs[B][0]))
     bench.deliver(A, done(jobs[A][0]))

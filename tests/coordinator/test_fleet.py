@@ -389,13 +389,14 @@ def test_who_says_hello_and_never_beats_is_one_of_a_few_and_soon_forgotten():
 
 def test_a_worker_that_beats_is_forgotten_only_after_a_long_silence():
     fleet = fleet_of(A)
+    given = digests(fleet.dispatch(0.0), A)
     for now in range(int(FORGOTTEN)):
         fleet.tick(float(now))
     assert fleet.members[A].silent
     for now in range(int(FORGOTTEN), int(FORGOTTEN) + 10):
         fleet.tick(float(now))
     assert not fleet.members
-    assert fleet.result(A, result(work(1)[0].job.digest), 100.0)[0] == "accepted", "its results still count"
+    assert fleet.result(A, result(given[0]), 100.0)[0] == "accepted", "its results still count"
 
 
 def test_a_stranger_who_only_said_hello_keeps_no_failing_job_from_being_tried_again():
@@ -466,6 +467,7 @@ def test_a_worker_that_did_not_hear_the_answer_to_its_hello_is_given_work_at_onc
         for digest in digests(fleet.dispatch(0.0), A)[:1]:
             fleet.result(A, result(digest), 0.0)
     first = fleet.members[A].numbering
+    fleet.depart(A, 0.9)
     second = fleet.welcome(A, 1, "f", 1.0)
     fleet.beat(A, beat(seen=7, numbering=first), 1.1)
     (send,) = [send for send in fleet.dispatch(1.1) if send.content.work]
@@ -473,6 +475,93 @@ def test_a_worker_that_did_not_hear_the_answer_to_its_hello_is_given_work_at_onc
     assert second > first
     fleet.beat(A, beat(seen=1, numbering=second), 1.2)
     assert not fleet.members[A].unseen
+
+
+def test_a_hello_in_the_name_of_a_worker_that_beats_takes_nothing_from_it():
+    fleet = fleet_of(A, jobs=4)
+    (lost,) = fleet.dispatch(0.0)
+    held, numbering = dict(fleet.members[A].leases), fleet.members[A].numbering
+    assert fleet.welcome(A, 1000, "of somebody else", 1.0) == numbering
+    assert fleet.members[A].leases == held
+    assert (fleet.members[A].slots, fleet.members[A].fingerprint) == (1, "f")
+    (again,) = fleet.dispatch(1.1)
+    assert (again.numbering, again.number) == (numbering, lost.number), "if it was itself, it may have missed this"
+    fleet.welcome(A, 1, "f", 1.2)
+    assert not numbered(fleet.dispatch(1.2)), "which is sent once, however often somebody greets"
+
+
+def test_a_worker_that_said_nothing_for_a_while_is_welcomed_anew():
+    fleet = fleet_of(A, jobs=4)
+    fleet.dispatch(0.0)
+    before = fleet.members[A].numbering
+    assert fleet.welcome(A, 1, "f", 2.5) > before
+    assert not fleet.members[A].leases
+
+
+def test_a_result_counts_from_the_life_that_was_given_its_job_and_from_nobody_else():
+    fleet = fleet_of(A, B, jobs=2)
+    sends = fleet.dispatch(0.0)
+    (of_a,), (of_b,) = digests(sends, A), digests(sends, B)
+    for stranger in ("x/0badc0de", "a/0badc0de"):
+        assert fleet.result(stranger, result(of_a, fitness=1e9), 0.1) == ("refused", None)
+    assert fleet.result(B, result(of_a, fitness=1e9), 0.1) == ("refused", None)
+    fleet.beat(B, beat(seen=1, running=[of_b], unacked=[of_a]), 0.2)
+    assert list(fleet.members[B].leases) == [of_b], "nor is it taken up because somebody shows it"
+    assert fleet.result(A, result(of_a), 0.3)[0] == "accepted"
+    (told,) = [each for send in fleet.dispatch(0.3) if send.identity == B for each in send.content.verdicts]
+    assert (told.digest, told.verdict) == (of_a, "refused")
+    assert fleet.dropped == {"result of a stranger": 2, "result of a job that was not given": 1}
+    assert fleet.counts["discarded_steps"] == 10, "a stranger's steps are not the fleet's"
+
+
+def test_what_an_earlier_life_gave_counts_once_its_worker_beats():
+    fleet = Fleet(BEAT)
+    fleet.jobs.earlier = 1
+    fleet.jobs.offer([*work(1), *work(1, generation=2)])
+    before, since = fleet.jobs
+    assert fleet.result(A, result(before), 0.0)[0] == "refused", "nobody has welcomed it yet"
+    fleet.welcome(A, 1, "f", 0.0)
+    assert fleet.result(A, result(before), 0.1)[0] == "refused"
+    fleet.beat(A, beat(unacked=[before, since]), 0.2)
+    assert list(fleet.members[A].leases) == [before]
+    assert fleet.result(A, result(since), 0.3)[0] == "refused", "it cannot have been given"
+    assert fleet.result(A, result(before), 0.3)[0] == "accepted"
+
+
+def test_an_error_of_a_job_that_its_worker_does_not_hold_is_no_failure():
+    fleet = fleet_of(A, B, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    for name in (B, "x/0badc0de", "y/0badc0de"):
+        fleet.result(name, result(digest, error="boom"), 0.1)
+    assert not fleet.jobs.failures
+    assert digest in fleet.members[A].leases
+
+
+def test_a_job_with_more_steps_than_it_can_have_goes_to_others_and_its_late_result_still_counts():
+    fleet = fleet_of(A, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.welcome(B, 1, "f", 0.1)
+    fleet.beat(B, beat(), 0.1)
+    fleet.beat(A, beat(seen=1, running=[digest], steps=10**12), 1.0)
+    fleet.overrun(A, digest)
+    sends = fleet.dispatch(1.0)
+    assert digests(sends, B) == [digest]
+    assert cancelled(sends, A) == [digest]
+    fleet.beat(A, beat(seen=2, running=[digest], steps=10**13), 2.0)
+    assert not fleet.members[A].leases, "however often it shows it"
+    assert not fleet.jobs.failures
+    assert fleet.result(A, result(digest), 3.0)[0] == "accepted"
+
+
+def test_a_beat_that_has_seen_batches_that_nobody_sent_makes_them_count_anew():
+    fleet = fleet_of(A, jobs=2)
+    (first,) = fleet.dispatch(0.0)
+    given = digests([first], A)
+    fleet.beat(A, beat(seen=1000, running=given[:1]), 1.0)
+    assert list(fleet.members[A].leases) == given[:1]
+    (send,) = numbered(fleet.dispatch(1.0))
+    assert send.numbering > first.numbering
+    assert (send.number, digests([send], A)) == (1, given[1:])
 
 
 def test_a_worker_that_was_silent_is_not_waited_for_to_see_what_is_not_sent_again():
@@ -491,6 +580,7 @@ def test_a_worker_that_was_silent_is_not_waited_for_to_see_what_is_not_sent_agai
 def test_a_late_beat_from_before_a_hello_says_nothing_of_the_batches_since():
     fleet = fleet_of(A, jobs=4)
     first = fleet.members[A].numbering
+    fleet.depart(A, 0.9)
     fleet.welcome(A, 1, "f", 1.0)
     fleet.beat(A, beat(), 1.1)
     given = digests(fleet.dispatch(1.1), A)

@@ -4,7 +4,7 @@ import pytest
 
 from dreamfleet.common.errors import InternalError
 from dreamfleet.common.messages import Result, ResultBatch
-from tests.coordinator.test_run import SETTINGS, Bench
+from tests.coordinator.test_run import SETTINGS, B, Bench
 
 
 @pytest.fixture
@@ -15,6 +15,10 @@ def bench(tmp_path, random_bundle):
 
 
 def given_jobs(bench):
+    """Both to one worker."""
+    bench.run.exchange.depart(B, bench.now)
+    bench.now += 1
+    bench.run.exchange.tick(bench.now)
     return [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.content.work]
 
 

@@ -44,8 +44,11 @@ class Bench:
         self.run.advance(self.now)
         self.run.commit()
         for name in (A, B):
-            self.run.exchange.admit(HelloRequest(1, 1, "0", name, (SPEC.task,), "f", 1), self.now)
+            self.run.exchange.admit(self.request(name), self.now)
             self.beat(name)
+
+    def request(self, name):
+        return HelloRequest(1, 1, "0", name, (SPEC.task,), "f", 1)
 
     def restart(self):
         """Killed: what was not committed never was."""
@@ -54,15 +57,14 @@ class Bench:
         self.begin()
 
     def beat(self, name, unacked=(), host_class=None):
-        if name not in self.run.fleet.members:
+        if (member := self.run.fleet.members.get(name)) is None:
             return
-        numbering = self.run.fleet.members[name].numbering
-        head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "numbering": numbering,
-                "drawn_by": "-"}  # fmt: skip
+        head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "drawn_by": "-",
+                "numbering": member.numbering}  # fmt: skip
         tags = tuple(digest[:TAG_BYTES] for digest in unacked)
         self.run.exchange.beat(
             name,
-            Beat(**head, seen=10**9, capacity=4, slots=4, queued=(), running=(), unacked=tags, load=0.0,
+            Beat(**head, seen=member.number, capacity=4, slots=4, queued=(), running=(), unacked=tags, load=0.0,
                  steps_per_second=0.0, host_class=host_class),
             self.now,
         )  # fmt: skip
@@ -256,7 +258,8 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
     tmp_path_factory, random_bundle, steps
 ):
     bench = Bench(tmp_path_factory.mktemp("run") / "night", random_bundle.path)
-    jobs = [job for _, job in bench.reach_collection()]
+    given = bench.reach_collection()
+    jobs = [job for _, job in given]
     accepted = []
     for kind, *what in steps:
         if kind in ("part", "spoilt"):
@@ -277,12 +280,12 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
         whole = {drive_of(job) for job in jobs}
         assert set(bench.kept()) <= whole, "what counts is whole"
         assert len(bench.kept()) == bench.run.slack.collections.progress[0]
-    for job in jobs:  # two rounds that come through: a spoilt part ends the first
+    for name, job in given:  # two rounds that come through: a spoilt part ends the first
         for _ in range(2):
-            bench.beat(A, unacked=[job.digest])
+            bench.beat(name, unacked=[job.digest])
             for part in bench.parts(job):
-                bench.upload(A, part)
-            bench.deliver(A, result_of(job))
+                bench.upload(name, part)
+            bench.deliver(name, result_of(job))
         accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
     assert bench.kept() == [drive_of(job) for job in jobs]
     assert len(accepted) == len(set(accepted))

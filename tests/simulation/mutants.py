@@ -145,10 +145,16 @@ def fleet_keeps_the_leases_of_a_worker_that_joins_again(_original):
 @mutant(Fleet, "beat")
 def fleet_believes_beats_of_other_numberings(original):
     def beat(self, identity, beat, now):
-        member = self.members.get(identity)
-        return original(self, identity, replace(beat, numbering=member.numbering) if member else beat, now)
+        if member := self.members.get(identity):  # which then shows no more batches than were sent, or is found out
+            beat = replace(beat, numbering=member.numbering, seen=min(beat.seen, member.number))
+        return original(self, identity, beat, now)
 
     return beat
+
+
+@mutant(Fleet, "asked_of")
+def fleet_asks_for_results_of_nobody(_original):
+    return lambda self, identity, result: None
 
 
 @mutant(Member, "begin_numbering")

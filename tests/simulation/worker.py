@@ -152,7 +152,7 @@ class Worker:
             self.backlog.begin(welcome.numbering)
             self.membership.join(welcome.nonce, BEAT, now)
             return
-        if welcome.nonce != self.nonce or welcome.numbering > self.backlog.numbering:
+        if welcome.nonce != self.nonce or welcome.numbering != self.backlog.numbering:
             self._begin_numbering(welcome.numbering)
         self.nonce = welcome.nonce
         self.membership.rejoin(welcome.nonce, now)
@@ -214,9 +214,10 @@ class Worker:
             return
         if event.nonce != self.nonce or event.numbering < self.backlog.numbering:
             return
-        self.membership.hear(now)
         if event.numbering > self.backlog.numbering:
-            self._begin_numbering(event.numbering)
+            self.membership.doubt()
+            return
+        self.membership.hear(now)
         self._note(event)
         for digest in event.cancels:
             self._abandon(digest, now)
@@ -288,12 +289,12 @@ class Worker:
 
     def _say(self, now: float) -> None:
         head = {"run_uid": UID, "incarnation": 1}
-        for results in self.outbox.due(now):
-            self._send(ResultBatch(**head, fingerprint="f", results=results))
-            self.told_at.update((result.digest, now) for result in results)
         if now >= self._beat_at:
             self._beat_at = now + BEAT
             self._send(self._beat(now))
+        for results in self.outbox.due(now):
+            self._send(ResultBatch(**head, fingerprint="f", results=results))
+            self.told_at.update((result.digest, now) for result in results)
         for piece in self.uploads.due(now):
             self._send(UploadPart(**head, **vars(piece)))
 

@@ -165,17 +165,20 @@ class JoinedRun:
         batch = self._line.inbox.decode(JobBatch, payload)
         if batch is None:
             return
-        if (batch.run_uid, batch.nonce) != (self._admission.run_uid, self._admission.nonce):
+        ours = self._admission
+        if (batch.run_uid, batch.incarnation, batch.nonce) != (ours.run_uid, ours.incarnation, ours.nonce):
             self._line.inbox.dropped["foreign coordinator"] += 1
             return
         if batch.numbering < self._backlog.numbering:  # what it says was said again since
             self._line.inbox.dropped["earlier numbering"] += 1
             return
+        if batch.numbering > self._backlog.numbering:  # it was welcomed again or given up, unheard; or so anybody says
+            self._line.inbox.dropped["unheard numbering"] += 1
+            self._membership.doubt()
+            return
         self._membership.hear(monotonic())
         if batch.leave:
             self._membership.disband()
-        if batch.numbering > self._backlog.numbering:  # it was welcomed again or given up, unheard
-            self._begin_numbering(batch.numbering)
         for digest in batch.cancels:
             self._slots.abandon(digest)
         for job, why in self._backlog.take_in(batch, self._slots.held):
@@ -218,9 +221,7 @@ class JoinedRun:
         self._slots.hand_back()
 
     def _send(self, now: float) -> None:
-        for results in self._outbox.due(now):
-            self._post.results(self._slots, results)
-        if now >= self._beat_at:
+        if now >= self._beat_at:  # first, so that a coordinator that has just welcomed it listens to what follows
             self._beat_at = now + self._admission.intervals.beat
             self._post.beat(
                 self._slots,
@@ -231,6 +232,8 @@ class JoinedRun:
                 unacked=self._outbox.digests,
                 rate=self._rate.read(now, self._steps_finished + self._slots.steps),
             )
+        for results in self._outbox.due(now):
+            self._post.results(self._slots, results)
         for piece in self._uploads.due(now):  # after the beat, which says that the job is in these hands
             self._post.upload(piece)
 
@@ -248,7 +251,7 @@ class JoinedRun:
         anew = admission.nonce != self._admission.nonce
         self._admission = admission
         self._post = Post(self._line.session, self._line.identity, admission)
-        if anew or admission.numbering > self._backlog.numbering:
+        if anew or admission.numbering != self._backlog.numbering:
             self._begin_numbering(admission.numbering)
         self._membership.rejoin(admission.nonce, monotonic())
         level = logging.INFO if anew else logging.DEBUG  # an idle worker of a paused run asks again and again

@@ -67,6 +67,10 @@ class Membership:
         self._parted = False  # the joined coordinator was out of sight, and may have given this worker up
         self._quiet_since = now
 
+    def doubt(self) -> None:
+        """Somebody says that this worker's batches are counted anew; only an answer to hello makes it true."""
+        self._parted = True
+
     def ask(self, now: float, pause: float) -> None:
         """It says hello again; if nobody answers, the next time is at least `pause` seconds away."""
         self._ask_at = now + pause

@@ -33,7 +33,7 @@ def test_it_follows_its_run_into_the_coordinators_next_life(stage, cached):
     assert hand.result(queued).fitness is not None
 
 
-def test_a_worker_that_did_not_hear_that_it_was_welcomed_again_learns_it_by_the_batches(stage, cached):
+def test_a_worker_that_did_not_hear_that_it_was_welcomed_again_asks_once_it_sees_it_by_the_batches(stage, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     stage.worker()
     hand.ready()
@@ -41,6 +41,8 @@ def test_a_worker_that_did_not_hear_that_it_was_welcomed_again_learns_it_by_the_
     hand.send(1, done, running, queued)
     hand.result(done)
     hand.numbering += 1
+    hand.send(1, later)
+    hand.hello()
     hand.send(1, later)
     beat = hand.beat(lambda beat: beat.numbering == hand.numbering and beat.seen == 1)
     assert tag(queued) not in beat.queued
