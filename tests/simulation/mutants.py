@@ -27,7 +27,7 @@ from dreamfleet.coordinator.member import Member, Sent
 from dreamfleet.coordinator.run import Run
 from dreamfleet.coordinator.uploads import Uploads as Intake
 from dreamfleet.coordinator.wanted import WantedJobs
-from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.backlog import Backlog, Parts
 from dreamfleet.worker.service.membership import Membership
 from dreamfleet.worker.service.outbox import Outbox
 from dreamfleet.worker.service.uploads import Uploads
@@ -350,7 +350,7 @@ def backlog_goes_on_counting_in_a_new_life(original):
 def backlog_joins_a_long_vector_before_it_is_whole(_original):
     def whole(self, identity):
         vector = self._vectors.get(identity)
-        return vector if isinstance(vector, bytes) else b"".join((vector or {}).values()) or None
+        return vector.joined() or None if isinstance(vector, Parts) else vector
 
     return whole
 

@@ -1,6 +1,8 @@
 """What the coordinator has given this worker and no slot has taken yet, in one numbering of its batches. Pure.
 
-Batches may come twice, late or out of order; each counts once, and a vector may be spread over several.
+Batches may come twice, late or out of order; each counts once, and a vector may be spread over several. Whoever reaches
+the port can send some too, so what waits is bounded: what has no room is let go, and as the next beats do not show it,
+the coordinator gives it again.
 """
 
 from __future__ import annotations
@@ -8,10 +10,26 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from collections.abc import Collection
+from dataclasses import dataclass, field
+from math import prod
 
-from dreamfleet.common.messages import Job, JobBatch, TaskSpec, VectorPart
+from dreamfleet.common.messages import MAX_LEASES, Job, JobBatch, TaskSpec, VectorPart
 
 KEPT_VECTORS = 64  # beside those that queued jobs need
+MOST_AHEAD = 1024  # batches after one that is missing
+MOST_BYTES = 256 << 20  # of all vectors; of 1024 candidates: 65,000 parameters each
+
+
+@dataclass
+class Parts:
+    """What has come of a vector of `size` bytes, by offset."""
+
+    size: int
+    data: dict[int, bytes] = field(default_factory=dict)
+
+    def joined(self) -> bytes:
+        """All of it, in order."""
+        return b"".join(data for _, data in sorted(self.data.items()))
 
 
 class Backlog:
@@ -21,7 +39,8 @@ class Backlog:
         self._spec = spec
         self.begin(0)
         self._jobs: OrderedDict[bytes, Job] = OrderedDict()
-        self._vectors: OrderedDict[bytes, bytes | dict[int, bytes]] = OrderedDict()  # identity -> whole, or by offset
+        self._vectors: OrderedDict[bytes, bytes | Parts] = OrderedDict()  # by identity
+        self._bytes = 0  # of all vectors
 
     def begin(self, numbering: int) -> None:
         """The coordinator counts batches from 1 again, under another number."""
@@ -44,7 +63,7 @@ class Backlog:
         Those that a slot has in hand (`held`, by digest) are not queued: a coordinator that was killed as it opened a
         generation gives its jobs again in its next life.
         """
-        if batch.number <= self.seen or batch.number in self._ahead:
+        if not self.seen < batch.number <= self.seen + MOST_AHEAD or batch.number in self._ahead:
             return []
         self._ahead.add(batch.number)
         while self.seen + 1 in self._ahead:
@@ -59,7 +78,7 @@ class Backlog:
             spec = job.spec(self._spec)
             if job.digest != spec.digest(job.kind, job.vector, job.seeds) or job.task != spec.task:
                 refused.append((job, "the job's digest is not of its content"))
-            elif job.digest not in held:
+            elif job.digest not in held and job.vector in self._vectors and len(self._jobs) < MAX_LEASES:
                 self._jobs[job.digest] = job
         self._trim()
         return refused
@@ -73,7 +92,10 @@ class Backlog:
         for digest, job in list(self._jobs.items()):
             if len(taken) == count or (taken and (job.alone or job.terms != taken[0][0].terms)):
                 break
-            if (vector := self._whole(job.vector)) is not None:
+            vector = self._whole(job.vector)
+            if job.vector not in self._vectors:  # what has come of it was of something else
+                del self._jobs[digest]
+            elif vector is not None:
                 taken.append((job, vector))
                 del self._jobs[digest]
                 if job.alone:
@@ -82,22 +104,31 @@ class Backlog:
 
     def _whole(self, identity: bytes) -> bytes | None:
         vector = self._vectors.get(identity)
-        if isinstance(vector, bytes):
+        if not isinstance(vector, Parts):
             return vector
-        joined = b"".join(data for _, data in sorted((vector or {}).items()))
-        if hashlib.sha256(joined).digest() != identity:
-            return None
-        self._vectors[identity] = joined
-        return joined
+        joined = vector.joined()
+        if hashlib.sha256(joined).digest() == identity:
+            self._vectors[identity] = joined
+            return joined
+        if len(joined) >= vector.size:
+            self._drop(identity)
+        return None
 
     def _add_part(self, part: VectorPart) -> None:
-        parts = self._vectors.setdefault(part.id, {})
-        if not isinstance(parts, bytes):
-            parts[part.offset] = part.data
+        if self._bytes + len(part.data) > MOST_BYTES:
+            return
+        parts = self._vectors.setdefault(part.id, Parts(int(part.dtype[-1]) * prod(part.shape)))
+        if isinstance(parts, Parts) and part.offset not in parts.data:
+            parts.data[part.offset] = part.data
+            self._bytes += len(part.data)
         self._vectors.move_to_end(part.id)
+
+    def _drop(self, identity: bytes) -> None:
+        vector = self._vectors.pop(identity)
+        self._bytes -= len(vector.joined() if isinstance(vector, Parts) else vector)
 
     def _trim(self) -> None:
         needed = {job.vector for job in self._jobs.values()}
         surplus = [identity for identity in self._vectors if identity not in needed]
         for identity in surplus[: max(0, len(surplus) - KEPT_VECTORS)]:
-            del self._vectors[identity]
+            self._drop(identity)

@@ -19,7 +19,7 @@ import zenoh
 from dreamfleet.common import keys
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.errors import RefusedError
-from dreamfleet.common.messages import JobBatch, Result
+from dreamfleet.common.messages import MAX_LEASES, JobBatch, Result
 from dreamfleet.common.mishaps import Mishaps
 from dreamfleet.common.session import enqueue_into
 from dreamfleet.worker.service.admission import Admission
@@ -182,7 +182,8 @@ class JoinedRun:
         for digest in batch.cancels:
             self._slots.abandon(digest)
         for job, why in self._backlog.take_in(batch, self._slots.held):
-            self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
+            if len(self._outbox) < MAX_LEASES:  # more than a beat can name nobody waits for
+                self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
         judged = [verdict.digest for verdict in batch.verdicts]
         self._outbox.settle(judged)
         self._uploads.settle(judged)

@@ -1,8 +1,9 @@
 import dataclasses
 import hashlib
 
-from dreamfleet.common.messages import JobBatch, VectorPart
-from dreamfleet.worker.service.backlog import KEPT_VECTORS, Backlog
+from dreamfleet.common.messages import MAX_LEASES, MAX_PART, JobBatch, VectorPart
+from dreamfleet.worker.service import backlog as room
+from dreamfleet.worker.service.backlog import KEPT_VECTORS, MOST_AHEAD, Backlog
 from tests.support.samples import HEAD, SPEC, VECTOR, VECTOR_ID, job
 
 WHOLE = VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR)
@@ -118,3 +119,44 @@ def test_a_new_life_of_the_coordinator_counts_from_one_again():
     assert not backlog.take(1)
     backlog.take_in(batch(1, (job(1),)))
     assert backlog.take(1) == [(job(1), VECTOR)]
+
+
+def test_a_number_that_no_coordinator_has_reached_counts_for_nothing():
+    backlog = Backlog(SPEC)
+    for number in (MOST_AHEAD + 1, 2**40, 2**62):
+        backlog.take_in(batch(number, (job(0),)))
+    assert not backlog.queued
+    assert not backlog._ahead
+    backlog.take_in(batch(1, (job(1),)))
+    assert backlog.seen == 1
+
+
+def test_more_jobs_than_a_worker_may_hold_are_let_go():
+    backlog = Backlog(SPEC)
+    for number in range(3):
+        backlog.take_in(batch(number + 1, tuple(job(number * 500 + each) for each in range(500))))
+    assert len(backlog.queued) == MAX_LEASES
+    backlog.clear()
+    backlog.take_in(batch(4, (job(0),)))
+    assert backlog.take(1) == [(job(0), VECTOR)]
+
+
+def test_vectors_have_so_much_room_and_no_more(monkeypatch):
+    monkeypatch.setattr(room, "MOST_BYTES", 4 * MAX_PART)
+    backlog = Backlog(SPEC)
+    for number in range(100):
+        rubbish = VectorPart(id=bytes([number]) * 32, dtype="<f4", shape=(2**40,), offset=0, data=bytes(MAX_PART))
+        backlog.take_in(batch(number + 1, vectors=(rubbish,)))
+    assert len(backlog._vectors) == 4
+    backlog.take_in(batch(101, (job(0),)))
+    assert not backlog.queued, "it is given again, to whoever has room"
+
+
+def test_a_vector_that_others_have_spoilt_costs_its_jobs_which_are_given_again():
+    backlog = Backlog(SPEC)
+    backlog.take_in(batch(1, vectors=(dataclasses.replace(WHOLE, data=bytes(64)),)))
+    backlog.take_in(batch(2, (job(0), job(1))))
+    assert not backlog.take(2)
+    assert not backlog.queued
+    backlog.take_in(batch(3, (job(0),)))
+    assert backlog.take(2) == [(job(0), VECTOR)]
