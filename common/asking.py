@@ -1,9 +1,13 @@
-"""Asking over Zenoh: one query, or several at once, and every reply to them."""
+"""Asking over Zenoh: one query, or several at once, and every reply to them.
+
+Left to itself, Zenoh asks only one of those who answer for a key if that one says that it knows all, and of several
+answers to one key tells the last: so whoever reaches the port could answer in a coordinator's place.
+"""
 
 from __future__ import annotations
 
 import queue
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from time import monotonic
 from typing import Any
 
@@ -14,6 +18,19 @@ MOST_REPLIES = 65_536  # that wait to be looked at: an answerer without end fill
 LOOK = 0.2  # seconds between looks at whether to stop
 
 
+def ask_everybody(
+    session: zenoh.Session, selectors: Iterable[str], timeout: float, payload: bytes | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Iterator[tuple[str, bytes]]:  # fmt: skip
+    """Every good reply of everybody who answers, as it comes within `timeout` seconds: whose it is, and its payload.
+
+    Nobody's answer keeps another's away. Whose it is, is the answering session's own word. `payload` is JSON.
+    """
+    everybody = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
+    for reply in _replies(session, selectors, timeout, payload, stopped, **everybody):
+        yield str(reply.replier_id and reply.replier_id.zid), reply.ok.payload.to_bytes()
+
+
 def ask_all(
     session: zenoh.Session, selectors: Iterable[str], timeout: float, payload: bytes | None = None,
     stopped: Callable[[], bool] = lambda: False,
@@ -22,6 +39,14 @@ def ask_all(
 
     `payload` is JSON. All queries are in flight together, and no order of the replies is promised.
     """
+    return [reply.ok.payload.to_bytes() for reply in _replies(session, selectors, timeout, payload, stopped)]
+
+
+def _replies(
+    session: zenoh.Session, selectors: Iterable[str], timeout: float, payload: bytes | None,
+    stopped: Callable[[], bool], **how: Any,
+) -> Iterator[Any]:  # fmt: skip
+    """Good replies as they come."""
     replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
     done = object()
 
@@ -33,9 +58,8 @@ def ask_all(
     left = 0
     for selector in selectors:
         handler = zenoh.handlers.Callback(take, lambda: replies.put(done), indirect=False)
-        session.get(selector, handler, timeout=timeout, payload=payload, encoding=encoding)
+        session.get(selector, handler, timeout=timeout, payload=payload, encoding=encoding, **how)
         left += 1
-    payloads: list[bytes] = []
     deadline = monotonic() + timeout + GRACE  # Ctrl-C in Zenoh's thread can take an end of replies with it
     while left and not stopped() and monotonic() < deadline:
         try:
@@ -45,5 +69,4 @@ def ask_all(
         if reply is done:
             left -= 1
         elif reply.ok is not None:
-            payloads.append(reply.ok.payload.to_bytes())
-    return payloads
+            yield reply

@@ -19,6 +19,10 @@ class BundleError(DreamfleetError):
     """A world-model bundle is missing, damaged, or not the one that was named."""
 
 
+class DownloadError(BundleError):
+    """A world model did not come, or came as something else: later, or from somebody else, it may come."""
+
+
 class ControllerError(DreamfleetError):
     """A controller file is damaged or does not fit the task or the bundle."""
 

@@ -70,7 +70,7 @@ def test_a_worker_that_lacks_the_environment_says_so_and_the_run_waits(processes
     coordinator = processes.coordinator(
         "--task", "tests.support.tasks:Toy", "--bundle", "tiny", "--population", 4, "--generations", 1
     )
-    code, _, err = processes.call("worker", "--connect", processes.endpoint, "--slots", 1)
+    code, _, err = processes.call("worker", "--connect", processes.endpoint, "--slots", 1, "--exit-when-done")
     assert code == 1
     assert "'tests.support.tasks:Toy'" in err
     assert "install the package" in err

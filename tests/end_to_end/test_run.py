@@ -112,7 +112,7 @@ def test_a_job_that_fails_on_two_workers_pauses_the_run_and_says_why(processes, 
 
 def test_a_worker_that_does_not_know_the_task_is_refused(processes, settings):
     processes.coordinator(*settings, "--task", "moon-landing", "--generations", 1)
-    code, _, err = processes.call("worker", "--connect", processes.endpoint)
+    code, _, err = processes.call("worker", "--connect", processes.endpoint, "--exit-when-done")
     assert code != 0
     assert "'moon-landing'" in err
 

@@ -1,8 +1,13 @@
-"""Asking to join a run: hello, and what the answer means."""
+"""Asking to join a run: hello, and what the answer means.
+
+Whoever reaches the port can answer too. So of several answers a welcome goes before a refusal, and the run that this
+worker has joined already before any other; of equals one is taken at random, so that nobody is sure to be believed.
+"""
 
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -10,7 +15,7 @@ from dataclasses import dataclass, replace
 import zenoh
 
 from dreamfleet.common import keys
-from dreamfleet.common.asking import ask_all
+from dreamfleet.common.asking import ask_all, ask_everybody
 from dreamfleet.common.codec import Inbox, MalformedError, encode_json, from_plain
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, fingerprint, package_version
@@ -19,6 +24,7 @@ from dreamfleet.common.printable import one_line
 from dreamfleet.worker.service.announced import check_announced
 
 HELLO_TIMEOUT = 2.0
+MOST_TOLD = 8  # runs by name
 
 
 @dataclass(frozen=True)
@@ -37,19 +43,22 @@ class Admission:
 
 
 def ask(
-    session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox, *, secured: bool = False
+    session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox, joined: str = "", *,
+    secured: bool = False,
 ) -> Admission | None:
     """Say hello to `run`, or to the only live one; `None` if nobody answers, `RefusedError` if the answer is no.
+
+    `joined` is the uid of the run that this worker is in.
 
     A run that asks for a task which the request does not announce is refused in turn: its word imports nothing here.
     In a `secured` fleet it is said under this worker's own name.
     Where the run's fingerprint names other packages than the request's, hello is said again about those.
     """
-    reply = _say(session, run, request, inbox, secured)
+    reply = _say(session, run, request, inbox, joined, secured=secured)
     if reply is not None and not reply.accepted and reply.packages != request.packages:
         named = fingerprint(reply.packages)[:MAX_TEXT]  # the packages that they name are theirs to choose
         about = replace(request, packages=reply.packages, fingerprint=named)
-        reply = _say(session, reply.run, about, inbox, secured)
+        reply = _say(session, reply.run, about, inbox, joined, secured=secured)
     if reply is None:
         return None
     admission = _admission(reply)
@@ -58,23 +67,27 @@ def ask(
 
 
 def _say(
-    session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox, secured: bool
+    session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox, joined: str, *, secured: bool
 ) -> HelloReply | None:
     key = keys.hello_of(run or "*", request.worker) if secured else keys.hello(run or "*")
-    replies = [reply for payload in ask_all(session, [key], HELLO_TIMEOUT, encode_json(request))
-               if (reply := inbox.decode_json(HelloReply, payload)) is not None and _names_a_run(reply)]  # fmt: skip
+    replies = []
+    for _, payload in ask_everybody(session, [key], HELLO_TIMEOUT, encode_json(request)):
+        reply = inbox.decode_json(HelloReply, payload)
+        if reply is not None and _is_of(reply, run):
+            replies.append(reply)
+            if reply.accepted and reply.run_uid == joined:  # nobody is to keep it waiting by not answering
+                break
     if not replies:
         return None
-    if len(replies) > 1:
-        names = ", ".join(sorted(reply.run for reply in replies))
-        raise UsageError(f"several runs are live: choose one with --run: {names}")
-    return replies[0]
+    if len(names := sorted({reply.run for reply in replies})) > 1:
+        raise RefusedError(f"several runs are live: choose one with --run: {', '.join(names[:MOST_TOLD])}")
+    return max(replies, key=lambda reply: (reply.run_uid == joined, reply.accepted, random.random()))  # noqa: S311
 
 
-def _names_a_run(reply: HelloReply) -> bool:
-    """Whether an answer is of a run at all: what else answers is nobody's coordinator."""
+def _is_of(reply: HelloReply, run: str | None) -> bool:
+    """Whether an answer is of `run`, or of any at all: what else answers is nobody's coordinator."""
     with suppress(UsageError):
-        return bool(keys.check_run_name(reply.run))
+        return keys.check_run_name(reply.run) == (run or reply.run)
     return False
 
 

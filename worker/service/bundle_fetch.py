@@ -1,20 +1,25 @@
-"""Fetching the frozen world model by its hash: in parts, resumable, verified."""
+"""Fetching the frozen world model by its hash: in parts, resumable, verified.
+
+Whoever reaches the port can answer too. So all of one download is of one answerer, and one whose bytes were not those
+of the hash is asked again only where nobody else answers.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import random
+from collections.abc import Callable, Collection
 from pathlib import Path
 from time import sleep
 
 import zenoh
 
 from dreamfleet.common import keys
-from dreamfleet.common.asking import ask_all
+from dreamfleet.common.asking import ask_everybody
 from dreamfleet.common.bundle import MAX_BUNDLE, Bundle
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.controller import Controller
-from dreamfleet.common.errors import BundleError
+from dreamfleet.common.errors import BundleError, DownloadError
 from dreamfleet.common.files import open_growing
 from dreamfleet.common.messages import MAX_PART, BundlePart
 from dreamfleet.common.store import BundleStore, default_cache
@@ -31,16 +36,21 @@ def obtain(
     session: zenoh.Session, run: str, sha256: str, store: BundleStore, inbox: Inbox,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Bundle | None:  # fmt: skip
-    """The bundle from the cache, or fetched from the coordinator; `None` if `stopped`, what has come stays."""
+    """The bundle from the cache, or fetched from the coordinator; `None` if `stopped`, what has come stays.
+
+    `DownloadError` if it does not come, or comes as something else again and again.
+    """
     bundle = store.find(sha256)
     if bundle is not None:
         return bundle
+    liars: set[str] = set()  # who gave bytes that were not of the hash
     with store.downloading(sha256) as path:
         for attempt in range(1, ATTEMPTS + 1):
             if (bundle := store.find(sha256)) is not None:  # another worker of this host was faster
                 return bundle
             try:
-                _download(session, keys.bundle(run, sha256), sha256, path, inbox, stopped)
+                anew = not path.exists() or path.stat().st_size == 0
+                sources = _download(session, keys.bundle(run, sha256), sha256, path, inbox, stopped, liars)
             except OSError as error:  # what has come stays, and the next worker goes on from there
                 raise store.unwritable(error) from error
             if stopped():
@@ -49,10 +59,12 @@ def obtain(
                 bundle = store.complete(sha256)
             except BundleError as error:
                 log.warning("attempt %d of %d: %s", attempt, ATTEMPTS, error)
+                if anew and len(sources) == 1:  # else nobody knows whose bytes they were
+                    liars |= sources
                 continue
             log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6)
             return bundle
-    raise BundleError(f"the bundle {sha256[:12]}... arrived damaged {ATTEMPTS} times: check the coordinator's copy")
+    raise DownloadError(f"the bundle {sha256[:12]}... arrived damaged {ATTEMPTS} times: check the coordinator's copy")
 
 
 def fetch_for(controller: Controller, session: zenoh.Session, run: str) -> Bundle | None:
@@ -65,39 +77,51 @@ def fetch_for(controller: Controller, session: zenoh.Session, run: str) -> Bundl
 
 
 def _download(
-    session: zenoh.Session, key: str, sha256: str, path: Path, inbox: Inbox, stopped: Callable[[], bool]
-) -> None:
-    """Append to `path` until it is as long as the bundle, or `stopped`.
+    session: zenoh.Session, key: str, sha256: str, path: Path, inbox: Inbox, stopped: Callable[[], bool],
+    liars: Collection[str],
+) -> set[str]:  # fmt: skip
+    """Append to `path` until it is as long as the bundle, or `stopped`; whose parts they were.
 
-    How long that is, the first part says; one that says otherwise is of something else.
+    How long that is, the first part says; one that says otherwise is of something else. Another answerer is looked for
+    only once the chosen one is silent.
     """
-    total, silences = None, 0
+    total, silences, source = None, 0, ""
+    sources: set[str] = set()
     with open_growing(path) as file:
         while (total is None or file.tell() < total) and not stopped():
             before = file.tell()
             offsets = [before + index * MAX_PART for index in range(WINDOW if total else 1)]
             wanted = [each for each in offsets if total is None or each < total]
-            parts = [part for part in _ask(session, key, wanted, inbox, stopped) if part.sha256.hex() == sha256]
-            for part in sorted(parts, key=lambda part: part.offset):
+            parts = _ask(session, key, sha256, wanted, inbox, stopped, source)
+            source = source or _choose(parts, liars)
+            for part in sorted(parts.get(source, []), key=lambda part: part.offset):
                 total = _length(part) if total is None else total
                 if part.total == total and part.offset == file.tell() and part.offset + len(part.data) <= total:
                     file.write(part.data)
+                    sources.add(source)
             if total is not None and file.tell() > total:
                 file.seek(0)
                 file.truncate()  # the beginning of something else
             elif file.tell() > before or file.tell() == total:
                 silences = 0
             else:
-                silences, total = silences + 1, None  # which was perhaps of something else
+                silences, total, source = silences + 1, None, ""  # which was perhaps of something else
                 sleep(PAUSE)
             if silences >= SILENCES:
-                raise BundleError("the coordinator no longer answers for its bundle; start the worker again later")
+                raise DownloadError("the coordinator no longer answers for its bundle; start the worker again later")
+    return sources
+
+
+def _choose(parts: Collection[str], liars: Collection[str]) -> str:
+    """One of those who answer, at random: nobody is sure to be first."""
+    known = sorted(set(parts) - set(liars)) or sorted(parts)
+    return random.choice(known) if known else ""  # noqa: S311 - no secret
 
 
 def _length(part: BundlePart) -> int:
     """How long the bundle is; `BundleError` before more is written than a bundle may be."""
     if part.total > MAX_BUNDLE:
-        raise BundleError(
+        raise DownloadError(
             f"the coordinator says that its bundle is {part.total / 1e6:,.0f} MB long, {MAX_BUNDLE / 1e6:.0f} at most "
             "are fetched: check its copy"
         )
@@ -105,8 +129,16 @@ def _length(part: BundlePart) -> int:
 
 
 def _ask(
-    session: zenoh.Session, key: str, offsets: list[int], inbox: Inbox, stopped: Callable[[], bool]
-) -> list[BundlePart]:
+    session: zenoh.Session, key: str, sha256: str, offsets: list[int], inbox: Inbox, stopped: Callable[[], bool],
+    source: str,
+) -> dict[str, list[BundlePart]]:  # fmt: skip
+    """Parts of this bundle by who gave them; without waiting for others once `source` has given all."""
     selectors = [f"{key}?offset={offset};length={MAX_PART}" for offset in offsets]
-    payloads = ask_all(session, selectors, QUERY_TIMEOUT, stopped=stopped)
-    return [part for payload in payloads if (part := inbox.decode(BundlePart, payload)) is not None]
+    parts: dict[str, list[BundlePart]] = {}
+    for who, payload in ask_everybody(session, selectors, QUERY_TIMEOUT, stopped=stopped):
+        part = inbox.decode(BundlePart, payload)
+        if part is not None and part.sha256.hex() == sha256:
+            parts.setdefault(who, []).append(part)
+        if len(parts.get(source, [])) == len(offsets):
+            break
+    return parts

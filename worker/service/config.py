@@ -23,7 +23,7 @@ class WorkerConfig:
     slot_memory: int = option(
         2048, "MiB of a scoring process; one that holds more is replaced between jobs; 0: no limit"
     )
-    exit_when_done: bool = option(False, "leave when the run has ended, instead of waiting for its coordinator")
+    exit_when_done: bool = option(False, "leave when the run has ended or refuses this worker")
 
     def __post_init__(self) -> None:
         if self.run is not None:

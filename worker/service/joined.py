@@ -47,8 +47,8 @@ class Line:
     session: zenoh.Session
     identity: str
     inbox: Inbox
-    # To a run by name, of a class that may not be known yet; `None` if nobody answers.
-    say_hello: Callable[[str, str], Admission | None]
+    # To a run by name, of a class that may not be known yet, by who is in the run of this uid; `None` if nobody answers.
+    say_hello: Callable[[str, str, str], Admission | None]
     pause: Callable[[], float]  # seconds until hello may be said again
 
 
@@ -74,8 +74,10 @@ class JoinedRun:
     def serve(self) -> None:
         """Work until told to leave, or until the run is over; ends neither the slots nor the session."""
         declared = self._startup()
-        self._main_loop()
-        self._shutdown(declared)
+        try:
+            self._main_loop()
+        finally:
+            self._shutdown(declared)
 
     def _startup(self) -> list[Any]:
         run, session = self._admission.run, self._line.session
@@ -244,11 +246,11 @@ class JoinedRun:
     def _rejoin(self, now: float) -> None:
         """Say hello again; what runs goes on, what is unacknowledged is kept, what is queued is given again."""
         self._membership.ask(now, self._line.pause())
-        admission = self._line.say_hello(self._admission.run, self._slots.host_class)
+        admission = self._line.say_hello(self._admission.run, self._slots.host_class, self._admission.run_uid)
         if admission is None:
             return
         if (admission.run_uid, admission.spec) != (self._admission.run_uid, self._admission.spec):
-            raise RefusedError(f"run {admission.run} is another run now; start this worker again to join it")
+            raise RefusedError(f"run {admission.run} is another run now")
         anew = admission.nonce != self._admission.nonce
         self._admission = admission
         self._post = Post(self._line.session, self._line.identity, admission)

@@ -1,25 +1,40 @@
-"""Which runs have refused a worker that serves any of them. Pure: a clock in, whom not to ask out.
+"""Which runs have refused a worker, and when to ask again. Pure: a clock in, whom not to ask out.
 
-What a run refuses for may pass: a package is installed, another run takes the name. So it is asked again, ever later.
+What a run refuses for may pass: another run takes the name, its coordinator comes back with other settings. And whoever
+reaches the port can refuse in its name. So it is asked again, ever later, for as long as the worker lives.
 """
 
 from __future__ import annotations
 
-FIRST, LONGEST = 15.0, 600.0  # seconds until a run is asked again: doubled with each refusal
+FIRST, LONGEST = 15.0, 600.0  # seconds until a run is asked again by a worker that has others: doubled each time
+ALONE = 1.0, 60.0  # the same of one that has not
 
 
 class Refusals:
     """Runs that said no, and until when they are left alone."""
 
-    def __init__(self) -> None:
+    def __init__(self, first: float = FIRST, longest: float = LONGEST) -> None:
+        self._first, self._longest = first, longest
+        self._why: dict[str, str] = {}  # what was last said of each
         self._pause: dict[str, float] = {}
         self._until: dict[str, float] = {}
 
     def add(self, run: str, now: float) -> float:
         """A run said no; for how many seconds it is left alone."""
-        pause = min(2 * self._pause.get(run, FIRST / 2), LONGEST)
+        pause = min(2 * self._pause.get(run, self._first / 2), self._longest)
         self._pause[run], self._until[run] = pause, now + pause
         return pause
+
+    def is_news(self, run: str, why: str) -> bool:
+        """Whether this is not what a run said the last time."""
+        before = self._why.get(run)
+        self._why[run] = why
+        return why != before
+
+    def forgive(self, run: str) -> None:
+        """A run has this worker score: what it refused before is past."""
+        for each in (self._why, self._pause, self._until):
+            each.pop(run, None)
 
     def standing(self, now: float) -> set[str]:
         """Runs not to ask now."""

@@ -17,7 +17,7 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.cores import cores
 from dreamfleet.common.credentials import seated
-from dreamfleet.common.errors import ConnectionFailedError, RefusedError
+from dreamfleet.common.errors import ConnectionFailedError, DownloadError, RefusedError
 from dreamfleet.common.session import Network, open_session
 from dreamfleet.common.store import BundleStore, default_cache
 from dreamfleet.worker.service.admission import Admission, ask, make_request, neediest
@@ -26,7 +26,7 @@ from dreamfleet.worker.service.bundle_fetch import obtain
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.joined import JoinedRun, Line
 from dreamfleet.worker.service.membership import Membership, Terms
-from dreamfleet.worker.service.refusals import Refusals
+from dreamfleet.worker.service.refusals import ALONE, Refusals
 from dreamfleet.worker.service.slots import Slots
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
 
@@ -53,7 +53,7 @@ class Worker:
         self._hello = make_request(self.identity, (*known_tasks(), *tasks), self._slot_count)
         terms = Terms(config.lifetime, config.drain_timeout, leaves_alone=config.exit_when_done or config.any)
         self._membership = Membership(terms, monotonic())
-        self._refusals = Refusals()
+        self._refusals = Refusals() if config.any else Refusals(*ALONE)
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
 
     def stop(self) -> None:
@@ -88,9 +88,13 @@ class Worker:
         """One run, or one after another."""
         line = Line(session, self.identity, self.inbox, lambda *of: self._ask(session, *of), _jittered_retry)
         while (admission := self._join(session)) is not None:
-            self._serve_run(line, admission)
-            if not self._config.any:
-                return
+            try:
+                self._serve_run(line, admission)
+            except (RefusedError, DownloadError) as error:
+                self._take_refusal(admission.run, error)
+            else:
+                if not self._config.any:
+                    return
 
     def _serve_run(self, line: Line, admission: Admission) -> None:
         """Work for a run until it is over, or until this worker leaves."""
@@ -101,30 +105,37 @@ class Worker:
         self._events = queue.SimpleQueue()
         with ExitStack() as stack:
             memory, path = self._config.slot_memory << 20, bundle.path if bundle else None
-            try:
-                if bundle is not None:
-                    check_world(bundle, self._hello.tasks)
-                slots = Slots(
-                    self._slot_count, admission.spec, path, self._events, self._hello.tasks, memory,
-                    lambda: self._obtain_bundle(line.session, admission) if bundle else None,
-                )  # fmt: skip
-                stack.callback(slots.stop)
-                JoinedRun(line, admission, self._membership, slots, self._events).serve()
-            except RefusedError as error:
-                self._take_refusal(admission.run, error)
+            if bundle is not None:
+                check_world(bundle, self._hello.tasks)
+            slots = Slots(
+                self._slot_count, admission.spec, path, self._events, self._hello.tasks, memory,
+                lambda: self._obtain_bundle(line.session, admission) if bundle else None,
+            )  # fmt: skip
+            stack.callback(slots.stop)
+            self._refusals.forgive(self._refuser(admission.run))
+            JoinedRun(line, admission, self._membership, slots, self._events).serve()
 
     def _join(self, session: zenoh.Session) -> Admission | None:
         """A run that has welcomed this worker; `None` if it shall leave meanwhile."""
         said = False
         while not self._leaving():
-            admission = self._ask_neediest(session) if self._config.any else self._ask(session, self._config.run)
+            admission = self._ask_neediest(session) if self._config.any else self._ask_own(session)
             if admission is not None:
                 return admission
-            if not said:
+            if not said and not self._refusals.standing(monotonic()):
                 log.warning("waiting for %s", f"run {self._config.run}" if self._config.run else "a run")
             said = True
             self._pause()
         return None
+
+    def _ask_own(self, session: zenoh.Session) -> Admission | None:
+        if self._refusals.standing(monotonic()):
+            return None
+        try:
+            return self._ask(session, self._config.run)
+        except RefusedError as error:
+            self._take_refusal("", error)
+            return None
 
     def _ask_neediest(self, session: zenoh.Session) -> Admission | None:
         run = neediest(session, self._refusals.standing(monotonic()))
@@ -134,15 +145,22 @@ class Worker:
             self._take_refusal(str(run), error)
             return None
 
-    def _take_refusal(self, run: str, error: RefusedError) -> None:
-        """A refusal ends a worker of one run; a worker of any run turns to the others, and asks again later."""
-        if not self._config.any:
+    def _take_refusal(self, run: str, error: RefusedError | DownloadError) -> None:
+        """A refusal ends only a worker that shall leave when it is done; any other asks again, ever later."""
+        if self._config.exit_when_done:
             raise error
-        log.warning("%s; asking it again in %.0f s", error, self._refusals.add(run, monotonic()))
+        refuser = self._refuser(run)
+        pause = self._refusals.add(refuser, monotonic())
+        if self._refusals.is_news(refuser, str(error)):
+            log.warning("%s; asking again in %.0f s, and then ever later", error, pause)
 
-    def _ask(self, session: zenoh.Session, run: str | None, host_class: str = "") -> Admission | None:
+    def _refuser(self, run: str) -> str:
+        """Under which name a refusal is remembered: a worker of one run has one that may refuse."""
+        return run if self._config.any else ""
+
+    def _ask(self, session: zenoh.Session, run: str | None, host_class: str = "", joined: str = "") -> Admission | None:
         request, secured = replace(self._hello, host_class=host_class), self._network.credentials is not None
-        return ask(session, run, request, self.inbox, secured=secured)
+        return ask(session, run, request, self.inbox, joined, secured=secured)
 
     def _obtain_bundle(self, session: zenoh.Session, admission: Admission) -> Bundle | None:
         store = BundleStore(default_cache())

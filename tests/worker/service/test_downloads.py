@@ -2,8 +2,11 @@
 
 import pytest
 
+from dreamfleet.common import keys
+from dreamfleet.common.codec import encode
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.messages import MAX_PART
+from dreamfleet.common.messages import MAX_PART, BundlePart
+from dreamfleet.common.session import Network, open_session
 from dreamfleet.common.store import BundleStore, default_cache
 from tests.support.hand import DEADLINE
 from tests.support.stage import wait_for
@@ -25,10 +28,37 @@ def test_a_damaged_part_costs_one_more_download(stage, said):
 def test_a_bundle_that_is_always_damaged_is_an_error_that_says_so(stage):
     hand = stage.hand()
     hand.damage = lambda offset, data: data[::-1]
-    _, served = stage.worker()
+    _, served = stage.worker(exit_when_done=True)
     error = served.exception(DEADLINE)
     assert isinstance(error, BundleError)
     assert "damaged 3 times" in str(error)
+
+
+def test_it_asks_again_for_a_bundle_that_never_came_whole(stage, said):
+    hand = stage.hand()
+    hand.damage = lambda offset, data: data[::-1]
+    stage.worker()
+    assert "asking again in 1 s" in wait_for(said, "damaged 3 times")
+    hand.damage = lambda offset, data: data
+    assert hand.ready().slots == 1
+
+
+def test_rubbish_beside_the_truth_keeps_no_worker_from_it(stage, said):
+    """Somebody answers first for every part, with bytes of nothing."""
+    hand = stage.hand()
+    head = {"run_uid": hand.run_uid, "incarnation": 1, "sha256": bytes.fromhex(stage.bundle.sha256)}
+
+    def lie(query):
+        offset = int(query.parameters.get("offset"))
+        total = stage.bundle.path.stat().st_size
+        with query:
+            data = bytes(min(MAX_PART, total - offset))
+            query.reply(query.key_expr, encode(BundlePart(**head, offset=offset, total=total, data=data)))
+
+    with open_session(Network(connect=(hand.endpoint,))) as session:
+        session.declare_queryable(keys.bundle("test", stage.bundle.sha256), lie, complete=True)
+        stage.worker()
+        assert hand.ready().slots == 1
 
 
 @pytest.mark.parametrize(("beginning", "first"), [(3 * MAX_PART + 17, 3 * MAX_PART + 17), (9 * MAX_PART, 9 * MAX_PART)])

@@ -7,17 +7,18 @@ from dataclasses import dataclass, replace
 import pytest
 
 from dreamfleet.common.bundle import write_bundle
+from dreamfleet.common.codec import encode_json
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, fingerprint
 from dreamfleet.common.messages import Intervals, ResultBatch, TaskSpec
-from dreamfleet.common.session import Network
+from dreamfleet.common.session import Network, open_session
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.service.worker import Worker
-from tests.support import tasks
+from tests.support import samples, tasks
 from tests.support.hand import DEADLINE, SECOND, Hand
 from tests.support.processes import free_port
-from tests.support.stage import wait_for
+from tests.support.stage import drained, wait_for
 
 pytestmark = pytest.mark.timeout(60)
 SLOW_BEATS = Intervals(beat=2 * DEADLINE, repeat=0.1)
@@ -56,14 +57,14 @@ def test_without_a_name_it_joins_the_only_run(stage, cached):
     assert hand.ready().slots == 1
 
 
-def test_without_a_name_several_runs_are_listed(stage, cached):
+def test_without_a_name_several_runs_are_listed_until_one_is_left(stage, said, cached):
     hand = stage.hand(run="night")
     other = Hand(free_port(), stage.bundle, tasks.TOY, run="day")
     answer = hand.session.declare_queryable("dreamfleet/hello/day", other._hello)
-    _, served = stage.worker(run=None)
-    assert isinstance(error := served.exception(DEADLINE), UsageError)
-    assert "day, night" in str(error)
+    stage.worker(run=None)
+    assert "day, night" in wait_for(said, "several runs are live")
     answer.undeclare()
+    hand.ready()
     other.close()
 
 
@@ -79,9 +80,38 @@ def test_it_says_hello_again_about_the_packages_that_the_runs_fingerprint_names(
     assert hand.beat(lambda beat: beat.capacity > 0).slots == 1
 
 
-def test_a_refusal_ends_it_with_the_reason_and_the_remedy(stage):
+def test_a_refusal_is_told_once_and_again_as_the_reason_changes_and_asked_about_until_it_is_over(stage, said, cached):
+    hand = stage.hand()
+    hand.refusal = ("your moon is full", "wait a week")
+    stage.worker()
+    assert "your moon is full; wait a week; asking again in 1 s" in wait_for(said, "refused this worker")
+    for _ in range(2):
+        hand.hello()
+    assert not [line for line in drained(said) if "moon" in line]
+    hand.refusal = ("your moon is new", "wait a week")
+    wait_for(said, "your moon is new")
+    hand.refusal = None
+    assert hand.ready().slots == 1
+
+
+def test_one_answer_of_several_is_enough_to_join(stage, cached):
+    """Somebody who answers for everything, and says that he knows all, answers first and refuses."""
+    hand = stage.hand()
+    refusal = replace(samples.JSON["hello-reply"], run="test", accepted=False, why="go away", remedy="far away")
+    with open_session(Network(connect=(hand.endpoint,))) as session:
+        session.declare_queryable("dreamfleet/**", lambda query: say(query, refusal), complete=True)
+        stage.worker()
+        assert hand.ready().slots == 1
+
+
+def say(query, reply):
+    with query:
+        query.reply(query.key_expr, encode_json(reply))
+
+
+def test_one_that_shall_leave_when_it_is_done_is_ended_by_a_refusal_with_the_reason_and_the_remedy(stage):
     stage.hand().refusal = ("your moon is full", "wait a week")
-    _, served = stage.worker()
+    _, served = stage.worker(exit_when_done=True)
     error = served.exception(DEADLINE)
     assert isinstance(error, RefusedError)
     assert "your moon is full; wait a week" in str(error)
@@ -90,7 +120,7 @@ def test_a_refusal_ends_it_with_the_reason_and_the_remedy(stage):
 def test_a_run_that_is_told_in_a_later_versions_words_is_refused_rather_than_scored_otherwise(stage):
     hand = stage.hand()
     hand.spec = OfTomorrow(**vars(hand.spec))
-    _, served = stage.worker()
+    _, served = stage.worker(exit_when_done=True)
     error = served.exception(DEADLINE)
     assert isinstance(error, RefusedError)
     assert "in words that this version does not know (wrong fields); install dreamfleet" in str(error)
@@ -102,7 +132,7 @@ def test_of_any_run_one_that_refuses_is_left_to_others(stage, said, cached):
     other = stage.also(picky, run="second")
     other.slots = 1
     stage.worker(run=None, any=True)
-    assert "your moon is full; wait a week; asking it again in 15 s" in wait_for(said, "refused")
+    assert "your moon is full; wait a week; asking again in 15 s" in wait_for(said, "refused")
     other.ready()
 
 
@@ -135,7 +165,7 @@ def foreign(tmp_path, monkeypatch):
 def test_a_task_that_it_did_not_announce_is_never_imported(stage, cached, tmp_path, monkeypatch):
     mark = foreign(tmp_path, monkeypatch)
     stage.hand("foreign_world:World")
-    _, served = stage.worker()
+    _, served = stage.worker(exit_when_done=True)
     assert isinstance(error := served.exception(DEADLINE), RefusedError)
     assert "'foreign_world:World', which this worker did not announce" in str(error)
     assert not mark.exists()
@@ -166,7 +196,7 @@ def test_a_world_model_of_a_world_that_it_did_not_announce_imports_nothing(stage
     world = replace(small.manifest, task="foreign_world:World")
     stage.bundle = write_bundle(tmp_path / "foreign.zip", world, parts)
     stage.hand("dream")
-    _, served = stage.worker()
+    _, served = stage.worker(exit_when_done=True)
     assert isinstance(served.exception(DEADLINE), RefusedError)
     assert not mark.exists()
 

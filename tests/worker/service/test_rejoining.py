@@ -1,12 +1,17 @@
 """A worker and the next life of its coordinator, or a coordinator that may have forgotten it."""
 
+from dataclasses import replace
+
 import pytest
 
+from dreamfleet.common.codec import encode_json
 from dreamfleet.common.errors import RefusedError
 from dreamfleet.common.messages import Intervals, ResultBatch, UploadPart
-from tests.support import tasks
+from dreamfleet.common.session import Network, open_session
+from tests.support import samples, tasks
 from tests.support.hand import DEADLINE, SECOND, tag
 from tests.support.relay import Relay
+from tests.support.stage import wait_for
 
 pytestmark = pytest.mark.timeout(60)
 SLOW_BEATS = Intervals(beat=2 * DEADLINE, repeat=0.1)
@@ -101,11 +106,41 @@ def test_a_coordinator_that_has_nothing_to_say_is_asked_whether_it_knows_the_wor
     hand.hello()
 
 
-def test_another_run_of_the_same_name_ends_it(stage, cached):
+def test_another_run_of_the_same_name_is_joined_anew(stage, said, cached):
     hand = stage.hand()
     _, served = stage.worker()
     hand.ready()
     hand.vanish()
     hand.nonce, hand.run_uid = SECOND, "f" * 32
     hand.appear()
+    wait_for(said, "is another run now")
+    assert hand.beat(lambda beat: beat.run_uid == "f" * 32).slots == 1
+    assert not served.done()
+
+
+def test_another_run_of_the_same_name_ends_one_that_shall_leave_when_its_own_is_over(stage, cached):
+    hand = stage.hand()
+    _, served = stage.worker(exit_when_done=True)
+    hand.ready()
+    hand.vanish()
+    hand.nonce, hand.run_uid = SECOND, "f" * 32
+    hand.appear()
     assert isinstance(served.exception(DEADLINE), RefusedError)
+
+
+def test_somebody_who_answers_as_another_run_does_not_part_it_from_its_own(stage, relay, cached):
+    hand = stage.hand()
+    stage.worker(relay.endpoint)
+    hand.ready()
+    other = replace(samples.JSON["hello-reply"], run="test", run_uid="f" * 32, accepted=True)
+    with open_session(Network(connect=(hand.endpoint,))) as session:
+        session.declare_queryable("dreamfleet/hello/test", lambda query: say(query, other), complete=True)
+        relay.cut()
+        hand.hello()
+        hand.send(1, hand.job())
+        assert hand.result(hand.job()).fitness is not None
+
+
+def say(query, reply):
+    with query:
+        query.reply(query.key_expr, encode_json(reply))
