@@ -142,7 +142,10 @@ class Fleet:
         if member is not None:
             self._hear(member, now)
             member.take_back(result)
+        lease = None if member is None else member.leases.get(result.digest)
         verdict, work = self._judge(identity, result)
+        if lease is not None and work is not None:
+            self._tail.took(now - lease.handful.given, in_slack=lease.in_slack)
         if member is not None or verdict == "accepted":
             self.story.add(now, verdict, identity, result.digest)
         if member is not None:

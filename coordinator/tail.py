@@ -21,6 +21,7 @@ SMOOTHING = 0.1  # weight of the newest episode in the typical one
 QUIET_BEATS = 2  # without a word: a straggler that nothing is known of
 UPLOAD_SECONDS = 30.0  # after a result, in which its upload should have come
 MARGIN = 1.5  # how many times sooner a copy must be expected to finish
+HELD, HELD_TIMES = 60.0, 8.0  # seconds, and times that a job of its kind was away: longer no worker's word is relied on
 STALE, STALE_TIMES = 10.0, 20.0  # seconds, and turnarounds: what is known of a host is old then
 
 
@@ -52,6 +53,12 @@ class Tail:
     def __init__(self, beat: float) -> None:
         self._beat = beat
         self._typical = 0.0
+        self._away = {False: 0.0, True: 0.0}  # seconds, by whether jobs fill the slack
+
+    def took(self, seconds: float, *, in_slack: bool) -> None:
+        """A job that was accepted had been with its worker for so long, by our clock."""
+        before = self._away[in_slack]
+        self._away[in_slack] += SMOOTHING * (seconds - before) if before else seconds
 
     def learn(self, steps: int) -> None:
         """An episode of so many steps was accepted."""
@@ -154,6 +161,8 @@ class Tail:
         quiet = now - holder.heard
         if quiet > QUIET_BEATS * self._beat:
             return math.inf
+        if now - lease.handful.given > HELD + HELD_TIMES * self._away[lease.in_slack]:
+            return math.inf  # whatever it tells of its steps: anybody can tell them
         if lease.ended is not None:
             return math.inf if now - lease.ended > UPLOAD_SECONDS else 0.0
         if lease.steps is None:

@@ -9,7 +9,7 @@ from dreamfleet.common.messages import TAG_BYTES, Beat, Result, Running
 from dreamfleet.coordinator.fleet import DEPARTURE_GRACE, FORGOTTEN, MOST_GUESTS, MOST_SLOTS, SILENT_BEATS, VISIT
 from dreamfleet.coordinator.fleet import Fleet as _Fleet
 from dreamfleet.coordinator.jobs import make_work, travelling
-from dreamfleet.coordinator.tail import UPLOAD_SECONDS
+from dreamfleet.coordinator.tail import HELD, HELD_TIMES, UPLOAD_SECONDS
 from tests.support.samples import HEAD, SPEC
 
 
@@ -551,6 +551,25 @@ def test_a_job_with_more_steps_than_it_can_have_goes_to_others_and_its_late_resu
     assert not fleet.members[A].leases, "however often it shows it"
     assert not fleet.jobs.failures
     assert fleet.result(A, result(digest), 3.0)[0] == "accepted"
+
+
+@pytest.mark.parametrize("kind", ["score", "evaluate"])
+def test_a_job_that_is_held_by_growing_steps_is_copied_once_it_was_away_for_long(kind):
+    fleet = fleet_of(A, B, jobs=0)
+    fleet.hurry = True
+    fleet.jobs.offer(work(2, kind))
+    sends = fleet.dispatch(0.0)
+    (held,), (other,) = digests(sends, A), digests(sends, B)
+    fleet.result(B, result(other), 1.0)
+    copied = {}
+    for second in range(1, 100):
+        fleet.beat(A, beat(seen=1, running=[held], rate=1e6, steps=2 * second), float(second))
+        fleet.beat(B, beat(seen=fleet.members[B].number), float(second))
+        fleet.tick(float(second))
+        for digest in digests(fleet.dispatch(float(second)), B):
+            copied.setdefault(digest, second)
+    assert copied.keys() == {held}
+    assert HELD < copied[held] < HELD + 2 * HELD_TIMES
 
 
 def test_a_beat_that_has_seen_batches_that_nobody_sent_makes_them_count_anew():

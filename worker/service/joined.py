@@ -47,7 +47,7 @@ class Line:
     session: zenoh.Session
     identity: str
     inbox: Inbox
-    # To a run by name, of a class that may not be known yet, by who is in the run of this uid; `None` if nobody answers.
+    # To a run by name, of a class that may not be known yet, by who is in the run of this uid; `None`: nobody answers.
     say_hello: Callable[[str, str, str], Admission | None]
     pause: Callable[[], float]  # seconds until hello may be said again
 
