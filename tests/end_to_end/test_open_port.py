@@ -20,7 +20,6 @@ from dreamfleet.common.messages import (
     MAX_PART,
     TAG_BYTES,
     ControlReply,
-    HelloReply,
     JobBatch,
     Result,
     ResultBatch,
@@ -34,9 +33,24 @@ from tests.support.samples import JSON, MSGPACK
 
 pytestmark = pytest.mark.timeout(180)
 RUN, GENERATIONS, POPULATION = "test", 3, 4
-EVIL = "evil/0badc0de"
+FORGED = ("f", "a guess")  # fingerprints
 SETTINGS = ("--task", tasks.SLOW_TOY, "--population", POPULATION, "--evaluate-every", 0, "--generations", GENERATIONS,
             "--seed", 5)  # fmt: skip
+
+
+class Guest:
+    """A worker that the attacker has the run welcome; with a `capacity` it is given jobs, which it never does."""
+
+    def __init__(self, identity, capacity):
+        self.identity, self.capacity = identity, capacity
+        self.numbering = self.seen = 0
+        self.held = {}
+
+    def take(self, batch):
+        if batch.numbering > self.numbering:
+            self.numbering, self.seen = batch.numbering, 0
+        self.seen = max(self.seen, batch.number)
+        self.held.update({job.digest: job for job in batch.jobs})
 
 
 class Attacker:
@@ -48,10 +62,8 @@ class Attacker:
         self.head = None  # of the last batch that it overheard
         self.worker = None  # whom that was for
         self.fingerprint = None
-        self.numbering = 0  # of the batches that it is given itself
-        self.seen = 0
-        self.held = {}
         self.dropped = {}  # as the coordinator told it when it left
+        self.teller, self.holder = Guest("teller/0badc0de", 0), Guest("holder/0badc0de", 1)
         self._heard = [
             session.declare_subscriber(keys.any_worker("job", RUN), direct(self._overhear_batch)),
             session.declare_subscriber(keys.any_worker("result", RUN), direct(self._overhear_results)),
@@ -60,40 +72,44 @@ class Attacker:
 
     def _overhear_batch(self, sample):
         batch, worker = decode(JobBatch, sample.payload.to_bytes()), keys.worker_of(str(sample.key_expr))
-        if worker == EVIL and batch.numbering >= self.numbering:
-            self.numbering, self.seen = batch.numbering, max(self.seen, batch.number)
-            self.held.update({job.digest: job for job in batch.jobs})
-        elif worker != EVIL and batch.nonce != "forged":
+        for guest in (self.teller, self.holder):
+            if worker == guest.identity:
+                guest.take(batch)
+        if worker.startswith("own/") and batch.nonce != "forged":
             self.head, self.worker = batch, worker
         self.jobs.update({job.digest: job for job in batch.jobs})
 
     def _overhear_results(self, sample):
-        self.fingerprint = decode(ResultBatch, sample.payload.to_bytes()).fingerprint
+        fingerprint = decode(ResultBatch, sample.payload.to_bytes()).fingerprint
+        self.fingerprint = self.fingerprint if fingerprint in FORGED else fingerprint
 
     def _overhear_farewell(self, sample):
         self.dropped = json.loads(sample.payload.to_bytes())["dropped"]
 
     def hello(self, worker):
-        """What the coordinator answers."""
-        request = replace(JSON["hello-request"], worker=worker, fingerprint=self.fingerprint or "f", slots=1,
+        """Greet as this worker."""
+        request = replace(JSON["hello-request"], worker=worker, fingerprint=self.fingerprint or FORGED[0], slots=1,
                           tasks=(tasks.SLOW_TOY,), protocol_min=2, protocol_max=2)  # fmt: skip
-        answers = self.session.get(keys.hello(RUN), payload=encode_json(request), timeout=5)
-        return [decode_json(HelloReply, each.ok.payload.to_bytes()) for each in answers if each.ok]
+        list(self.session.get(keys.hello(RUN), payload=encode_json(request), timeout=5))
+
+    def join(self, guest, steps):
+        """Have a guest welcomed; it tells that it runs all that it was given, and has made so many steps."""
+        if self.fingerprint is None or self.head is None:
+            return
+        self.hello(guest.identity)
+        running = tuple(Running(digest[:TAG_BYTES], steps) for digest in list(guest.held)[-64:])
+        beat = replace(
+            MSGPACK["beat"], run_uid=self.head.run_uid, incarnation=self.head.incarnation, nonce=self.head.nonce,
+            numbering=guest.numbering, seen=guest.seen, capacity=guest.capacity, slots=guest.capacity, queued=(),
+            unacked=(), running=running,
+        )  # fmt: skip
+        self.session.put(keys.beat(RUN, guest.identity), encode(beat))
 
     def tell(self, worker, *results, fingerprint=None):
         if self.head is not None:
             batch = ResultBatch(run_uid=self.head.run_uid, incarnation=self.head.incarnation, results=results,
-                                fingerprint=fingerprint or self.fingerprint or "f")  # fmt: skip
+                                fingerprint=fingerprint or self.fingerprint or FORGED[0])  # fmt: skip
             self.session.put(keys.result(RUN, worker), encode(batch))
-
-    def beat(self, steps):
-        """As a worker that it has joined as, which runs all that it was given."""
-        running = tuple(Running(digest[:TAG_BYTES], steps) for digest in list(self.held)[:64])
-        beat = replace(
-            MSGPACK["beat"], run_uid=self.head.run_uid, incarnation=self.head.incarnation, nonce=self.head.nonce,
-            numbering=self.numbering, seen=self.seen, capacity=1, slots=1, queued=(), unacked=(), running=running,
-        )  # fmt: skip
-        self.session.put(keys.beat(RUN, EVIL), encode(beat))
 
     def forge(self, **changes):
         """A batch to the worker that it overheard."""
@@ -126,21 +142,17 @@ def tells_failures_of_everybodys_jobs(evil, _round):
 
 def tells_in_a_workers_name_what_is_not_of_its_host(evil, _round):
     if evil.worker is not None:
-        evil.tell(evil.worker, *map(lie, list(evil.jobs)[-32:]), fingerprint="a guess")
+        evil.tell(evil.worker, *map(lie, list(evil.jobs)[-32:]), fingerprint=FORGED[1])
 
 
 def joins_and_tells_what_others_were_given(evil, _round):
-    if evil.fingerprint is not None and evil.head is not None:
-        evil.hello(EVIL)
-        evil.beat(0)
-        others = [digest for digest in evil.jobs if digest not in evil.held][-16:]
-        evil.tell(EVIL, *map(lie, others), *map(fail, others))
+    evil.join(evil.teller, 0)
+    others = list(evil.jobs)[-16:]
+    evil.tell(evil.teller.identity, *map(lie, others), *map(fail, others))
 
 
 def joins_and_holds_its_jobs_by_growing_steps(evil, number):
-    if evil.fingerprint is not None and evil.head is not None:
-        evil.hello(EVIL)
-        evil.beat(10**12 + number)
+    evil.join(evil.holder, 10**12 + number)
 
 
 def greets_as_the_worker_that_works(evil, _round):
