@@ -108,7 +108,7 @@ def _download(
                 silences, total, source = silences + 1, None, ""  # which was perhaps of something else
                 sleep(PAUSE)
             if silences >= SILENCES:
-                raise DownloadError("the coordinator no longer answers for its bundle; start the worker again later")
+                raise DownloadError("the coordinator no longer answers for its bundle: ask for it later")
     return sources
 
 
@@ -119,7 +119,7 @@ def _choose(parts: Collection[str], liars: Collection[str]) -> str:
 
 
 def _length(part: BundlePart) -> int:
-    """How long the bundle is; `BundleError` before more is written than a bundle may be."""
+    """How long the bundle is; `DownloadError` before more is written than a bundle may be."""
     if part.total > MAX_BUNDLE:
         raise DownloadError(
             f"the coordinator says that its bundle is {part.total / 1e6:,.0f} MB long, {MAX_BUNDLE / 1e6:.0f} at most "
