@@ -15,7 +15,7 @@ from dreamfleet.common.seeds import CHOOSING, CONFIRMING, VALIDATION
 from dreamfleet.common.stored import StoredEvaluation
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.confirmation import FINALISTS, Confirmation, Finalist
-from tests.coordinator.test_run import SETTINGS, A, Bench
+from tests.coordinator.test_run import SETTINGS, Bench
 from tests.support.samples import SPEC
 
 JUDGED = replace(
@@ -50,7 +50,7 @@ class Judging(Bench):
         fitness = drive(job) if job.kind == "evaluate" else float(job.digest[0])
         if job.kind == "evaluate":
             self.judged.append(job)
-        self.deliver(A, Result(job.digest, fitness, 10, 0.1, None, None))
+        self.answer(Result(job.digest, fitness, 10, 0.1, None, None))
 
     def end(self):
         while self.run.ended is None:

@@ -13,7 +13,7 @@ from dreamfleet.common.shelf import find_controller
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.report import PACE
 from dreamfleet.coordinator.start import find_start
-from tests.coordinator.test_run import SETTINGS, A, Bench
+from tests.coordinator.test_run import SETTINGS, Bench
 
 EVALUATED = replace(SETTINGS, collect_every=0, evaluate_every=2, evaluation_episodes=2, population=4)
 SCORES = {1: 10.0, 3: 5.0}  # of the mean after a generation
@@ -32,7 +32,7 @@ class Reporting(Bench):
             self.given += [work.job for work in send.content.work]
         job = self.given.pop(0)
         fitness = SCORES[job.generation] if job.kind == "evaluate" else float(job.digest[0])
-        self.deliver(A, Result(job.digest, fitness, 10, 0.1, None, None))
+        self.answer(Result(job.digest, fitness, 10, 0.1, None, None))
 
     def close(self, generations):
         """Until so many generations are closed and nothing is being evaluated."""

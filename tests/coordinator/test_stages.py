@@ -18,7 +18,7 @@ from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.status import take_snapshot
 from dreamfleet.coordinator.verbs import fork
 from tests.coordinator.evaluated import EVERY, Evaluated
-from tests.coordinator.test_run import SETTINGS, A
+from tests.coordinator.test_run import SETTINGS
 from tests.support.samples import SPEC
 
 GENERATIONS = 11
@@ -194,7 +194,7 @@ def test_a_result_is_bounded_by_the_horizon_of_its_own_stage(staged):
         bench.finish(0)
     bench.fetch()
     job = bench.given[bench.first("score")]
-    bench.deliver(A, Result(job.digest, 1.0, 1500 * 1024, 0.1, None, None))
+    bench.answer(Result(job.digest, 1.0, 1500 * 1024, 0.1, None, None))
     bench.restart()
     assert bench.run.generation.done == 1, "no older version took it in"
 

@@ -35,7 +35,7 @@ def score(bench, count, fitness=lambda job: job.candidate + job.episode / 2):
         for send in bench.run.exchange.dispatch(bench.now):
             bench.given = getattr(bench, "given", []) + [work.job for work in send.content.work]
         job = bench.given.pop(0)
-        bench.deliver(A, Result(job.digest, fitness(job), 10, 0.1, None, None))
+        bench.answer(Result(job.digest, fitness(job), 10, 0.1, None, None))
         count -= 1
 
 
@@ -212,7 +212,7 @@ def test_a_worker_is_told_with_the_time_of_a_job_its_round_trip_and_what_was_sen
     bench.now = 0.25
     bench.beat(A)
     assert snapshot_of(bench).workers[0].round_trip == 0.25
-    bench.deliver(A, Result(send.content.work[0].job.digest, 1.0, 10, 0.1, None, None))
+    bench.answer(Result(send.content.work[0].job.digest, 1.0, 10, 0.1, None, None))
     bench.run.exchange.dispatch(bench.now)  # its verdict, which no beat shows as seen
     bench.run.exchange.dispatch(bench.now + 30.0)
     told = snapshot_of(bench).workers[0]

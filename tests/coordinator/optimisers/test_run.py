@@ -9,7 +9,7 @@ from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.messages import Result
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.coordinator.start import latest
-from tests.coordinator.test_run import SETTINGS, A, Bench
+from tests.coordinator.test_run import SETTINGS, Bench
 
 GENERATIONS = 6
 OPTIMISERS = ["cma", "cmaes-lra", "cmaes-sep", "tests.support.optimisers:ParentsAndChildren"]
@@ -29,7 +29,7 @@ def drive(path, bundle, optimiser, restart_at=()):
             for send in bench.run.fleet.dispatch(bench.now):
                 for work in send.content.work:
                     fitness = float(np.frombuffer(work.vector, "<f4").sum())
-                    bench.deliver(A, Result(work.job.digest, fitness, 10, 0.1, None, None))
+                    bench.answer(Result(work.job.digest, fitness, 10, 0.1, None, None))
     assert bench.run.ended is not None
     bench.journal.close()
     with RunFolder(path) as stored:
