@@ -43,7 +43,12 @@ class Admission:
 
 
 def ask(
-    session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox, joined: str = "", *,
+    session: zenoh.Session,
+    run: str | None,
+    request: HelloRequest,
+    inbox: Inbox,
+    joined: str = "",
+    *,
     secured: bool = False,
 ) -> Admission | None:
     """Say hello to `run`, or to the only live one; `None` if nobody answers, `RefusedError` if the answer is no.
