@@ -52,7 +52,11 @@ def _secured(endpoint: str) -> str:
 
 def is_loopback(endpoint: str) -> bool:
     """Whether an endpoint is of this host alone."""
-    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    return is_loopback_host(endpoint.partition("/")[2].rpartition(":")[0].strip("[]"))
+
+
+def is_loopback_host(host: str) -> bool:
+    """Whether a name or an address is of this host alone."""
     try:
         return ip_address(host).is_loopback
     except ValueError:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ipaddress
 from dataclasses import dataclass, field
 
 from dreamfleet.common.config import option
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.network import is_loopback_host
 
-LOCALHOST = "localhost"
 LEAST_TOKEN = 12  # characters: whoever can reach the port can guess
 
 
@@ -39,10 +38,7 @@ class DashboardConfig:
     @property
     def is_loopback(self) -> bool:
         """Whether this computer alone reaches the page."""
-        try:
-            return self.host == LOCALHOST or ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return False
+        return is_loopback_host(self.host)
 
     def address(self, port: int) -> str:
         """Where a browser finds it."""
