@@ -6,14 +6,17 @@ SUPPLY := .venv-supply
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
-.PHONY: demo test setup check wheel long box2d-py simulate chaos sanitize bundle worker-size stranger reproduce \
+.PHONY: demo test slow setup check wheel long box2d-py simulate chaos sanitize bundle worker-size stranger reproduce \
   reproduce-evolution lock audit sbom clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(ARGS)
 
-test: $(VENV)/.dev  ## every test that ends within minutes
-	$(BIN)/pytest -m "not long" --numprocesses 2 --dist worksteal $(ARGS)
+test: $(VENV)/.dev  ## every test that ends within seconds: under ten minutes
+	$(BIN)/pytest -m "not slow and not long" --numprocesses 2 --dist worksteal $(ARGS)
+
+slow: $(VENV)/.dev  ## those that take longer, each under two minutes; what lands has passed both
+	$(BIN)/pytest -m "slow and not long" --numprocesses 2 --dist worksteal $(ARGS)
 
 setup: $(VENV)/.dev  ## everything that development needs
 

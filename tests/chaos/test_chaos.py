@@ -5,6 +5,7 @@ import pytest
 from tests.chaos.chaos import NARROW, WIDE, compare
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("stage", [NARROW, WIDE], ids=lambda stage: stage.name)
 def test_a_fleet_under_faults_gives_the_undisturbed_fleets_bits(tmp_path, stage):

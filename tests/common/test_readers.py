@@ -191,6 +191,7 @@ def test_damaged_settings(tmp_path, watched):
     assert 0 < count < COUNT
 
 
+@pytest.mark.slow
 def test_damaged_task_options(watched):
     from dreamfleet.coordinator.config import RunConfig, _check_normal
 

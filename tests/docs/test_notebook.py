@@ -20,6 +20,7 @@ def port_of_nobody():
     raise AssertionError("no port is free")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_every_cell_of_the_notebook_runs(tmp_path, monkeypatch):
     monkeypatch.setenv("NOTEBOOK_PORT", str(port_of_nobody()))

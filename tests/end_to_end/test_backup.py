@@ -19,6 +19,7 @@ def back_up(processes, to, name="test"):
     return processes.call("runs", "backup", name, "--runs-dir", processes.runs, "--to", to)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, tmp_path):
     whole = processes.coordinator(*FLAGS, name="whole")
     worker = processes.worker("--run", "whole")

@@ -32,6 +32,7 @@ def state(folder):
     return weights, load_progress(folder / CHECKPOINT), (folder / CURVE).read_bytes(), kept
 
 
+@pytest.mark.slow
 def test_a_training_that_was_interrupted_and_killed_goes_on_to_the_same_bits(processes, tmp_path):
     flags = (word for name, value in SETTINGS.items() for word in ("--" + name.replace("_", "-"), value))
     words = ("baseline", "train", "drqn", "--data", tmp_path / "broken", *flags)

@@ -89,6 +89,7 @@ def test_hosts_that_compute_the_same_are_of_one_class_whatever_they_say_of_thems
     assert OTHER in classes.largest[0].fingerprints
 
 
+@pytest.mark.slow
 def test_a_strict_run_refuses_another_class_and_goes_on_strict_until_it_is_told_otherwise(processes, settings):
     coordinator = processes.coordinator(*settings, "--generations", 1, "--strict")
     first = own(processes)
@@ -109,6 +110,7 @@ def test_a_strict_run_refuses_another_class_and_goes_on_strict_until_it_is_told_
         assert json.loads(run.fact("network"))["strict"] is False
 
 
+@pytest.mark.slow
 def test_status_runs_show_and_list_tell_of_what_classes_the_results_are(processes, settings):
     coordinator = processes.coordinator(*settings, "--generations", 1000)
     odd = own(processes, inside=ODD)
@@ -134,6 +136,7 @@ def product(where):
     return hashlib.sha256(done.stdout).hexdigest()
 
 
+@pytest.mark.slow
 def test_another_kernel_of_openblas_is_another_class_whose_results_are_replayed_there(processes):
     """Real arithmetic, no test's: OpenBLAS with and without fused products, under gymnasium's BipedalWalker."""
     if product(()) == product(OTHER_KERNEL):

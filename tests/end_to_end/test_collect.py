@@ -74,6 +74,7 @@ def test_the_drives_are_a_function_of_the_run_whoever_makes_them(processes, sett
             assert run.results(1, 0, "collect")[0].fitness == pytest.approx(drive["reward"].sum(), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_coordinator_killed_in_mid_upload_asks_again(processes, settings):
     whole = processes.coordinator(*settings, "--task", tasks.HEAVY, name="whole")
     processes.worker("--run", "whole", "--task", tasks.HEAVY)

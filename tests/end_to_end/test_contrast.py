@@ -36,6 +36,7 @@ def data(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_a_contrast_that_was_stopped_goes_on_and_tells_kinds_apart(processes, data, tmp_path):
     words = ("contrast", "--data", data, "--out", tmp_path / "out", "--seeds", 1, *SMALL)
     first = processes.start(*words)

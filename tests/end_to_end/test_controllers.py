@@ -8,6 +8,7 @@ from dreamfleet.common.runs import open_run
 pytestmark = pytest.mark.timeout(240)
 
 
+@pytest.mark.slow
 def test_a_hidden_controller_on_the_latent_alone_is_evolved_replayed_and_judged(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--controller", "hidden", "--hidden-units", 4, "--features", "z",

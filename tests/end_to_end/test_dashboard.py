@@ -85,6 +85,7 @@ def without_absence(page):
     page.said[:] = [each for each in page.said if not each.startswith(LEFT_OUT)]
 
 
+@pytest.mark.slow
 def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes, settings, record_property):
     wait(page, "no coordinator")
     assert processes.endpoint in part(page, "sentence")

@@ -38,6 +38,7 @@ def test_both_stages_search_in_the_features_that_ship_for_its_world_model(config
     assert all(("covariance" in each.flags) == bool(subspace) for each in found), "full in few dimensions"
 
 
+@pytest.mark.slow
 def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
     code, out, err = processes.call(
         "demo", "--run", "demo", "--runs-dir", processes.runs, "--port", processes.port, "--bundle", random_bundle.path,

@@ -35,6 +35,7 @@ def outcome(processes, name):
         return fitness, vectors, [(each.generation, each.mean) for each in run.evaluations()], parameters
 
 
+@pytest.mark.slow
 def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bundle):
     coordinator = begin(processes, random_bundle, "alone")
     worker = processes.worker("--run", "alone")
@@ -55,6 +56,7 @@ def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bund
     assert code == 0, err
 
 
+@pytest.mark.slow
 def test_dreams_that_begin_at_recorded_states_are_the_same_whoever_dreams(processes, tmp_path):
     bundle = write_random_bundle(tmp_path / "b.zip", recorded=states(20))
     for name, workers, flags in (("alone", 1, ("--recorded", 0.5)), ("two", 2, ("--recorded", 0.5)), ("plain", 1, ())):
@@ -165,6 +167,7 @@ def staged(processes, bundle, name, *flags):
     return begin(processes, bundle, name, "--schedule", path, "--generations", len(DRIVEN), *flags)
 
 
+@pytest.mark.slow
 def test_a_run_that_dreams_then_mixes_then_drives_gives_the_same_bits_through_kills(processes, random_bundle):
     coordinator = staged(processes, random_bundle, "calm")
     coordinator.wait_for("generation 0 is in stage 1 of 3")

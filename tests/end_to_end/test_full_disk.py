@@ -35,6 +35,7 @@ def resize(place, size):
     subprocess.run(["mount", "-o", f"remount,size={size}", place], check=True)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_a_clear_error_and_with_more_room_the_run_goes_on(processes, random_bundle, small_disk):
     flags = ("--task", tasks.TOY, "--population", 64, "--episodes", 1, "--evaluate-every", 0, "--generations", 40)
     processes.runs = small_disk
@@ -63,6 +64,7 @@ def test_a_full_disk_is_a_clear_error_and_with_more_room_the_run_goes_on(process
         assert history == [(each.number, each.mean) for each in other.history()]
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_while_a_drive_is_written_keeps_whole_drives_only(processes, random_bundle, small_disk):
     flags = (
         "--task", tasks.HEAVY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 1,

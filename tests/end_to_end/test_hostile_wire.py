@@ -40,6 +40,7 @@ def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, 
     assert coordinator.finish()[0] == 0
 
 
+@pytest.mark.slow
 def test_a_worker_drops_what_is_malformed_or_of_another_coordinator(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,

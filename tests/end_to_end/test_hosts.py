@@ -29,6 +29,7 @@ def slots(processes):
     return sum(status.slots for status in processes.statuses())
 
 
+@pytest.mark.slow
 def test_a_host_that_is_cut_off_costs_no_bit_and_comes_back(processes, hosts, random_bundle):
     settings = (
         "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", POPULATION, "--episodes", 1,

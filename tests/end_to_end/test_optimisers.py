@@ -23,6 +23,7 @@ def candidates(processes, name):
         return np.stack([run.candidate(each.number, i) for each in run.history() for i in range(6)])
 
 
+@pytest.mark.slow
 def test_a_run_of_another_optimiser_is_continued_and_forked_to_one_of_ones_own(processes, settings):
     flags = (*settings, "--task", tasks.SLOW_TOY, "--optimiser", "cmaes-sep", "--generations", 4)
     whole = processes.coordinator(*flags, name="whole")

@@ -35,6 +35,7 @@ def stopped(processes, settings, *flags):
     return worker, coordinator.lines[-1]
 
 
+@pytest.mark.slow
 def test_the_hint_of_a_run_that_was_left_is_a_whole_command_with_its_limits_and_its_network(processes, settings):
     processes.runs = processes.folder / "all my runs"
     worker, said = stopped(processes, settings, "--generations", 6, "--strict")
@@ -76,6 +77,7 @@ def test_a_limit_that_has_passed_ends_at_once_and_names_no_controller_that_is_no
     assert "it goes on with wider limits" in out
 
 
+@pytest.mark.slow
 def test_a_run_moves_to_another_place_and_its_worker_follows(processes, settings):
     """The worker is given both addresses; the folder is all that moves."""
     whole = processes.coordinator(*settings, "--generations", 5, name="whole")

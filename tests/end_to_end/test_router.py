@@ -51,6 +51,7 @@ def alone(tmp_path_factory, random_bundle):
         return fitness(processes, "alone")
 
 
+@pytest.mark.slow
 def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe, random_bundle, alone):
     ports = {"router": free_port(), "second": free_port()}
     first = recipe("one.toml", **{"0_0_0_0:7447": f"127.0.0.1:{ports['router']}",

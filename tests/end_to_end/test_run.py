@@ -57,6 +57,7 @@ def test_the_mean_is_evaluated_on_schedule_and_at_the_end_and_the_target_ends_th
     assert "reached" in out
 
 
+@pytest.mark.slow
 def test_stopped_with_a_signal_and_continued_equals_never_stopped(processes, settings):
     whole = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 6, name="whole")
     processes.worker("--task", tasks.SLOW_TOY, "--run", "whole", "--slots", 2)
@@ -209,6 +210,7 @@ def test_a_race_that_is_stopped_between_its_stages_equals_one_that_is_not(proces
         assert sorted(len(run.results(0, i)) for i in range(4)) == [2, 2, 4, 4]
 
 
+@pytest.mark.slow
 def test_several_runs_on_one_router_never_see_each_other_and_a_worker_serves_the_neediest(processes, settings):
     """The second coordinator connects to the first one's router."""
     first = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 9, name="first")
@@ -232,6 +234,7 @@ def test_several_runs_on_one_router_never_see_each_other_and_a_worker_serves_the
         assert one.results(0, 0)[0].worker != other.results(0, 0)[0].worker
 
 
+@pytest.mark.slow
 def test_on_a_small_busy_fleet_an_evaluation_is_finished_within_two_generations(processes, random_bundle):
     """Two slots, 32 episodes a generation, and an evaluation of 6 tracks after generation 1."""
     coordinator = processes.coordinator(

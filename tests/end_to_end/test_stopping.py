@@ -41,6 +41,7 @@ def test_training_keeps_all_updates(processes, tmp_path, number):
     assert f"after update {update} of 100000: {tmp_path}/vae.safetensors keeps them; the same command goes on" in said
 
 
+@pytest.mark.slow
 def test_a_training_that_was_killed_goes_on_to_the_same_bits(processes, tmp_path):
     weights = []
     for name, killed in ("whole", False), ("killed", True):

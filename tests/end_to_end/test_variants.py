@@ -57,6 +57,7 @@ def test_a_run_evolves_to_the_same_bits_and_is_replayed(processes, evolve, kind)
     assert (code, out.count("same bits")) == (0, 1), err
 
 
+@pytest.mark.slow
 def test_every_verb_drives_as_the_run_does(processes, random_bundle, evolve):
     evolve("one", "--variant", "pedals=one", "decide_every=3", "feedback=last", "--collect-every", 1,
            "--collect-episodes", 1)  # fmt: skip

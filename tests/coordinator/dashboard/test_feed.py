@@ -40,6 +40,7 @@ def looks():
     return Looks()
 
 
+@pytest.mark.slow
 def test_every_viewer_gets_the_same_pictures_from_one_look_each(looks):
     looks.are_single = True
 
