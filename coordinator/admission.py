@@ -1,9 +1,10 @@
-"""Who may join a run: workers that know its task; where it is strict, on hosts of one class. Pure."""
+"""Who may join a run: workers that speak its protocol and know its task; where it is strict, of one class. Pure."""
 
 from __future__ import annotations
 
 from dreamfleet.common.classes import counted_as
-from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, package_version
+from dreamfleet.common.keys import PROTOCOL_VERSION
 from dreamfleet.common.messages import HelloRequest
 from dreamfleet.common.printable import shortened
 
@@ -21,6 +22,11 @@ def refusal(
     `admitted` is the class that the run keeps to, `None` admits any; fingerprints name the versions of `packages`. A
     worker that does not know its class yet may join, and is judged once it says it.
     """
+    if not request.protocol_min <= PROTOCOL_VERSION <= request.protocol_max:
+        spoken = f"the worker speaks protocol {request.protocol_min} to {request.protocol_max}"
+        return f"{spoken}, this run {PROTOCOL_VERSION}", (
+            f"install dreamfleet {package_version('dreamfleet')} on the worker's host"
+        )
     if not {task, task.partition(":")[0]} & set(request.tasks):  # itself, or the family that it is of
         return f"this run scores in {task!r}, which the worker does not know (it knows: {_known(request.tasks)})", (
             "install the package that registers this task on the worker's host"

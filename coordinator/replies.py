@@ -45,13 +45,7 @@ def misunderstanding(request: HelloRequest | None) -> tuple[str, str] | None:
     """Why a hello cannot be talked about at all, and what to do about it; `None` if it can."""
     if request is None or not keys.is_worker(request.worker):
         return "the request is not a hello", "update dreamfleet on the worker's host"
-    if request.protocol_min <= keys.PROTOCOL_VERSION <= request.protocol_max:
-        return None
-    return (
-        f"the worker speaks protocol {request.protocol_min} to {request.protocol_max}, this run "
-        f"{keys.PROTOCOL_VERSION}",
-        f"install dreamfleet {package_version('dreamfleet')} on the worker's host",
-    )
+    return None
 
 
 def control_verb(asked_at: str) -> str:

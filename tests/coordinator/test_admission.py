@@ -4,6 +4,7 @@ import pytest
 
 from dreamfleet.common.classes import class_of
 from dreamfleet.common.fingerprint import fingerprint
+from dreamfleet.common.keys import PROTOCOL_VERSION
 from dreamfleet.coordinator.admission import MOST_REFUSED, Refusals, refusal
 from tests.support.samples import JSON
 
@@ -12,7 +13,8 @@ LANDER, PACKAGES = "gym:LunarLander-v3", ("numpy", "gymnasium", "box2d", "box2d-
 
 
 def hello(**changes):
-    return replace(HELLO, **{"tasks": ("car-racing", "gym"), "fingerprint": "here", **changes})
+    spoken = {"protocol_min": PROTOCOL_VERSION, "protocol_max": PROTOCOL_VERSION}
+    return replace(HELLO, **spoken, **{"tasks": ("car-racing", "gym"), "fingerprint": "here", **changes})
 
 
 @pytest.mark.parametrize("tasks", [("gym",), (LANDER,), ("dream", "gym")])

@@ -112,7 +112,7 @@ def test_a_pending_evaluation_of_an_older_coordinator_is_driven_again(bench):
 
 def test_slots_and_steps_without_bound_can_be_told(bench):
     for name in (A, B):
-        bench.run.exchange.admit(HelloRequest(1, 1, "0", name, (SPEC.task,), "f", MOST), bench.now)
+        bench.run.exchange.admit(HelloRequest(2, 2, "0", name, (SPEC.task,), "f", MOST), bench.now)
     bench.run.exchange.counts["discarded_steps"] = 3 * MOST
     told(bench)
 
@@ -140,7 +140,7 @@ def test_what_does_not_exceed_can_be_summed_over_the_largest_run(fitness, steps,
 def test_what_is_told_can_be_encoded(steps, value):
     assert 0 <= saturated(steps) <= MOST
     assert np.isfinite(finite(value))
-    assert encode_json(replace(HelloRequest(1, 1, "0", A, (), "f", 1), slots=saturated(steps)))
+    assert encode_json(replace(HelloRequest(2, 2, "0", A, (), "f", 1), slots=saturated(steps)))
 
 
 @pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep", "cmaes-lra"])

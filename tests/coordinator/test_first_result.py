@@ -35,7 +35,7 @@ class Classed(Bench):
 
     def request(self, name):
         known = self.classes[name] and self.told[name]  # a worker finds it out after it has joined
-        return HelloRequest(1, 1, "0", name, (SPEC.task,), self.fingerprints[name], 1, host_class=known)
+        return HelloRequest(2, 2, "0", name, (SPEC.task,), self.fingerprints[name], 1, host_class=known)
 
     def hello(self, name):
         """Why it is refused, if it is."""

@@ -28,7 +28,7 @@ class LongRun:
         settings = replace(SETTINGS, population=4, evaluate_every=1, collect_every=0)
         self.run = Run(Journal.create(folder, settings, bundle), settings, LimitsConfig(), Fleet(1.0), 0.0)
         self.now, self.seen = 0.0, 0
-        self.run.exchange.admit(HelloRequest(1, 1, "0", A, (settings.task.task,), "f", 1), self.now)
+        self.run.exchange.admit(HelloRequest(2, 2, "0", A, (settings.task.task,), "f", 1), self.now)
 
     def cost(self):
         """Processor time of one more generation, in seconds."""

@@ -48,7 +48,7 @@ class Bench:
             self.beat(name)
 
     def request(self, name):
-        return HelloRequest(1, 1, "0", name, (SPEC.task,), "f", 1)
+        return HelloRequest(2, 2, "0", name, (SPEC.task,), "f", 1)
 
     def restart(self):
         """Killed: what was not committed never was."""

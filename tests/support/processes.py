@@ -22,11 +22,11 @@ def free_port():
         return sock.getsockname()[1]
 
 
-def environment(cache):
+def environment(cache, root=ROOT):
     inherited = {name: value for name, value in os.environ.items() if name != "SDL_VIDEODRIVER"}  # as people start it
     return {
         **inherited,
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": str(root),
         "DREAMFLEET_CACHE": str(cache),
         "PYTHONUNBUFFERED": "1",
         "COLUMNS": "120",
@@ -36,10 +36,10 @@ def environment(cache):
 class Process(Child):
     """A verb running; its stderr lines can be waited for."""
 
-    def __init__(self, arguments, cache, inside=()):
+    def __init__(self, arguments, cache, inside=(), root=ROOT):
         self._reading = threading.Event()
         self._reading.set()
-        super().__init__(*arguments, environment=environment(cache), inside=inside)
+        super().__init__(*arguments, environment=environment(cache, root), inside=inside)
 
     def freeze(self, size=4096):
         """Read its stderr no more, of which so many bytes still fit into the pipe."""
@@ -74,12 +74,12 @@ class Processes:
         self.cache = folder / "cache"
         self._started = []
 
-    def start(self, *arguments, inside=()):
-        """A verb, `inside` a host of its own if given the words that lead there."""
-        self._started.append(Process(arguments, self.cache, inside))
+    def start(self, *arguments, inside=(), root=ROOT):
+        """A verb, `inside` a host of its own if given the words that lead there; `root` holds its files."""
+        self._started.append(Process(arguments, self.cache, inside, root))
         return self._started[-1]
 
-    def coordinator(self, *arguments, name="test"):
+    def coordinator(self, *arguments, name="test", root=ROOT):
         process = self.start(
             "coordinator",
             "--run",
@@ -91,13 +91,14 @@ class Processes:
             "--beat",
             "0.2",
             *arguments,
+            root=root,
         )
         process.wait_for("incarnation")
         return process
 
-    def worker(self, *arguments, endpoint=None, inside=()):
+    def worker(self, *arguments, endpoint=None, inside=(), root=ROOT):
         arguments = ("--connect", endpoint or self.endpoint, "--slots", "1", *arguments)
-        return self.start("worker", *arguments, inside=inside)
+        return self.start("worker", *arguments, inside=inside, root=root)
 
     def call(self, *arguments, timeout=DEADLINE):
         """Run a verb to its end: exit code, stdout, stderr."""
