@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from ipaddress import ip_address
 from pathlib import Path
 
 import pytest
@@ -251,7 +250,7 @@ def test_three_hosts_install_from_wheels_alone_one_of_them_after_it_was_killed_a
             pytest.skip("network namespaces need root and iproute2")
         cables = {"x": x, "y": y, "z": z}
         there = [
-            hosts.add(name, address=str(ip_address(cable.address) + 1), inside=cable.inside, path=BARE, modules="")
+            hosts.add(name, address=cable.own, inside=cable.inside, path=BARE, modules="")
             for name, cable in cables.items()
         ]
         near = [f"tcp/{cable.address}:{processes.port}" for cable in cables.values()]

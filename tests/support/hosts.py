@@ -10,18 +10,18 @@ _numbers = count()
 
 
 class Host:
-    """A namespace; `address` is this end of its cable, which it reaches us by."""
+    """A namespace; `address` is this end of its cable, which it reaches us by, `own` is its own end."""
 
     def __init__(self, name, number):
         self.name = name
-        self.address = f"198.18.{os.getpid() % 250}.{4 * number + 1}"  # of the block for tests of devices, RFC 2544
+        self.address, self.own = (f"198.18.{os.getpid() % 250}.{4 * number + end}" for end in (1, 2))  # RFC 2544
         self.inside = ("ip", "netns", "exec", name)
         self._near, far = f"{name}-a", f"{name}-b"
         _ip("netns", "add", name)
         _ip("link", "add", self._near, "type", "veth", "peer", "name", far, "netns", name)
         _ip("addr", "add", f"{self.address}/30", "dev", self._near)
         _ip("link", "set", self._near, "up")
-        _ip("-n", name, "addr", "add", f"198.18.{os.getpid() % 250}.{4 * number + 2}/30", "dev", far)
+        _ip("-n", name, "addr", "add", f"{self.own}/30", "dev", far)
         for device in ("lo", far):
             _ip("-n", name, "link", "set", device, "up")
 

@@ -12,12 +12,12 @@ RESET_ON_CLOSE = struct.pack("ii", 1, 0)
 
 
 class Relay:
-    """Passes connections on to a port of this host."""
+    """Passes connections on to a port of this host, or of the host at `far`."""
 
-    def __init__(self, target, address="127.0.0.1"):
+    def __init__(self, target, address="127.0.0.1", far="127.0.0.1"):
         self.delay = 0.0  # seconds that every piece takes
         self.rate = 0.0  # bytes a second of each connection and way; 0: as fast as they come
-        self._target = target
+        self._target = far, target
         self._flowing = threading.Event()
         self._flowing.set()
         self._pairs = []
@@ -58,7 +58,7 @@ class Relay:
             except OSError:
                 return
             try:
-                far = socket.create_connection(("127.0.0.1", self._target))
+                far = socket.create_connection(self._target)
             except OSError:  # nobody listens there now
                 near.close()
                 continue

@@ -16,12 +16,12 @@ from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 MODULE = "tests.support.tasks"
 (
     TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, EXPLODING, ENDLESS,
-    CHATTY, PAINTED, ROUNDED,
+    CHATTY, PAINTED, ROUNDED, SECOND_TOY,
 ) = (
     f"{MODULE}:{name}"
     for name in (
         "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Optimistic",
-        "Exploding", "Endless", "Chatty", "Painted", "Rounded",
+        "Exploding", "Endless", "Chatty", "Painted", "Rounded", "SecondToy",
     )
 )  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, PAINTED
@@ -78,6 +78,13 @@ class SlowToy(Toy):
 
     name = SLOW_TOY
     seconds = 0.03
+
+
+class SecondToy(Toy):
+    """An episode takes a second."""
+
+    name = SECOND_TOY
+    seconds = 0.1
 
 
 class Rounded(Toy):

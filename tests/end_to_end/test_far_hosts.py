@@ -1,0 +1,149 @@
+"""Three hosts and a router on a fourth, behind join files and links that are slow and cut: the bits, and the time.
+
+Each host is a network namespace. Its link to the router is a relay, at which TLS does not end.
+"""
+
+import logging
+import random
+import sqlite3
+import statistics
+import subprocess
+from contextlib import ExitStack, closing, contextmanager
+
+import pytest
+
+from dreamfleet.common.authority import Authority
+from dreamfleet.common.runs import open_run
+from tests.support import tasks
+from tests.support.hosts import new_host
+from tests.support.processes import free_port, processes_in
+from tests.support.relay import Relay
+
+log = logging.getLogger(__name__)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(1800)]
+HOSTS, SLOTS = 3, 4
+TASKS = tasks.SLOW_TOY, tasks.SECOND_TOY
+DELAY = 0.05  # seconds that every piece takes on a link, each way
+BLOCKS = 3
+PATIENCE = 600
+
+
+class FarFleet:
+    """A coordinator here, a router and workers each on a host of their own; all connect out, to the router's relays."""
+
+    def __init__(self, processes, cables):
+        self._processes = processes
+        self._middle, *self._hosts = cables
+        port, access = free_port(), processes.folder / "access"
+        self._home = Relay(port, far=self._middle.own)
+        self._relays = [Relay(port, host.address, far=self._middle.own) for host in self._hosts]
+        authority = Authority.create(access)
+        authority.issue("router", "middle", access / "router.join", hosts=[host.address for host in self._hosts])
+        authority.issue("coordinator", "home", access / "home.join")
+        authority.issue("worker", "lab", access / "lab.join", connect=[f"tls/{self._middle.own}:{port}"])
+        self._join = access
+        processes.start("router", "--join", access / "router.join", "--listen", f"tls/{self._middle.own}:{port}",
+                        inside=self._middle.inside).wait_for("listening on")  # fmt: skip
+
+    @property
+    def links(self):
+        return (self._home, *self._relays)
+
+    def begin(self, name, *settings):
+        coordinator = self._processes.start(
+            "coordinator", "--run", name, "--runs-dir", self._processes.runs, "--join", self._join / "home.join",
+            "--connect", f"tls/127.0.0.1:{self._home.port}", *settings,
+        )  # fmt: skip
+        coordinator.wait_for("incarnation")
+        for number, (host, relay) in enumerate(zip(self._hosts, self._relays, strict=True)):
+            self._processes.start(
+                "worker", "--join", self._join / "lab.join", "--connect", f"tls/{host.address}:{relay.port}",
+                "--run", name, "--name", f"h{number}", "--slots", SLOTS, "--task", *TASKS, inside=host.inside,
+            )  # fmt: skip
+        return coordinator
+
+    def close(self):
+        for link in self.links:
+            link.close()
+
+
+@contextmanager
+def far_fleet(processes):
+    with ExitStack() as stack:
+        cables = [stack.enter_context(new_host()) for _ in range(1 + HOSTS)]
+        if None in cables:
+            pytest.skip("network namespaces need root and iproute2")
+        fleet = FarFleet(processes, cables)
+        stack.callback(fleet.close)
+        yield fleet
+
+
+def begin_near(processes, name, *settings):
+    """The same workers on this host, at a coordinator that is its own router, without certificates."""
+    coordinator = processes.coordinator(*settings, name=name)
+    for number in range(HOSTS):
+        processes.worker("--run", name, "--name", f"h{number}", "--slots", SLOTS, "--task", *TASKS)
+    return coordinator
+
+
+def outcome(processes, name, generations, population):
+    """Every candidate and its fitness, and the strategy's state after the run."""
+    with open_run(processes.runs, name) as run:
+        each = [(g, i) for g in range(generations) for i in range(population)]
+        return [(run.candidate(*one).tobytes(), run.fitness(*one)) for one in each], run.strategy_state()
+
+
+def test_links_that_are_slow_and_cut_at_random_cost_no_bit(processes):
+    generations, population = 12, 24
+    settings = ("--task", tasks.SLOW_TOY, "--population", population, "--episodes", 2, "--evaluate-every", 0,
+                "--generations", generations, "--seed", 5)  # fmt: skip
+    chance, cuts = random.Random(11), 0
+    with far_fleet(processes) as fleet:
+        coordinator = fleet.begin("far", "--beat", 0.2, *settings)
+        for link in fleet.links:
+            link.delay = DELAY
+        coordinator.wait_for("generation 0: mean", timeout=PATIENCE)
+        while coordinator.popen.poll() is None:
+            chance.choice(fleet.links).cut()
+            cuts += 1
+            wait_for_end(coordinator, chance.uniform(0.5, 3.0))
+        assert coordinator.finish(PATIENCE)[0] == 0, "".join(coordinator.lines[-5:])
+    assert begin_near(processes, "alone", *settings).finish(PATIENCE)[0] == 0
+    assert outcome(processes, "far", generations, population) == outcome(processes, "alone", generations, population)
+    log.info("%d cuts while %d jobs were scored", cuts, generations * population * 2)
+    assert cuts >= 10
+
+
+def wait_for_end(process, seconds):
+    try:
+        process.popen.wait(seconds)
+    except subprocess.TimeoutExpired:
+        return
+
+
+def efficiency(processes, name):
+    """Seconds of accepted jobs over slots x time, from the first generation's end to the last one's."""
+    with closing(sqlite3.connect(processes.runs / name / "journal.sqlite")) as journal:
+        first, last = journal.execute("SELECT min(closed), max(closed) FROM generation").fetchone()
+        (done,) = journal.execute("SELECT sum(seconds) FROM result WHERE generation > 0").fetchone()
+    return done / (HOSTS * SLOTS * (last - first))
+
+
+def test_jobs_of_a_second_keep_slots_behind_slow_links_as_busy_as_on_one_host(tmp_path):
+    population, generations = 4 * HOSTS * SLOTS, 6
+    settings = ("--task", tasks.SECOND_TOY, "--population", population, "--episodes", 1, "--evaluate-every", 0,
+                "--generations", generations, "--seed", 5)  # fmt: skip
+    near, far = [], []
+    for block in range(BLOCKS):
+        with processes_in(tmp_path / f"near-{block}") as processes:
+            assert begin_near(processes, "near", *settings).finish(PATIENCE)[0] == 0
+            near.append(efficiency(processes, "near"))
+        with processes_in(tmp_path / f"far-{block}") as processes, far_fleet(processes) as fleet:
+            for link in fleet.links:
+                link.delay = DELAY
+            assert fleet.begin("far", "--beat", 0.2, *settings).finish(PATIENCE)[0] == 0
+            far.append(efficiency(processes, "far"))
+    ratio = statistics.median(b / a for a, b in zip(near, far, strict=True))
+    log.info("busy: here %s, far %s; median ratio %.3f", *(", ".join(f"{each:.3f}" for each in one)
+                                                          for one in (near, far)), ratio)  # fmt: skip
+    assert ratio >= 0.9
