@@ -11,8 +11,10 @@ import json
 import queue
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import monotonic, sleep
 from typing import Any
 
 import zenoh
@@ -24,6 +26,7 @@ from dreamfleet.common.handshake import trouble_with
 from dreamfleet.common.network import Network, check_endpoint
 from dreamfleet.common.rules import access_control
 
+ATTEMPT = 3.0  # seconds that a link may take to open: TLS takes four round trips and more
 LEASE_MS = 4000  # announced by each side: after so long without a sign the other side drops its token
 MOST_SESSIONS = 10_000
 MAX_RECEIVED = (
@@ -36,20 +39,45 @@ _NO_ROOM = "no network session can be opened: {}; give this host more room (ulim
 __all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_session", "settings_of"]
 
 
-def open_session(network: Network, *, timeout: float | None = 3.0) -> zenoh.Session:
+def open_session(network: Network, *, timeout: float | None = ATTEMPT) -> zenoh.Session:
     """A router where `network.listen` is given, else a client; `ConnectionFailedError` after `timeout` seconds.
 
-    Once open, a client reconnects by itself for ever. Zenoh's own endless first attempt (`timeout_ms` -1) blocks a
-    client in native code where no signal is heard, so whoever wants to wait calls again. A router does not block:
-    without a `timeout` it opens at once, and links to others as they come.
+    Once open, a client reconnects by itself for ever, at any of its addresses. Zenoh's own first attempt never leaves
+    the first one, and blocks in native code where no signal is heard: so whoever wants to wait calls again, and the one
+    of several that answers is found before. A router does not block: without a `timeout` it opens at once, and links to
+    others as they come.
     """
     with _dictionary(network) as dictionary:
-        return _open(network, settings_of(network, timeout, dictionary))
+        if network.listen or len(network.connect) < 2:
+            return _open(network, lambda: _opened(settings_of(network, timeout, dictionary)))
+        return _open(network, lambda: _opened(settings_of(_answering_first(network, timeout or 0.0), ATTEMPT)))
 
 
-def _open(network: Network, settings: dict[str, Any]) -> zenoh.Session:
+def _answering_first(network: Network, timeout: float) -> Network:
+    """The same with an address in front that answers; each may take an attempt, for one may swallow what it is sent."""
+    deadline, pause = monotonic() + timeout, 0.1
+    while True:
+        for each in network.connect:
+            try:
+                settings = settings_of(replace(network, connect=(each,)), ATTEMPT)
+                settings["connect"]["retry"]["period_init_ms"] = 0  # once: of a session that stays it would never rest
+                _opened(settings).close()  # type: ignore[no-untyped-call]
+            except zenoh.ZError:
+                if monotonic() >= deadline and each == network.connect[-1]:
+                    raise
+            else:
+                return replace(network, connect=(each, *(other for other in network.connect if other != each)))
+        sleep(pause)
+        pause = min(1.5 * pause, 1.0)
+
+
+def _opened(settings: dict[str, Any]) -> zenoh.Session:
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+
+
+def _open(network: Network, begin: Callable[[], zenoh.Session]) -> zenoh.Session:
     try:
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+        return begin()
     except zenoh.ZError as error:
         if "os error 24" in str(error):
             raise DreamfleetError(_NO_ROOM.format(_first_line(error))) from error

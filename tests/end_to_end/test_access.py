@@ -18,6 +18,7 @@ from dreamfleet.common.session import MAX_PASSED, Network, open_session
 from dreamfleet.worker.service.admission import make_request
 from tests.support import tasks
 from tests.support.processes import free_port
+from tests.support.relay import Relay
 from tests.support.samples import MSGPACK
 
 LIFE = "0badc0de"
@@ -55,8 +56,9 @@ def endpoint():
 def begin(processes, access, endpoint, bundle, *more, name="safe"):
     process = processes.start(
         "coordinator", "--run", name, "--runs-dir", processes.runs, "--beat", 0.2, "--listen", endpoint,
-        "--join", access.path("coordinator"), "--access-dir", access.folder, "--bundle", bundle.path,
-        "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0, *more,
+        "--join", access.path("coordinator"), "--access-dir", access.folder,
+        *(("--bundle", bundle.path) if bundle else ()), "--task", tasks.SLOW_TOY, "--population", 4,
+        "--evaluate-every", 0, *more,
     )  # fmt: skip
     process.wait_for("incarnation")
     return process
@@ -163,6 +165,16 @@ def test_who_is_not_of_the_fleet_is_not_let_in_and_is_told_why(access, endpoint,
         open_session(Network(connect=(endpoint,), credentials=good)).close()
         with pytest.raises(ConnectionFailedError):
             open_session(Network(connect=(endpoint.replace("tls", "tcp"),)), timeout=1)
+
+
+def test_a_link_of_half_a_second_to_and_fro_lets_a_worker_in(processes, access, endpoint):
+    begin(processes, access, endpoint, None)
+    relay = Relay(int(endpoint.rpartition(":")[2]))
+    relay.delay = 0.25
+    try:
+        work(processes, access, f"tls/127.0.0.1:{relay.port}", "first").wait_for("joined")
+    finally:
+        relay.close()
 
 
 def test_a_worker_that_is_revoked_counts_no_more_while_the_run_goes_on(processes, access, endpoint, random_bundle):

@@ -76,7 +76,7 @@ class Worker:
         said = False
         while not self._leaving():
             try:
-                return open_session(self._network, timeout=RETRY)
+                return open_session(self._network)
             except ConnectionFailedError:
                 if not said:
                     log.warning("waiting for a coordinator at %s", ", ".join(self._network.connect))
