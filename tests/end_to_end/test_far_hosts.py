@@ -41,7 +41,7 @@ class FarFleet:
         authority.issue("router", "middle", access / "router.join", hosts=[host.address for host in self._hosts])
         authority.issue("coordinator", "home", access / "home.join")
         authority.issue("worker", "lab", access / "lab.join", connect=[f"tls/{self._middle.own}:{port}"])
-        self._join = access
+        self._access = access
         processes.start("router", "--join", access / "router.join", "--listen", f"tls/{self._middle.own}:{port}",
                         inside=self._middle.inside).wait_for("listening on")  # fmt: skip
 
@@ -51,13 +51,13 @@ class FarFleet:
 
     def begin(self, name, *settings):
         coordinator = self._processes.start(
-            "coordinator", "--run", name, "--runs-dir", self._processes.runs, "--join", self._join / "home.join",
+            "coordinator", "--run", name, "--runs-dir", self._processes.runs, "--join", self._access / "home.join",
             "--connect", f"tls/127.0.0.1:{self._home.port}", *settings,
         )  # fmt: skip
         coordinator.wait_for("incarnation")
         for number, (host, relay) in enumerate(zip(self._hosts, self._relays, strict=True)):
             self._processes.start(
-                "worker", "--join", self._join / "lab.join", "--connect", f"tls/{host.address}:{relay.port}",
+                "worker", "--join", self._access / "lab.join", "--connect", f"tls/{host.address}:{relay.port}",
                 "--run", name, "--name", f"h{number}", "--slots", SLOTS, "--task", *TASKS, inside=host.inside,
             )  # fmt: skip
         return coordinator
