@@ -22,12 +22,14 @@ import zenoh
 from dreamfleet.common.credentials import SEATS, Credentials, identity, password_of
 from dreamfleet.common.descriptors import room_for_connections
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
+from dreamfleet.common.gate import guard
 from dreamfleet.common.handshake import trouble_with
 from dreamfleet.common.network import Network, check_endpoint
 from dreamfleet.common.rules import access_control
 
 ATTEMPT = 3.0  # seconds that a link may take to open: TLS takes four round trips and more
 LEASE_MS = 4000  # announced by each side: after so long without a sign the other side drops its token
+HANDSHAKE_MS = 3000  # of TLS: as long as our own clients wait for it
 MOST_SESSIONS = 10_000
 MAX_RECEIVED = (
     128 * 1024
@@ -49,8 +51,14 @@ def open_session(network: Network, *, timeout: float | None = ATTEMPT) -> zenoh.
     """
     with _dictionary(network) as dictionary:
         if network.listen or len(network.connect) < 2:
-            return _open(network, lambda: _opened(settings_of(network, timeout, dictionary)))
-        return _open(network, lambda: _opened(settings_of(_answering_first(network, timeout or 0.0), ATTEMPT)))
+            session = _open(network, lambda: _opened(settings_of(network, timeout, dictionary)))
+        else:
+            session = _open(
+                network, lambda: _opened(settings_of(_answering_first(network, timeout or 0.0), ATTEMPT))
+            )
+    if network.listen and network.credentials is not None:
+        guard(session, {int(each.rpartition(":")[2]) for each in network.listen})
+    return session
 
 
 def _answering_first(network: Network, timeout: float) -> Network:
@@ -121,7 +129,7 @@ def settings_of(network: Network, timeout: float | None, dictionary: str | None 
     retry = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
     return {
         "mode": "router" if router else "client",
-        "listen": {"endpoints": list(network.listen), "exit_on_failure": True},
+        "listen": {"endpoints": _listening(network), "exit_on_failure": True},
         "connect": {
             "endpoints": list(network.connect),
             "timeout_ms": -1 if timeout is None else int(timeout * 1000),
@@ -132,6 +140,12 @@ def settings_of(network: Network, timeout: float | None, dictionary: str | None 
         "transport": transport,
         **guards,
     }
+
+
+def _listening(network: Network) -> list[str]:
+    """Where a router listens, and for how long a secured one holds a stranger who says nothing."""
+    patience = "" if network.credentials is None else f"#tls_handshake_timeout_ms={HANDSHAKE_MS}"
+    return [each + patience for each in network.listen]
 
 
 def _tls(credentials: Credentials) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from dreamfleet.common import keys
-from dreamfleet.common.authority import Authority
 from dreamfleet.common.client import Client
 from dreamfleet.common.codec import encode, encode_json
 from dreamfleet.common.credentials import read_join
@@ -17,30 +16,12 @@ from dreamfleet.common.runs import open_run
 from dreamfleet.common.session import MAX_PASSED, Network, open_session
 from dreamfleet.worker.service.admission import make_request
 from tests.support import tasks
+from tests.support.access import PATIENCE, Access, begin, until, work
 from tests.support.processes import free_port
 from tests.support.relay import Relay
 from tests.support.samples import MSGPACK
 
 LIFE = "0badc0de"
-PATIENCE = 60  # seconds
-
-
-class Access:
-    """An authority, with a join file for each actor."""
-
-    def __init__(self, folder, **how):
-        self.folder = folder
-        self.authority = Authority.create(folder, **how)
-        somewhere = ["tls/127.0.0.1:7447"]
-        self.authority.issue("coordinator", "home", self.path("coordinator"), hosts=["home.example"])
-        for role, name in (("worker", "first"), ("worker", "second"), ("viewer", "viewer"), ("operator", "operator")):
-            self.authority.issue(role, name, self.path(name), connect=somewhere)
-
-    def path(self, name):
-        return self.folder / f"{name}.join"
-
-    def network(self, name, endpoint):
-        return Network(connect=(endpoint,), credentials=read_join(self.path(name)))
 
 
 @pytest.fixture(scope="module")
@@ -51,31 +32,6 @@ def access(tmp_path_factory):
 @pytest.fixture
 def endpoint():
     return f"tls/127.0.0.1:{free_port()}"
-
-
-def begin(processes, access, endpoint, bundle, *more, name="safe"):
-    process = processes.start(
-        "coordinator", "--run", name, "--runs-dir", processes.runs, "--beat", 0.2, "--listen", endpoint,
-        "--join", access.path("coordinator"), "--access-dir", access.folder,
-        *(("--bundle", bundle.path) if bundle else ()), "--task", tasks.SLOW_TOY, "--population", 4,
-        "--evaluate-every", 0, *more,
-    )  # fmt: skip
-    process.wait_for("incarnation")
-    return process
-
-
-def work(processes, access, endpoint, who, name="safe"):
-    return processes.start(
-        "worker", "--join", access.path(who), "--connect", endpoint, "--run", name, "--slots", 1,
-        "--task", tasks.SLOW_TOY,
-    )  # fmt: skip
-
-
-def until(found, what):
-    deadline = time.monotonic() + PATIENCE
-    while not found():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)
 
 
 def fitness(processes, name, generations=3):

@@ -1,0 +1,131 @@
+"""A gate before a secured router's port: strangers who connect and never prove who they are take nothing of a run.
+
+Zenoh accepts every connection, holds it until its handshake ends or is out of time, and lets each one that failed cost
+all others 100 ms (https://github.com/eclipse-zenoh/zenoh/issues/2685): a few hundred closed connections keep newcomers
+out for a minute, and once a process has no descriptor left it never gets one back. So where more than `MOST_UNPROVEN`
+connections prove nothing, the kernel lets no packet of a new one through until they are fewer. Whoever is in stays in,
+and a newcomer's kernel tries again by itself. Linux only: elsewhere there is no gate.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import socket
+import struct
+import sys
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import Thread
+from time import sleep
+
+import zenoh
+
+log = logging.getLogger("dreamfleet.router")
+MOST_UNPROVEN = 32  # connections: at 100 ms each they are gone in three seconds
+SPARE = 16  # descriptors
+LOOK = 0.05  # seconds from one look at the descriptors to the next
+_OPEN = Path("/proc/self/fd")
+_ATTACH, _DETACH = 26, 27  # SO_ATTACH_FILTER and SO_DETACH_FILTER of Linux's asm-generic/socket.h
+_NOTHING = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0), 8)  # a socket filter: return 0 bytes
+_FILTER = struct.pack("@HP", 1, ctypes.addressof(_NOTHING))
+
+
+def guard(session: zenoh.Session, ports: Collection[int]) -> None:
+    """Keep a gate before the ports on which `session` listens, until it is closed."""
+    if sys.platform == "linux":
+        Thread(target=_Gate(session, ports).keep, name="gate", daemon=True).start()
+
+
+class _Gate:
+    def __init__(self, session: zenoh.Session, ports: Collection[int]) -> None:
+        self._info, self._ports = session.info, ports
+        own = _sockets()
+        self._own, self._listening = len(own), [each for each in own if self._listens(each)]
+        self._open, self._unproven = 0, 0
+        # Where a process has none left, Zenoh hears of that alone and ends no handshake: then it gets these back.
+        self._spare = _spare_ones()
+        self._shut = False
+
+    def keep(self) -> None:
+        while any(map(self._listens, self._listening)):  # whoever asks a session that is being closed, breaks it
+            if self._crowded() != self._shut:
+                self._turn(not self._shut)
+            sleep(LOOK)
+        self._release()
+
+    def _crowded(self) -> bool:
+        try:
+            if (found := sum(1 for _ in _OPEN.iterdir())) != self._open:
+                self._unproven = len(_sockets()) - self._own - len(self._info.transports())
+                self._open = found
+        except OSError:  # no descriptor is left
+            return True
+        return self._unproven > MOST_UNPROVEN
+
+    def _turn(self, shut: bool) -> None:
+        self._shut = shut
+        for number in filter(self._listens, self._listening):
+            with _borrowed(number) as listening:
+                listening.setsockopt(socket.SOL_SOCKET, _ATTACH if shut else _DETACH, _FILTER if shut else 0)
+                if shut:
+                    self._turn_away(listening)
+        if shut:
+            self._release()
+            log.warning("more than %d connections prove nothing: newcomers wait", MOST_UNPROVEN,
+                        extra={"facts": {"event": "crowd", "unproven": self._unproven}})  # fmt: skip
+        else:
+            self._spare = _spare_ones()
+
+    def _turn_away(self, listening: socket.socket) -> None:
+        """Close what waits to be accepted, or it would take the spare ones; Zenoh may be faster and take some."""
+        while self._spare:
+            os.close(self._spare.pop())
+            try:
+                while True:
+                    listening.accept()[0].close()
+            except BlockingIOError:  # nothing waits
+                return
+            except OSError:  # it took this one
+                continue
+
+    def _release(self) -> None:
+        while self._spare:
+            os.close(self._spare.pop())
+
+    def _listens(self, number: int) -> bool:
+        """Whether this is still the descriptor of one of the ports."""
+        with suppress(OSError), _borrowed(number) as found:
+            listens = found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+            return bool(listens) and found.getsockname()[1] in self._ports
+        return False
+
+
+def _spare_ones() -> list[int]:
+    found: list[int] = []
+    with suppress(OSError):
+        while len(found) < SPARE:
+            found.append(os.open(os.devnull, os.O_RDONLY))
+    return found
+
+
+def _sockets() -> list[int]:
+    """The descriptors of this process that are sockets."""
+    found = []
+    for each in _OPEN.iterdir():
+        with suppress(FileNotFoundError):  # gone meanwhile
+            if str(each.readlink()).startswith("socket:"):
+                found.append(int(each.name))
+    return found
+
+
+@contextmanager
+def _borrowed(number: int) -> Iterator[socket.socket]:
+    """Another's descriptor as a socket."""
+    found = socket.socket(fileno=number)
+    try:
+        yield found
+    finally:
+        found.detach()

@@ -1,0 +1,153 @@
+"""Who does what at a secured port, with a join file or without one: it is refused or bounded, and costs no bit."""
+
+import resource
+import socket
+import ssl
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.client import Client
+from dreamfleet.common.credentials import read_join
+from tests.support import tasks
+from tests.support.access import Access, begin, until, work
+from tests.support.attacks import CLAIMED, RUN, SECURED, SETTINGS, attacking, outcome, steers_by_name
+from tests.support.processes import free_port, processes_in
+
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def access(tmp_path_factory):
+    return Access(tmp_path_factory.mktemp("certificates") / "access")
+
+
+@pytest.fixture
+def endpoint():
+    return f"tls/127.0.0.1:{free_port()}"
+
+
+@pytest.fixture(scope="module")
+def unharmed(tmp_path_factory, random_bundle):
+    """At an open port: certificates change no bit."""
+    with processes_in(tmp_path_factory.mktemp("unharmed")) as processes:
+        coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
+        processes.worker("--task", tasks.SLOW_TOY, "--name", "own")
+        assert coordinator.finish()[0] == 0
+        return outcome(processes)
+
+
+# What arrives of each, and is counted: nothing of who only looks or steers; of a worker what it says in its own name.
+ARRIVES = {
+    "viewer": set(),
+    "operator": set(),
+    "second": {"result of a job that was not given", "lease with more steps than a job has"},
+}
+
+
+@pytest.mark.parametrize(
+    "who", [*(pytest.param(who, marks=pytest.mark.long) for who in ("viewer", "operator")), "second"]
+)
+def test_all_at_once_change_no_bit(processes, access, endpoint, random_bundle, unharmed, who):
+    actions = SECURED if who == "operator" else [*SECURED, steers_by_name]  # which an operator may
+    coordinator = begin(processes, access, endpoint, random_bundle, *SETTINGS, name=RUN)
+    ears = access.network("coordinator", endpoint)
+    with attacking(access.network(who, endpoint), *actions, ears=ears) as evil:
+        work(processes, access, endpoint, "first", RUN, "--name", "own")
+        assert coordinator.finish(120)[0] == 0
+    assert outcome(processes) == unharmed, "\n".join(coordinator.lines)
+    assert not evil.steered
+    assert not evil.asked
+    assert not evil.overheard
+    assert evil.seen
+    assert evil.seen.isdisjoint(CLAIMED)
+    assert evil.dropped.keys() - {"result of a stranger"} == ARRIVES[who]
+    assert ARRIVES[who] or not evil.dropped
+    assert not any("paused" in line for line in coordinator.lines)
+
+
+def address(endpoint):
+    host, port = endpoint.partition("/")[2].split(":")
+    return host, int(port)
+
+
+def knock(where, count):
+    """Connections that are begun and closed at once; nobody waits for an answer."""
+    for _ in range(count):
+        with socket.socket() as link:
+            link.setblocking(False)
+            link.connect_ex(where)
+
+
+def break_off(where, count):
+    """Handshakes that end with the first words."""
+    context = ssl.create_default_context()
+    for _ in range(count):
+        incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        with pytest.raises(ssl.SSLWantReadError):
+            context.wrap_bio(incoming, outgoing, server_hostname="home.example").do_handshake()
+        with socket.socket() as link:
+            link.settimeout(0.05)
+            if not link.connect_ex(where):
+                link.send(outgoing.read())
+
+
+def show_nothing(where, count, access):
+    """Handshakes without a certificate."""
+    context = ssl.create_default_context(cadata=read_join(access.path("viewer")).ca)
+    context.check_hostname = False
+    for _ in range(count):
+        try:
+            with socket.create_connection(where, 0.2) as link, context.wrap_socket(link) as shown:
+                shown.recv(1)
+        except OSError:
+            pass
+
+
+def hold(where, count):
+    """Connections that say nothing and stay."""
+    held = [socket.socket() for _ in range(count)]
+    for link in held:
+        link.setblocking(False)
+        link.connect_ex(where)
+    return held
+
+
+def open_files(process):
+    return len(list(Path(f"/proc/{process.popen.pid}/fd").iterdir()))
+
+
+@pytest.mark.long
+def test_ten_thousand_connections_that_prove_nothing_keep_nobody_out_for_long(
+    processes, access, endpoint, random_bundle, unharmed
+):
+    if resource.getrlimit(resource.RLIMIT_NOFILE)[0] < 3000:
+        pytest.skip("2,000 connections at once want more descriptors (ulimit -n)")
+    coordinator = begin(processes, access, endpoint, random_bundle, *SETTINGS, name=RUN)
+    with Client(access.network("viewer", endpoint)) as viewer:
+        before, where = open_files(coordinator), address(endpoint)
+        held = hold(where, 2000)
+        knock(where, 10_000)
+        break_off(where, 200)
+        show_nothing(where, 20, access)
+        assert open_files(coordinator) > before
+        assert viewer.status().state == "waiting for workers"  # who is in, stays in
+        work(processes, access, endpoint, "first", RUN, "--name", "own").wait_for("joined")
+        assert coordinator.finish(120)[0] == 0
+    for link in held:
+        link.close()
+    assert outcome(processes) == unharmed
+
+
+@pytest.mark.long
+def test_strangers_take_no_descriptor_for_good(processes, access, endpoint, random_bundle):
+    """More connections than the process may have; Zenoh alone would never end one, nor accept any other."""
+    coordinator = begin(processes, access, endpoint, random_bundle, "--generations", 1,
+                        inside=("bash", "-c", 'ulimit -n 120; exec "$@"', "-"))  # fmt: skip
+    before, held = open_files(coordinator), hold(address(endpoint), 400)
+    coordinator.wait_for("prove nothing")
+    for link in held:
+        link.close()
+    until(lambda: open_files(coordinator) <= before, "descriptors do not come back")
+    work(processes, access, endpoint, "first").wait_for("joined")
+    assert coordinator.finish(120)[0] == 0
