@@ -40,6 +40,11 @@ def _opened(path: Path, private: bool) -> BinaryIO:
     if not private:
         return path.open("wb")
     path.unlink(missing_ok=True)  # one of another mode
+    return open_new(path)
+
+
+def open_new(path: Path) -> BinaryIO:
+    """Open a file that is its owner's alone (mode 600) for writing; `FileExistsError` if there is any."""
     return open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "wb")  # noqa: PTH123
 
 

@@ -6,11 +6,13 @@ import argparse
 import json
 import signal
 from dataclasses import dataclass
+from pathlib import Path
 from threading import Event
 
 from dreamfleet.common.config import add_flags, load, option
 from dreamfleet.common.descriptors import raise_limit
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.files import open_new
 from dreamfleet.common.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT, Network
 from dreamfleet.common.site import joined, offer
 from dreamfleet.common.stopping import SIGNALS
@@ -38,6 +40,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--print-config", action="store_true", help="print what Zenoh's own zenohd reads to do the same, and leave"
     )
+    parser.add_argument(
+        "--write-config", type=Path, metavar="FILE.json5",
+        help="write that to a new file of mode 600, with what the join file keeps secret, and leave",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -56,11 +62,31 @@ def run(args: argparse.Namespace) -> int:
     network.check_open(insecure=config.insecure)
     if args.print_config:
         if credentials is not None:
-            raise UsageError("--print-config would print what the join file keeps secret: let this verb route itself")
+            raise UsageError("--print-config would print what the join file keeps secret: --write-config FILE.json5")
         print(json.dumps(settings_of(network, None), indent=2))
+        return 0
+    if args.write_config is not None:
+        _write(args.write_config, network)
         return 0
     stopped = Event()
     for number in SIGNALS:
         signal.signal(number, lambda *_: stopped.set())
     route(network, stopped)
     return 0
+
+
+def _write(path: Path, network: Network) -> None:
+    """What zenohd reads, as a file; certificates and keys stand in it."""
+    from dreamfleet.common.session import settings_of
+
+    if path.suffix not in (".json", ".json5"):
+        raise UsageError(f"--write-config {path}: zenohd knows what it reads by its name: end it in .json5")
+    if network.credentials is not None and network.credentials.with_passwords:
+        raise UsageError("--write-config is for certificates: of a fleet with passwords let this verb be the router")
+    try:
+        with open_new(path) as file:
+            file.write(json.dumps(settings_of(network, None), indent=2).encode())
+    except FileExistsError:
+        raise UsageError(f"--write-config {path} exists: name another, or remove it first") from None
+    except OSError as error:
+        raise DreamfleetError(f"cannot write {path}: {error.strerror}; choose another --write-config") from error

@@ -1,11 +1,12 @@
 """A fleet with join files: who is let in, who may do what, and that a run is none the worse for the others."""
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import pytest
+import zenoh
 
 from dreamfleet.common import keys
 from dreamfleet.common.client import Client
@@ -193,13 +194,37 @@ def test_nobody_listens_beyond_this_host_without_security_unless_that_is_said(pr
     assert (code, f"it is tls/0.0.0.0:{processes.port}" in err) == (2, True)
 
 
-def test_a_router_of_its_own_holds_everybody_to_the_same_rules(processes, access, endpoint, random_bundle):
-    join = access.path("router")
-    access.authority.issue("router", "middle", join, hosts=["router.example"])
-    begun = ("router", "--join", join, "--access-dir", access.folder, "--listen", endpoint)
-    processes.start(*begun).wait_for("listening on")
-    code, out, err = processes.call(*begun, "--print-config")
+@contextmanager
+def routed_by_the_verb(processes, *words):
+    processes.start(*words).wait_for("listening on")
+    yield
+
+
+@contextmanager
+def routed_by_zenoh_alone(processes, *words):
+    """From the file that zenohd reads."""
+    file = processes.folder / "secured.json5"
+    code, out, err = processes.call(*words, "--print-config")
     assert (code, out, "secret" in err) == (2, "", True)
+    assert processes.call(*words, "--write-config", file)[0] == 0
+    assert file.stat().st_mode & 0o777 == 0o600
+    code, _, err = processes.call(*words, "--write-config", file)
+    assert (code, "exists" in err) == (2, True)
+    with zenoh.open(zenoh.Config.from_file(str(file))):
+        yield
+
+
+@pytest.fixture(params=[routed_by_the_verb, routed_by_zenoh_alone], ids=lambda how: how.__name__)
+def router(request, processes, tmp_path, access, endpoint):
+    join = tmp_path / "router.join"
+    access.authority.issue("router", "middle", join, hosts=["router.example"])
+    words = ("router", "--join", join, "--access-dir", access.folder, "--listen", endpoint)
+    with request.param(processes, *words) as routed:
+        yield routed
+
+
+@pytest.mark.usefixtures("router")
+def test_a_router_of_its_own_holds_everybody_to_the_same_rules(processes, access, endpoint, random_bundle):
     coordinator = processes.start(
         "coordinator", "--run", "far", "--runs-dir", processes.runs, "--beat", 0.2, "--connect", endpoint,
         "--join", access.path("coordinator"), "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY,
