@@ -167,6 +167,26 @@ def test_a_worker_that_is_revoked_counts_no_more_while_the_run_goes_on(processes
     assert {str(each.key_expr).split("/")[-2].rpartition(".")[2] for each in said} == {str(seats["newcomer"])}
 
 
+def test_a_router_that_starts_after_it_bars_every_role(access, endpoint):
+    network = Network(listen=(endpoint,), credentials=read_join(access.path("coordinator")),
+                      barred=frozenset({"viewer.1", "operator.1", "worker.1"}))  # fmt: skip
+    with open_session(network) as router, ExitStack() as stack:
+        asks = [keys.status("safe"), keys.control("safe", "stop"), keys.bundle("safe", "ab" * 32)]
+        sessions = {who: stack.enter_context(open_session(access.network(who, endpoint)))
+                    for who in ("viewer", "operator", "first", "second")}  # fmt: skip
+        for key in asks:
+            stack.enter_context(router.declare_queryable(key, lambda query: query.reply(query.key_expr, b"{}")))
+        until(lambda: answered(sessions["second"].get(asks[0], timeout=1)), "who is not barred is not answered")
+        asked = {who: [sessions[who].get(key, timeout=2) for key in asks] for who in ("viewer", "operator", "first")}
+        assert {who: [answered(each) for each in replies] for who, replies in asked.items()} == dict.fromkeys(
+            asked, [False] * 3
+        )
+
+
+def answered(replies):
+    return any(reply.ok for reply in replies)
+
+
 def test_a_fleet_is_joined_by_passwords_too(processes, tmp_path, endpoint, random_bundle):
     access = Access(tmp_path / "access", passwords=True)
     assert not read_join(access.path("first")).certificate
