@@ -17,6 +17,7 @@ from dreamfleet.common.stored import StoredConfirmation, StoredEvaluation
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 MOST_WORKERS, MOST_REASONS = 200, 50
+OTHER = "other"  # the classes of hosts that a status does not name
 LONGEST = 128  # characters of a label's value
 STATES = ("running", "evaluating", "waiting for workers", "paused", *OVER)
 ESCAPES = str.maketrans({"\\": r"\\", '"': r"\"", "\n": r"\n"})
@@ -98,6 +99,12 @@ def _fleet(status: Status) -> Iterator[Metric]:
     count = [({"which": "present"}, float(status.workers.present)), ({"which": "known"}, float(status.workers.known))]
     yield Metric("dreamfleet_workers", "gauge", "Workers that are present, and that are known.", count)
     yield _gauge("slots", "Slots of the present workers.", status.slots)
+    classes = status.classes
+    rest = classes.results - sum(each.results for each in classes.largest)
+    by_class = [({"class": each.host_class}, float(each.results)) for each in classes.largest]
+    by_class += [({"class": OTHER}, float(rest))] * bool(rest)
+    yield _gauge("host_classes", "Classes of hosts that accepted results are of; one: to the bit.", classes.total)
+    yield Metric("dreamfleet_class_results", "gauge", "Accepted results of the largest classes of hosts.", by_class)
     yield _gauge("failing_jobs", "Wanted jobs that failed somewhere.", status.failing)
 
 

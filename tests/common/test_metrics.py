@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from dreamfleet.common.classes import MOST_TOLD, Classes
 from dreamfleet.common.metrics import MOST_REASONS, MOST_WORKERS, exposition
 from dreamfleet.common.status import Throughput
 from dreamfleet.common.stored import StoredConfirmation
@@ -18,7 +19,7 @@ WORKER = dataclasses.replace(STATUS.worker_list[0], job_seconds=1.5, round_trip=
 WHOLE = dataclasses.replace(
     STATUS, worker_list=(WORKER,), limits={"minutes": 30.0}, throughput=Throughput(987.5, 448000, 60.0),
     confirmed=StoredConfirmation(4, 16, 118.5, 30.0, 7),
-    generation=dataclasses.replace(STATUS.generation, temperature=1.25),
+    generation=dataclasses.replace(STATUS.generation, temperature=1.25), classes=Classes.of({("a" * 16, "x"): 5}),
 )  # fmt: skip
 HOSTILE = 'a"b\\c\nd{run="x"} 1\x1b[2J\ud800'
 
@@ -47,6 +48,13 @@ def test_what_is_not_known_has_no_sample():
     found = read(dataclasses.replace(STATUS, last=None, recent=(), evaluation=None, best=None))
     for name in ("fitness", "evaluated_score", "confirmed_score", "temperature", "eta_seconds", "worker_job_seconds"):
         assert f"dreamfleet_{name}" not in found
+
+
+def test_results_by_class_of_host_add_up_to_all_of_them():
+    found = read(dataclasses.replace(STATUS, classes=Classes.of({(f"{n:016x}", "x"): 10 - n for n in range(9)})))
+    assert found["dreamfleet_host_classes"][0][1] == 9
+    told = {labels["class"]: value for labels, value in found["dreamfleet_class_results"]}
+    assert told == {**{f"{n:016x}": 10 - n for n in range(MOST_TOLD)}, "other": 6 + 5 + 4 + 3 + 2}
 
 
 def test_label_sets_are_bounded():
