@@ -33,7 +33,7 @@ def test_a_crowd_of_strangers_keeps_newcomers_out_for_seconds_and_nobody_else(tm
     with open_session(Network(listen=(endpoint,), credentials=read_join(tmp_path / "home.join"))) as router:
         with open_session(viewer):
             inside = router.info.transports()
-            knock(port, 20 * MOST_UNPROVEN)
+            knock(port, 2 * MOST_UNPROVEN)
             until(lambda: "prove nothing" in caplog.text, "a crowd goes unnoticed")
             assert [each.zid for each in router.info.transports()] == [each.zid for each in inside]
         until(lambda: joined(viewer), "a newcomer is not let in")

@@ -41,6 +41,11 @@ def fitness(processes, name, generations=3):
 
 
 def test_each_may_do_what_its_role_says_and_the_run_is_none_the_worse(processes, access, endpoint, random_bundle):
+    plain = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1,
+        "--evaluate-every", 0, "--generations", 3, name="plain",
+    )  # fmt: skip
+    processes.worker("--task", tasks.SLOW_TOY)
     coordinator = begin(processes, access, endpoint, random_bundle, "--generations", 3)
     own, foreign, garbage = f"x.1/{LIFE}", f"x.2/{LIFE}", b"\xc1"  # `first` has seat 1
     asks = {
@@ -87,12 +92,6 @@ def test_each_may_do_what_its_role_says_and_the_run_is_none_the_worse(processes,
         assert operator.status().expires > time.time() + 80 * 86400
         until(lambda: not operator.runs(), "the run does not end")
     assert coordinator.finish()[0] == 0
-
-    plain = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
-        "--generations", 3, name="plain",
-    )  # fmt: skip
-    processes.worker("--task", tasks.SLOW_TOY)
     assert plain.finish()[0] == 0
     assert fitness(processes, "safe") == fitness(processes, "plain")
     body = read_join(access.path("coordinator")).key.splitlines()[1]
@@ -248,7 +247,7 @@ def test_a_router_of_its_own_holds_everybody_to_the_same_rules(processes, access
     coordinator = processes.start(
         "coordinator", "--run", "far", "--runs-dir", processes.runs, "--beat", 0.2, "--connect", endpoint,
         "--join", access.path("coordinator"), "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY,
-        "--population", 4, "--evaluate-every", 0, "--generations", 1,
+        "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 1,
     )  # fmt: skip
     coordinator.wait_for("incarnation")
     for who, may in (("viewer", False), ("operator", True)):

@@ -11,7 +11,6 @@ import pytest
 from dreamfleet.common.session import Network
 from tests.support import tasks
 from tests.support.attacks import OPEN, SETTINGS, attacking, outcome
-from tests.support.processes import processes_in
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -24,15 +23,6 @@ def connects_without_end(evil, number):
 
 
 ACTIONS = [*OPEN, connects_without_end]
-
-
-@pytest.fixture(scope="module")
-def unharmed(tmp_path_factory, random_bundle):
-    with processes_in(tmp_path_factory.mktemp("unharmed")) as processes:
-        coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
-        processes.worker("--task", tasks.SLOW_TOY, "--name", "own")
-        assert coordinator.finish()[0] == 0
-        return outcome(processes)
 
 
 def harmed(processes, random_bundle, *actions):

@@ -33,7 +33,7 @@ def begin(processes, access, endpoint, bundle, *more, name="safe", inside=()):
         "coordinator", "--run", name, "--runs-dir", processes.runs, "--beat", 0.2, "--listen", endpoint,
         "--join", access.path("coordinator"), "--access-dir", access.folder,
         *(("--bundle", bundle.path) if bundle else ()),
-        "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0, *more,
+        "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, *more,
         inside=inside,
     )  # fmt: skip
     process.wait_for("incarnation")

@@ -29,10 +29,10 @@ from dreamfleet.common.session import open_session
 from tests.support import tasks
 from tests.support.samples import JSON, MSGPACK
 
-RUN, GENERATIONS, POPULATION = "test", 3, 4
+RUN, GENERATIONS, POPULATION = "test", 4, 4
 FORGED = ("f", "a guess")  # fingerprints
-SETTINGS = ("--task", tasks.SLOW_TOY, "--population", POPULATION, "--evaluate-every", 0, "--generations", GENERATIONS,
-            "--seed", 5)  # fmt: skip
+SETTINGS = ("--task", tasks.SLOW_TOY, "--population", POPULATION, "--episodes", 1, "--evaluate-every", 0,
+            "--generations", GENERATIONS, "--seed", 5)  # fmt: skip
 CLAIMED = (keys.live_coordinator(RUN, "f" * 16), keys.live_worker(RUN, "own.1/0badc0de"))  # tokens of who is not there
 ASKED = 5  # seconds that a question stays open: nobody waits for it
 
