@@ -42,8 +42,7 @@ def guard(session: zenoh.Session, ports: Collection[int]) -> None:
 class _Gate:
     def __init__(self, session: zenoh.Session, ports: Collection[int]) -> None:
         self._info, self._ports = session.info, ports
-        own = _sockets()
-        self._own, self._listening = len(own), [each for each in own if self._listens(each)]
+        self._listening = [each for each in self._ours() if self._listens(each)]
         self._open, self._unproven = 0, 0
         # Where a process has none left, Zenoh hears of that alone and ends no handshake: then it gets these back.
         self._spare = _spare_ones()
@@ -58,8 +57,9 @@ class _Gate:
 
     def _crowded(self) -> bool:
         try:
-            if (found := _OPEN.stat().st_size or sum(1 for _ in _OPEN.iterdir())) != self._open:  # 0: before Linux 6.2
-                self._unproven = len(_sockets()) - self._own - len(self._info.transports())
+            found = _OPEN.stat().st_size or sum(1 for _ in _OPEN.iterdir())  # 0: before Linux 6.2
+            if found != self._open or self._unproven > MOST_UNPROVEN:
+                self._unproven = len(self._ours()) - len(self._listening) - len(self._info.transports())
                 self._open = found
         except OSError:  # no descriptor is left
             return True
@@ -95,11 +95,15 @@ class _Gate:
         while self._spare:
             os.close(self._spare.pop())
 
+    def _ours(self) -> list[int]:
+        """The descriptors of what listens at the ports, and of whoever connected there."""
+        return [number for each in _OPEN.iterdir() if _port(number := int(each.name)) in self._ports]
+
     def _listens(self, number: int) -> bool:
-        """Whether this is still the descriptor of one of the ports."""
-        with suppress(OSError), _borrowed(number) as found:
-            listens = found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-            return bool(listens) and found.getsockname()[1] in self._ports
+        """Whether this is still the descriptor of what listens at one of the ports."""
+        if _port(number) in self._ports:
+            with suppress(OSError), _borrowed(number) as found:
+                return bool(found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
         return False
 
 
@@ -111,14 +115,12 @@ def _spare_ones() -> list[int]:
     return found
 
 
-def _sockets() -> list[int]:
-    """The descriptors of this process that are sockets."""
-    found = []
-    for each in _OPEN.iterdir():
-        with suppress(FileNotFoundError):  # gone meanwhile
-            if str(each.readlink()).startswith("socket:"):
-                found.append(int(each.name))
-    return found
+def _port(number: int) -> int:
+    """The port of this host that a descriptor has; 0 of one that is no internet socket, or is gone."""
+    with suppress(OSError), _borrowed(number) as found:
+        if found.family in (socket.AF_INET, socket.AF_INET6):
+            return int(found.getsockname()[1])
+    return 0
 
 
 @contextmanager

@@ -3,6 +3,8 @@
 import logging
 import socket
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import pytest
 
@@ -37,6 +39,10 @@ def test_a_crowd_of_strangers_keeps_newcomers_out_for_seconds_and_nobody_else(tm
             until(lambda: "prove nothing" in caplog.text, "a crowd goes unnoticed")
             assert [each.zid for each in router.info.transports()] == [each.zid for each in inside]
         until(lambda: joined(viewer), "a newcomer is not let in")
+        with ExitStack() as fleet, ThreadPoolExecutor(8) as threads:  # who proves something is no crowd
+            for session in threads.map(lambda _: open_session(viewer, timeout=30), range(2 * MOST_UNPROVEN)):
+                fleet.enter_context(session)
+            assert joined(viewer)
     open_session(Network(listen=(endpoint,), credentials=read_join(tmp_path / "home.join"))).close()  # its port is free
 
 
