@@ -53,9 +53,7 @@ def open_session(network: Network, *, timeout: float | None = ATTEMPT) -> zenoh.
         if network.listen or len(network.connect) < 2:
             session = _open(network, lambda: _opened(settings_of(network, timeout, dictionary)))
         else:
-            session = _open(
-                network, lambda: _opened(settings_of(_answering_first(network, timeout or 0.0), ATTEMPT))
-            )
+            session = _open(network, lambda: _opened(settings_of(_answering_first(network, timeout or 0.0), ATTEMPT)))
     if network.listen and network.credentials is not None:
         guard(session, {int(each.rpartition(":")[2]) for each in network.listen})
     return session

@@ -35,8 +35,7 @@ REFRESH = 0.5
 START_SECONDS = 30.0
 PAGE_PACKAGES = ("plotly", "starlette", "uvicorn")
 PLOT, VIDEO = "fitness.png", "drive.mp4"
-DREAM_LOOKS, REAL_LOOKS = (2, 8), (3, 16)  # generations between evaluations, and tracks of each
-CONFIRMATION_TRACKS = 16  # on which what a stage reports is confirmed
+DREAM_LOOKS, REAL_LOOKS = (2, 8), (3, 16)  # generations between evaluations, and tracks of each; twice as many confirm
 FEW, ALL, ABLE = 0.3, 0.1, 0.06  # first step sizes: from zero in a subspace, of all parameters, and after a dream
 
 
@@ -45,7 +44,7 @@ class DemoConfig:
     """How long and how large; the defaults suit two cores."""
 
     dream_minutes: float = option(0.5, "dream for so long first; 0: not at all")
-    minutes: float = option(4.0, "then evolve in reality for so long; 0: not at all")
+    minutes: float = option(4.5, "then evolve in reality for so long; 0: not at all")
     temperature: float = option(1.5, "of the dream")
     population: int = option(24, "candidates a generation in reality")
     episodes: int = option(4, "episodes a candidate in reality")
@@ -227,7 +226,7 @@ def _drives(scores: Sequence[float]) -> str:
 
 
 def _looks(every: int, tracks: int) -> dict[str, object]:
-    return {"evaluate-every": every, "evaluation-episodes": tracks, "confirm-episodes": CONFIRMATION_TRACKS}
+    return {"evaluate-every": every, "evaluation-episodes": tracks, "confirm-episodes": 2 * tracks}
 
 
 def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
