@@ -6,6 +6,8 @@ The copy is a run like any other.
 
 from __future__ import annotations
 
+import fcntl
+import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
@@ -25,8 +27,7 @@ def back_up(source: RunFolder, target: Path) -> None:
     """
     _check_target(source, target)
     aside, former = (target.with_name(f".{target.name}.{word}") for word in ("part", "former"))
-    with _translated(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
+    with _translated(target), _alone(target):
         _clear(target, aside, former)  # an earlier call may have been killed
         try:
             aside.mkdir(mode=0o700)
@@ -40,6 +41,26 @@ def back_up(source: RunFolder, target: Path) -> None:
             _clear(target, aside, former)
 
 
+@contextmanager
+def _alone(target: Path) -> Iterator[None]:
+    """Inside, nobody else backs up into this folder: what the one has half copied the other would take for its own."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    path = target.with_name(f".{target.name}.lock")
+    while True:
+        with path.open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UsageError(f"another backup into {target} is at work: wait for it") from None
+            if not path.exists() or not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
+                continue  # who held it has removed it
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
 def _clear(target: Path, aside: Path, former: Path) -> None:
     """Leave one copy under its name: the new one if it has come to be, else the earlier one."""
     if former.exists() and not target.exists():
@@ -49,6 +70,8 @@ def _clear(target: Path, aside: Path, former: Path) -> None:
 
 
 def _check_target(source: RunFolder, target: Path) -> None:
+    if target.is_symlink():
+        raise UsageError(f"{target} is a link: name the folder of runs that it leads to with --to")
     if target.exists() and target.samefile(source.path):
         raise UsageError(f"{target} is the run itself: name another folder with --to")
     if not (target / JOURNAL).exists():

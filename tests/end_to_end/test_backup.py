@@ -118,3 +118,30 @@ def test_a_world_model_is_copied_too(processes, tmp_path):
     assert back_up(processes, tmp_path / "safe")[0] == 0
     copied = tmp_path / "safe" / "test" / BUNDLE
     assert copied.read_bytes() == find_bundle("tiny").path.read_bytes()
+
+
+def test_two_at_once_leave_a_whole_copy(processes, finished, tmp_path, monkeypatch):
+    safe = tmp_path / "safe"
+    assert back_up(processes, safe)[0] == 0
+    unserved, said = backup._unserved, []
+
+    def meanwhile(target):
+        said.append(back_up(processes, safe))
+        return unserved(target)
+
+    monkeypatch.setattr(backup, "_unserved", meanwhile)
+    with open_run(processes.runs, "test") as source:
+        backup.back_up(source, safe / "test")
+    assert [(code, "is at work" in err) for code, _, err in said] == [(2, True)]
+    assert [path.name for path in safe.iterdir()] == ["test"]
+    with open_run(safe, "test") as copy:
+        assert len(copy.history()) == 2
+
+
+def test_a_link_is_no_copy_to_replace(processes, finished, tmp_path):
+    assert back_up(processes, tmp_path / "far")[0] == 0
+    (tmp_path / "near").mkdir()
+    (tmp_path / "near" / "test").symlink_to(tmp_path / "far" / "test")
+    code, _, err = back_up(processes, tmp_path / "near")
+    assert (code, "is a link" in err) == (2, True), err
+    assert [path.name for path in (tmp_path / "near").iterdir()] == ["test"]
