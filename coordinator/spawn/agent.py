@@ -103,6 +103,11 @@ class Place:
         """Where an environment lies; it is whole when it holds `WHOLE`."""
         return self.root / "environments" / name
 
+    def whole(self, name: str) -> bool:
+        """Whether an environment can be used: the Python that it was made of may be gone since."""
+        folder = self.environment(name)
+        return (folder / WHOLE).exists() and (folder / "bin" / "python").exists()
+
     def worker(self, name: str) -> Path:
         """Where a worker's state, log and join file lie."""
         return self.root / "workers" / name
@@ -120,10 +125,12 @@ class Place:
             self._make()
             with (self.root / "lock").open("w") as lock:
                 self._take(lock.fileno())
+                held = False
                 with suppress(FileNotFoundError):  # who held it may have removed it all
-                    if os.path.samestat(os.fstat(lock.fileno()), (self.root / "lock").stat()):
-                        yield
-                        return
+                    held = os.path.samestat(os.fstat(lock.fileno()), (self.root / "lock").stat())
+                if held:
+                    yield
+                    return
 
     def remove(self) -> None:
         """Leave nothing behind; a folder with other things in it stays, with these."""
@@ -248,7 +255,7 @@ def look(question: dict[str, Any], line: Line) -> dict[str, Any]:
         "writable": os.access(there, os.W_OK),
         "root": str(place.root),
         "free": shutil.disk_usage(there).free,
-        "environments": [each for each in place.names("environments") if (place.environment(each) / WHOLE).exists()],
+        "environments": [each for each in place.names("environments") if place.whole(each)],
         "workers": [Found(place.worker(each)).row() for each in place.names("workers")],
     }
 
@@ -258,7 +265,7 @@ def install(question: dict[str, Any], files: dict[str, bytes], line: Line) -> di
     place = Place(question["root"], line)
     folder = place.environment(question["environment"])
     with place.locked():
-        if (folder / WHOLE).exists():
+        if place.whole(question["environment"]):
             return {"python": str(folder / "bin" / "python")}
         shutil.rmtree(folder, ignore_errors=True)  # an attempt that was interrupted
         parcel = folder / "parcel"

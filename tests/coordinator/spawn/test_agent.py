@@ -1,0 +1,41 @@
+"""What the agent answers where a host is not as it was."""
+
+import os
+
+import pytest
+
+from dreamfleet.coordinator.spawn import agent
+from dreamfleet.coordinator.spawn.agent import MARK, WHOLE, Line, Place
+
+
+def test_a_file_that_is_missing_inside_is_told_and_the_folder_is_let_go(tmp_path, capsys):
+    asked = {"do": "start", "root": str(tmp_path / "place"), "name": "box", "python": str(tmp_path / "gone"),
+             "words": [], "env": {}, "slots": 1, "held": False, "digest": "1"}  # fmt: skip
+    for _ in range(2):
+        agent.obey(asked, Line())
+        said = capsys.readouterr().out
+        assert said.startswith(f'{MARK}{{"failed"'), said
+        assert "No such file" in said
+
+
+def test_who_removed_the_folder_that_is_waited_for_is_followed(tmp_path, monkeypatch):
+    place, take = Place(str(tmp_path / "place"), Line()), Place._take
+
+    def removed(self, lock):
+        monkeypatch.setattr(Place, "_take", take)
+        self.remove()
+        take(self, lock)
+
+    monkeypatch.setattr(Place, "_take", removed)
+    with place.locked():
+        assert (place.root / "lock").exists()
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_an_environment_whose_python_is_gone_is_none(tmp_path, there):
+    folder = tmp_path / "environments" / "one"
+    (folder / "bin").mkdir(parents=True)
+    (folder / WHOLE).touch()
+    (folder / "bin" / "python").symlink_to(os.devnull if there else tmp_path / "gone")
+    found = agent.look({"root": str(tmp_path)}, Line())
+    assert found["environments"] == (["one"] if there else [])
