@@ -10,10 +10,11 @@ Keys are P-256, which whatever speaks TLS understands; certificates are X.509 v3
 from __future__ import annotations
 
 import ipaddress
+import re
 import secrets
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -37,6 +38,7 @@ EARLIER = timedelta(minutes=5)  # clocks differ
 HERE = ("localhost", "127.0.0.1", "::1")  # of every listener, for its own host
 _CERTIFICATE, _KEY, _SECRET = "ca.pem", "ca.key", "secret"
 _MOST = 64 * 1024
+_HOST = re.compile(r"(\*\.)?[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")
 
 
 class Authority:
@@ -53,13 +55,16 @@ class Authority:
             self._pem = read_text(folder / _CERTIFICATE, _MOST)
             self._certificate = x509.load_pem_x509_certificate(self._pem.encode())
             key = serialization.load_pem_private_key(read_regular(folder / _KEY, _MOST), None)
-            self._secret = read_text(folder / _SECRET, _MOST) if (folder / _SECRET).exists() else ""
+            self._secret = read_text(folder / _SECRET, _MOST).strip() if (folder / _SECRET).exists() else ""
+            bytes.fromhex(self._secret)
         except OSError as error:
             raise AccessError(f"the authority in {folder} cannot be read: {error.strerror}") from error
         except (ValueError, TypeError) as error:
             raise AccessError(f"the authority in {folder} is damaged: restore the folder") from error
         if not isinstance(key, EllipticCurvePrivateKey):
             raise AccessError(f"the authority in {folder} has a key of another kind: restore the folder")
+        if key.public_key() != self._certificate.public_key():
+            raise AccessError(f"the authority in {folder} has the key of another certificate: restore the folder")
         self._key = key
 
     @classmethod
@@ -76,8 +81,11 @@ class Authority:
             .sign(key, hashes.SHA256())
         )
         pem = certificate.public_bytes(serialization.Encoding.PEM)
-        with told(folder):
+        with told(folder, "--access-dir"):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with told(folder, "--access-dir"), _held(folder):
+            if (folder / _KEY).exists():
+                raise UsageError(f"{folder} holds an authority already: name another --access-dir")
             _write(folder / _CERTIFICATE, pem)
             if passwords:
                 _write(folder / _SECRET, secrets.token_hex(32).encode())
@@ -104,6 +112,8 @@ class Authority:
                 key = generate_private_key(SECP256R1())
                 pem = self._sign(who, key, serial, hosts, now)
                 who = replace(who, certificate=pem, key=_key_bytes(key).decode())
+            if ledger.passwords and not self._secret:
+                raise AccessError(f"{self._folder / _SECRET} is missing, of which all passwords follow: restore it")
             if ledger.passwords:
                 who = (replace(who, secret=self._secret) if who.listens
                        else replace(who, password=password_of(self._secret, who.identity)))  # fmt: skip
@@ -151,8 +161,15 @@ class Authority:
     @contextmanager
     def _changing(self) -> Iterator[Ledger]:
         """The ledger, which nobody else changes meanwhile."""
-        with held(self._folder / "lock", "`dreamfleet access`"):
-            yield Ledger.load(self._folder / ISSUED)
+        with _held(self._folder):
+            ledger = Ledger.load(self._folder / ISSUED)
+            if ledger.authority != authority_of(self._pem):
+                raise AccessError(f"{self._folder / ISSUED} is of another authority: restore the folder")
+            yield ledger
+
+
+def _held(folder: Path) -> AbstractContextManager[None]:
+    return held(folder / "lock", "`dreamfleet access`", "--access-dir")
 
 
 def _seat(ledger: Ledger, role: str, name: str) -> int:
@@ -196,10 +213,9 @@ def _host(text: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(text.strip("[]")))
     except ValueError:
         pass
-    try:
-        return x509.DNSName(text)
-    except ValueError as error:
-        raise UsageError(f"--host {text!r} is no host: give a name or an address, without a port") from error
+    if not _HOST.fullmatch(text):  # of other scripts it is the `xn--` form that is asked for
+        raise UsageError(f"--host {text!r} is no host: give a name or an address, without a port")
+    return x509.DNSName(text)
 
 
 def _key_bytes(key: EllipticCurvePrivateKey) -> bytes:

@@ -159,6 +159,10 @@ def _parsed(path: Path, document: dict[str, Any]) -> Credentials:
     proved = bool(credentials.certificate and credentials.key)
     if not (proved or credentials.password) or (credentials.listens and not proved):
         raise AccessError(f"{path} is no join file: what proves its role is missing")
+    try:
+        bytes.fromhex(credentials.secret)
+    except ValueError:
+        raise AccessError(f"{path} is no join file: 'secret' is not of its kind") from None
     return credentials
 
 

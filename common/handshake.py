@@ -17,7 +17,7 @@ def trouble_with(endpoints: Iterable[str], credentials: Credentials) -> str | No
         host, _, port = endpoint.partition("/")[2].rpartition(":")
         try:
             link = socket.create_connection((host.strip("[]"), int(port)), PATIENCE)
-        except OSError:
+        except (OSError, ValueError):  # a name that no host can have
             continue
         with link:
             return (
@@ -27,7 +27,10 @@ def trouble_with(endpoints: Iterable[str], credentials: Credentials) -> str | No
 
 
 def _said(link: socket.socket, host: str, credentials: Credentials) -> str:
-    context = ssl.create_default_context(cadata=credentials.ca)
+    try:
+        context = ssl.create_default_context(cadata=credentials.ca)
+    except (OSError, ValueError, TypeError):
+        return "this join file is damaged: have another issued"
     try:
         with context.wrap_socket(link, server_hostname=host.strip("[]")):
             return (

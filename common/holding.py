@@ -11,14 +11,17 @@ from dreamfleet.common.errors import DatasetError, UsageError
 
 
 @contextmanager
-def held(lock: Path, who: str) -> Iterator[None]:
-    """Hold the folder of the file `lock`, made if it is not there; `UsageError` while another `who` works in it."""
+def held(lock: Path, who: str, flag: str = "--data") -> Iterator[None]:
+    """Hold the folder of the file `lock`, made if it is not there; `UsageError` while another `who` works in it.
+
+    `flag` is the one that names another folder.
+    """
     folder = lock.parent
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = lock.open("w")
     except OSError as error:
-        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
+        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another {flag}") from error
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

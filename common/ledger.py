@@ -63,9 +63,12 @@ class Ledger:
             raise AccessError(f"{path} is damaged: {error}; restore it") from error
 
     def save(self, path: Path) -> None:
-        """Write it whole."""
-        with write_aside(path, private=True) as file:
-            file.write(json.dumps(asdict(self), indent=1).encode())
+        """Write it whole; `AccessError` if that fails, and it is as before."""
+        try:
+            with write_aside(path, private=True) as file:
+                file.write(json.dumps(asdict(self), indent=1).encode())
+        except OSError as error:
+            raise AccessError(f"{path} cannot be written: {error.strerror}; nothing is changed") from error
 
     def barred(self) -> frozenset[str]:
         """The seats that were taken back."""

@@ -35,6 +35,8 @@ class Network:
                 raise UsageError(f"{endpoint} is not encrypted: with a join file it is {_secured(endpoint)}")
             if self.credentials is None and endpoint.startswith(SECURED):
                 raise UsageError(f"{endpoint} is encrypted: give --join FILE, which `dreamfleet access issue` makes")
+        for endpoint in self.connect:
+            check_secured(endpoint)
 
     def check_open(self, *, insecure: bool) -> None:
         """`UsageError` where others could reach a router that lets everybody do all, and nobody said `insecure`."""
@@ -69,6 +71,13 @@ def check_endpoint(endpoint: str) -> str:
     if not found or int(found[3]) > 65535:
         run = "" if "/" in endpoint or ":" in endpoint else "; if it is a run's name, that stands before the addresses"
         raise UsageError(f"{endpoint!r} is no endpoint: write it as tcp/HOST:PORT, such as {DEFAULT_ENDPOINT}{run}")
+    return endpoint
+
+
+def check_secured(endpoint: str) -> str:
+    """Return `endpoint` if Zenoh can connect to it, else raise `UsageError`: it checks no certificate for IPv6."""
+    if endpoint.startswith(f"{SECURED}["):
+        raise UsageError(f"{endpoint} cannot be reached: Zenoh speaks TLS to names and IPv4 alone; give a name")
     return endpoint
 
 

@@ -36,9 +36,9 @@ def saving(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def told(path: Path) -> Iterator[None]:
-    """What cannot be written at `path` is a `DreamfleetError`."""
+def told(path: Path, flag: str = "--out") -> Iterator[None]:
+    """What cannot be written at `path`, which `flag` names, is a `DreamfleetError`."""
     try:
         yield
     except OSError as error:
-        raise DreamfleetError(f"cannot write {path}: {error.strerror}; make room or choose another --out") from error
+        raise DreamfleetError(f"cannot write {path}: {error.strerror}; make room or choose another {flag}") from error

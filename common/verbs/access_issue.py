@@ -8,7 +8,7 @@ from pathlib import Path
 from dreamfleet.common.credentials import LISTENERS, ROLES
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.network import SECURED, check_endpoint
+from dreamfleet.common.network import SECURED, check_endpoint, check_secured
 from dreamfleet.common.site import offer
 
 SUMMARY = "make a join file: one file, mode 600, with which a host is let into the fleet"
@@ -22,8 +22,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the join file, which must not exist")
     offer(parser, "access_dir")
     parser.add_argument(
-        "--connect", nargs="+", default=[], metavar="ENDPOINT", help="where the fleet is: tls/HOST:7447"
-    )
+        "--connect", dest="endpoints", nargs="+", default=[], metavar="ENDPOINT",
+        help="where the fleet is: tls/HOST:7447",
+    )  # fmt: skip
     parser.add_argument(
         "--host", nargs="+", default=[], metavar="HOST",
         help="of a coordinator or router: names and addresses by which others reach it, beside localhost",
@@ -36,17 +37,17 @@ def run(args: argparse.Namespace) -> int:
     """Make it."""
     from dreamfleet.common.authority import Authority
 
-    for endpoint in args.connect:
-        if not check_endpoint(endpoint).startswith(SECURED):
+    for endpoint in args.endpoints:
+        if not check_secured(check_endpoint(endpoint)).startswith(SECURED):
             raise UsageError(f"--connect {endpoint}: join files are for encrypted endpoints, such as tls/HOST:7447")
-    if args.role not in LISTENERS and (args.host or not args.connect):
+    if args.role not in LISTENERS and (args.host or not args.endpoints):
         raise UsageError(f"a {args.role} connects: give --connect tls/HOST:7447, and no --host")
-    if args.role in LISTENERS and not args.host and not args.connect:
+    if args.role in LISTENERS and not args.host and not args.endpoints:
         raise UsageError(f"a {args.role} is reached by names: give --host, or --connect where a router listens for it")
     if args.days is not None and not 0 < args.days <= 3650:
         raise UsageError(f"--days must be above 0 and at most 3650, not {args.days:g}")
     who = Authority(args.site.access_dir).issue(
-        args.role, args.name, args.out, connect=args.connect, hosts=args.host, days=args.days
+        args.role, args.name, args.out, connect=args.endpoints, hosts=args.host, days=args.days
     )
     text = (
         f"{args.out}: {who.role} {who.name} ({who.identity}) until {who.expires:%Y-%m-%d}; use it with --join, or "

@@ -1,16 +1,21 @@
 """Join files: made by an authority, read strictly, and of use to nobody but their owner."""
 
+import errno
 import os
+import shutil
+import socket
 import stat
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import pytest
 
+from dreamfleet.common import authority
 from dreamfleet.common.authority import Authority
 from dreamfleet.common.cli import main
 from dreamfleet.common.credentials import MOST_BYTES, read_join, seat_of_worker, seated
 from dreamfleet.common.errors import AccessError, UsageError
+from dreamfleet.common.handshake import trouble_with
 from dreamfleet.common.ledger import ISSUED, Ledger, Revocations
 
 HERE = ["tls/127.0.0.1:7447"]
@@ -138,3 +143,76 @@ def test_the_verbs_make_list_and_take_back(tmp_path, capsys):
     assert main(["access", "issue", "coordinator", "c", *folder, "--out", f"{out}2"]) == 2
     assert main(["pause", "--join", str(out)]) == 1
     assert "this needs one whose role is operator or coordinator" in capsys.readouterr().err
+
+
+def test_who_listens_is_issued_a_file_by_its_names_alone(tmp_path, capsys):
+    """The first of the five commands in docs/security.md."""
+    folder, out = ("--access-dir", str(tmp_path / "access")), tmp_path / "home.join"
+    assert main(["access", "init", *folder]) == 0
+    assert main(["access", "issue", "coordinator", "home", *folder, "--host", "h.example", "--out", str(out)]) == 0
+    assert (read_join(out).role, read_join(out).connect) == ("coordinator", ())
+    for wrong in ("h.example:7447", "tls/h.example", "", "a b", "a..b"):
+        assert main(["access", "issue", "coordinator", "c", *folder, "--host", wrong, "--out", f"{out}2"]) == 2
+        assert "is no host" in capsys.readouterr().err
+    assert main(["access", "issue", "worker", "w", *folder, "--connect", "tls/[::1]:1", "--out", f"{out}2"]) == 2
+    assert "give a name" in capsys.readouterr().err
+
+
+def test_a_disk_without_room_says_that_nothing_is_taken_back(access, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    before = (access._folder / ISSUED).read_bytes()
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(AccessError, match=r"cannot be written: No space left on device; nothing is changed"):
+        access.revoke("box")
+    assert (access._folder / ISSUED).read_bytes() == before
+
+
+def test_an_authority_whose_parts_are_not_its_own_issues_nothing(tmp_path):
+    def made(name):
+        return Authority.create(tmp_path / name, passwords=True)._folder
+
+    whole, other = made("whole"), made("other")
+    for part, text, why in (
+        ("ca.key", (other / "ca.key").read_text(), "key of another certificate"),
+        (ISSUED, (other / ISSUED).read_text(), "of another authority"),
+        ("secret", "no hex", "damaged"),
+        ("secret", None, "secret is missing"),
+    ):
+        folder = tmp_path / "mixed"
+        shutil.copytree(whole, folder)
+        (folder / part).unlink()
+        if text is not None:
+            (folder / part).write_text(text)
+        with pytest.raises(AccessError, match=why):
+            Authority(folder).issue("worker", "box", tmp_path / "box", connect=HERE)
+        assert not (tmp_path / "box").exists()
+        shutil.rmtree(folder)
+    with (whole / "secret").open("a") as file:
+        file.write("\n")  # as an editor leaves it
+    Authority(whole).issue("coordinator", "home", tmp_path / "home", hosts=["h.example"])
+    assert read_join(tmp_path / "home").secret == (whole / "secret").read_text().strip()
+
+
+def test_an_authority_that_is_made_already_is_left_alone_also_by_who_began_before(tmp_path, monkeypatch):
+    folder = tmp_path / "access"
+    begun = authority._begun
+
+    def late(*args, **more):
+        monkeypatch.setattr(authority, "_begun", begun)
+        Authority.create(folder)
+        return begun(*args, **more)
+
+    monkeypatch.setattr(authority, "_begun", late)
+    with pytest.raises(UsageError, match="holds an authority already"):
+        Authority.create(folder)
+    Authority(folder)
+
+
+@pytest.mark.parametrize(("ca", "host"), [("garbage", "127.0.0.1"), ("gärbage", "127.0.0.1"), ("", "a" * 70)])
+def test_what_is_damaged_is_told_and_no_traceback(join, ca, host):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = f"tls/{host}:{server.getsockname()[1]}"
+        said = trouble_with([endpoint], replace(read_join(join), ca=ca))
+    assert said is None if host != "127.0.0.1" else "this join file is damaged" in str(said)
