@@ -33,7 +33,8 @@ def summary(status: Status) -> tuple[str, dict[str, Any]]:
 def worker_command(network: Network, run: str) -> str:
     """The command that starts a worker of the run, on this host or another."""
     addresses = [_reached(each) for each in network.listen or network.connect]
-    return shlex.join(("dreamfleet", "worker", "--run", run, "--connect", *addresses))
+    join = () if network.credentials is None else ("--join", "FILE")
+    return shlex.join(("dreamfleet", "worker", "--run", run, "--connect", *addresses, *join))
 
 
 def _reached(endpoint: str) -> str:

@@ -42,6 +42,13 @@ class RunRequest:
     start: Start | None = None  # of a new run; it begins with zero parameters otherwise
     credentials: Credentials | None = None
     access_dir: Path = Path("access")  # whose list says what is revoked
+    join: Path | None = None  # where the credentials were read
+
+    @property
+    def again(self) -> str:
+        """The command that goes on with the run, under the same rules."""
+        rules = () if self.join is None else ("--join", self.join, "--access-dir", self.access_dir)
+        return spoken("coordinator", "--resume", self.name, "--runs-dir", self.runs_dir, *rules)
 
 
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
@@ -68,8 +75,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         except ConnectionFailedError as error:
             if request.config is None:
                 raise
-            again = spoken("coordinator", "--resume", request.name, "--runs-dir", request.runs_dir)
-            raise ConnectionFailedError(f"{error}; the run is made, and begins with: {again}") from error
+            raise ConnectionFailedError(f"{error}; the run is made, and begins with: {request.again}") from error
 
 
 def _service(request: RunRequest, custody: Custody, bundle: ServedBundle | None) -> Service:

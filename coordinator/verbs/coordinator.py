@@ -145,7 +145,9 @@ def request_of(
     credentials = joined(args, ("coordinator",))
     network = choose_addresses(own, args.site, kept, credentials)
     Network(network.listen, network.connect, credentials).check_open(insecure=network.insecure)
-    return RunRequest(name, args.runs_dir, config, limits, network, start, credentials, args.site.access_dir)
+    return RunRequest(
+        name, args.runs_dir, config, limits, network, start, credentials, args.site.access_dir, args.site.join
+    )
 
 
 def serve_request(
@@ -223,12 +225,10 @@ def _end_on_signals() -> None:
 def _report(
     args: argparse.Namespace, run: Run, request: RunRequest, outcome: Outcome, *, nothing_new: bool
 ) -> None:  # fmt: skip
-    from dreamfleet.common.processes import spoken
     from dreamfleet.common.runs import CONTROLLER
     from dreamfleet.common.stored import told
 
-    join = () if args.site.join is None else ("--join", args.site.join)
-    again = spoken("coordinator", "--resume", request.name, "--runs-dir", request.runs_dir, *join)
+    again = request.again
     path = request.runs_dir / request.name / CONTROLLER
     controller = path if path.is_file() else None
     facts: dict[str, Any] = {"run": request.name, "ended": run.ended, "controller": controller, "continue": again}

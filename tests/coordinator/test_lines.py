@@ -2,7 +2,9 @@
 
 import dataclasses
 import socket
+from datetime import UTC, datetime
 
+from dreamfleet.common.credentials import Credentials
 from dreamfleet.common.network import Network
 from dreamfleet.common.status import Throughput
 from dreamfleet.coordinator.lines import summary, worker_command
@@ -26,4 +28,7 @@ def test_the_command_names_an_address_that_others_reach():
     )
     everywhere = worker_command(Network(listen=("tcp/0.0.0.0:7448", "tcp/[::]:7449")), "night")
     assert everywhere.endswith(f"--connect tcp/{socket.gethostname()}:7448 tcp/{socket.gethostname()}:7449")
+    who = Credentials("coordinator", 1, "home", datetime.now(UTC), "")
+    secured = Network(listen=("tls/127.0.0.1:7447",), credentials=who)
+    assert worker_command(secured, "night").endswith(" --connect tls/127.0.0.1:7447 --join FILE")
     assert "tcp/router:1" in worker_command(Network(connect=("tcp/router:1",)), "night")
