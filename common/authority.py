@@ -47,7 +47,7 @@ class Authority:
     def __init__(self, folder: Path) -> None:
         """Open it; `AccessError` if there is none, or it is damaged."""
         self._folder = folder
-        if not (folder / _KEY).exists():
+        if not _is_made(folder):
             raise AccessError(
                 f"no authority in {folder}: `dreamfleet access init` makes one, --access-dir names another"
             )
@@ -70,7 +70,7 @@ class Authority:
     @classmethod
     def create(cls, folder: Path, *, passwords: bool = False) -> Authority:
         """A new one; `UsageError` where there is one."""
-        if (folder / _KEY).exists():
+        if _is_made(folder):
             raise UsageError(f"{folder} holds an authority already: name another --access-dir")
         key, now = generate_private_key(SECP256R1()), datetime.now(UTC)
         name = _named(f"dreamfleet {secrets.token_hex(4)}")
@@ -84,7 +84,7 @@ class Authority:
         with told(folder, "--access-dir"):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with told(folder, "--access-dir"), _held(folder):
-            if (folder / _KEY).exists():
+            if _is_made(folder):
                 raise UsageError(f"{folder} holds an authority already: name another --access-dir")
             _write(folder / _CERTIFICATE, pem)
             if passwords:
@@ -166,6 +166,14 @@ class Authority:
             if ledger.authority != authority_of(self._pem):
                 raise AccessError(f"{self._folder / ISSUED} is of another authority: restore the folder")
             yield ledger
+
+
+def _is_made(folder: Path) -> bool:
+    """Whether there is an authority; `AccessError` where that cannot be seen."""
+    try:
+        return (folder / _KEY).exists()
+    except OSError as error:
+        raise AccessError(f"the authority in {folder} cannot be read: {error.strerror}") from error
 
 
 def _held(folder: Path) -> AbstractContextManager[None]:

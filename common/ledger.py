@@ -93,7 +93,11 @@ class Revocations:
         self.barred: frozenset[str] = frozenset()
         if credentials is None:
             return
-        if not self._path.exists():
+        try:
+            there = self._path.exists()
+        except OSError as error:  # what it revoked would stand
+            raise AccessError(f"{self._path} cannot be read: {error.strerror}") from error
+        if not there:
             log.warning("there is no %s: nothing is revoked (--access-dir)", self._path)
         else:
             self._take(time.monotonic())

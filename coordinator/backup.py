@@ -25,7 +25,8 @@ def back_up(source: RunFolder, target: Path) -> None:
     Whatever ends this, one whole copy is left if there was one. `UsageError` for a target that is something else, a
     run that is served from there, or the run itself; `JournalError` where the disk refuses.
     """
-    _check_target(source, target)
+    with _translated(target):
+        _check_target(source, target)
     aside, former = (target.with_name(f".{target.name}.{word}") for word in ("part", "former"))
     with _translated(target), _alone(target):
         _clear(target, aside, former)  # an earlier call may have been killed

@@ -7,6 +7,7 @@ import socket
 import stat
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 
@@ -193,6 +194,22 @@ def test_an_authority_whose_parts_are_not_its_own_issues_nothing(tmp_path):
         file.write("\n")  # as an editor leaves it
     Authority(whole).issue("coordinator", "home", tmp_path / "home", hosts=["h.example"])
     assert read_join(tmp_path / "home").secret == (whole / "secret").read_text().strip()
+
+
+def test_a_folder_that_may_not_be_looked_into_is_told(access, join, tmp_path, monkeypatch):
+    credentials = read_join(join)
+
+    def refused(self, **_):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+
+    monkeypatch.setattr(Path, "stat", refused)
+    for looked in (
+        lambda: Authority(tmp_path),
+        lambda: Authority.create(tmp_path),
+        lambda: Revocations(tmp_path, credentials),
+    ):
+        with pytest.raises(AccessError, match="cannot be read: Permission denied"):
+            looked()
 
 
 def test_an_authority_that_is_made_already_is_left_alone_also_by_who_began_before(tmp_path, monkeypatch):
