@@ -34,7 +34,8 @@ AT_ONCE = ((signal.SIGTERM, 1.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 30.0)
 DRAINING = ((signal.SIGTERM, MOST_DRAIN),)
 LEAST_FREE = 700_000_000  # bytes that an environment takes while it is made
 LONGEST_TAIL = 8192  # bytes of a log in which its last line is looked for
-JOIN, LOG, STATE, WHOLE = "join", "log", "worker.json", "whole"
+JOIN, LOG, STATE, WHOLE, MADE = "join", "log", "worker.json", "whole", "made"
+FOLDERS = ("environments", "workers", "cache")  # under the root
 JOIN_HERE = "{join}"  # a word that stands for the join file's path
 _HEAD = re.compile(r"^\S+ \S+ [A-Z]+ dreamfleet[\w.]*: |^dreamfleet: ")  # of a line of the log, or of a last word
 _RECORD = re.compile(rb"(?m)^(\d{4}-\S+ \S+ [A-Z]+ dreamfleet|\{)")  # a line of its log, as text or JSON
@@ -99,6 +100,11 @@ class Place:
         """Variables that keep what others would leave in the user's home in here, too."""
         return {"DREAMFLEET_CACHE": str(self.root / "cache"), "XDG_CACHE_HOME": str(self.root / "cache")}
 
+    @property
+    def ours(self) -> bool:
+        """Whether a command of ours has worked here: else what has our folders' names is somebody's own."""
+        return (self.root / MADE).exists() or any(self.root.glob(f"workers/*/{STATE}"))
+
     def environment(self, name: str) -> Path:
         """Where an environment lies; it is whole when it holds `WHOLE`."""
         return self.root / "environments" / name
@@ -136,10 +142,10 @@ class Place:
         """Leave nothing behind; a folder with other things in it stays, with these."""
         made = [self.root]
         with suppress(FileNotFoundError):
-            made = [Path(each) for each in json.loads((self.root / "made").read_text())]
-        for name in ("environments", "workers", "cache"):
+            made = [Path(each) for each in json.loads((self.root / MADE).read_text())]
+        for name in FOLDERS:
             shutil.rmtree(self.root / name, ignore_errors=True)
-        for name in ("made", "lock"):
+        for name in (MADE, "lock"):
             (self.root / name).unlink(missing_ok=True)
         for folder in made:
             with suppress(OSError):
@@ -147,9 +153,11 @@ class Place:
 
     def _make(self) -> None:
         missing = [each for each in (self.root, *self.root.parents) if not each.exists()]
+        if not self.ours and (strange := [each for each in FOLDERS if (self.root / each).exists()]):
+            raise FailedError(f"{self.root} holds {strange[0]} of something else: name another --remote-dir")
         self.root.mkdir(parents=True, exist_ok=True)
-        if missing:
-            (self.root / "made").write_text(json.dumps([str(each) for each in missing]))
+        if missing or not (self.root / MADE).exists():
+            (self.root / MADE).write_text(json.dumps([str(each) for each in missing]))
 
     def _take(self, lock: int) -> None:
         said = False
@@ -391,7 +399,7 @@ def follow(question: dict[str, Any], line: Line) -> dict[str, Any]:
 def end(question: dict[str, Any], line: Line) -> dict[str, Any]:
     """End one worker, or all, with what belongs to them; unless told to keep it, the rest too when none is left."""
     place, ended = Place(question["root"], line), list[dict[str, Any]]()
-    if not place.root.exists():
+    if not place.ours:
         return {"ended": ended}
     with place.locked():
         for name in question["names"] or place.names("workers"):

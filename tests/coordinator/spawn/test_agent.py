@@ -31,6 +31,28 @@ def test_who_removed_the_folder_that_is_waited_for_is_followed(tmp_path, monkeyp
         assert (place.root / "lock").exists()
 
 
+def test_a_folder_that_is_somebodys_own_is_left_alone(tmp_path, capsys):
+    kept = [tmp_path / "cache" / "a", tmp_path / "workers" / "mine" / "b", tmp_path / "environments" / "c"]
+    for path in kept:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    agent.obey({"do": "end", "root": str(tmp_path), "names": None, "now": False, "keep": False}, Line())
+    assert '"ok"' in capsys.readouterr().out
+    agent.obey({"do": "start", "root": str(tmp_path), "name": "box"}, Line())
+    assert "of something else: name another --remote-dir" in capsys.readouterr().out
+    assert all(path.exists() for path in kept)
+
+
+def test_a_folder_that_was_there_stays_and_what_else_is_in_it(tmp_path):
+    place = Place(str(tmp_path), Line())
+    (tmp_path / "notes").touch()
+    with place.locked():
+        (tmp_path / "cache").mkdir()
+    with place.locked():
+        place.remove()
+    assert [path.name for path in tmp_path.iterdir()] == ["notes"]
+
+
 @pytest.mark.parametrize("there", [True, False])
 def test_an_environment_whose_python_is_gone_is_none(tmp_path, there):
     folder = tmp_path / "environments" / "one"
