@@ -166,6 +166,8 @@ def _fit(hint: Any, value: Any, where: str) -> Any:
 def _parse(hint: Any, text: str, where: str) -> Any:
     """Text of an environment variable or a flag as the field's type."""
     base = _base(hint)
+    if base is Path and base is not hint and not text:
+        return None  # as where nothing is said: an empty path would be the folder that one is in
     if get_origin(base) is tuple:
         return tuple(part for part in text.split(",") if part)
     if base is bool and text in ("true", "false"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from datetime import datetime
 from importlib.util import find_spec
 
@@ -27,6 +28,7 @@ def run(args: argparse.Namespace) -> int:
         if find_spec(package) is None:  # said now rather than after minutes of evolution
             raise ModuleNotFoundError(name=package)
     config = load(DemoConfig, "demo", **args.sources)
+    os.environ["DREAMFLEET_JOIN"] = ""  # of what is begun here nothing leaves this host, whatever fleet it is of
     name = args.run_name or f"demo-{datetime.now():%m%d-%H%M%S}"
     Demo(config, name, args.runs_dir).play()
     return 0

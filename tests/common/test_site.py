@@ -1,6 +1,7 @@
 """What every verb knows of its surroundings: from the top of a file, the environment and flags, in this order."""
 
 from argparse import ArgumentParser
+from pathlib import Path
 
 import pytest
 
@@ -48,6 +49,13 @@ def test_file_environment_and_flags_in_this_order(tmp_path):
     assert args.log_level == "error"
     assert {"runs_dir"} <= args.given
     assert args.sources["file"]["worker"] == {"slots": 3}
+
+
+def test_an_empty_variable_takes_back_the_join_file_that_the_file_names(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text('join = "lab.join"\n')
+    assert settled("--config", str(path)).site.join == Path("lab.join")
+    assert settled("--config", str(path), environment={"DREAMFLEET_JOIN": ""}).site.join is None
 
 
 def test_the_file_can_be_named_in_the_environment(tmp_path):

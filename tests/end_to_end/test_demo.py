@@ -1,13 +1,15 @@
 """The demonstration, seconds long."""
 
+import os
 import signal
 from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.cli import main
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.runs import open_run
-from dreamfleet.coordinator.demo import DemoConfig, median_drive, stages
+from dreamfleet.coordinator.demo import Demo, DemoConfig, median_drive, stages
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -62,6 +64,14 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         assert (processes.runs / made).stat().st_size > 1000
     assert "evolving in the dream" in out
     assert "the dashboard is at http://127.0.0.1:" in out
+
+
+def test_what_it_begins_is_of_no_other_fleet(monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_JOIN", "of-another-fleet.join")
+    monkeypatch.setattr(Demo, "play", lambda _: joins.append(os.environ["DREAMFLEET_JOIN"]))
+    joins = []
+    assert main(["demo"]) == 0
+    assert joins == [""]
 
 
 def test_without_the_page_none_is_begun(processes, random_bundle):
