@@ -51,6 +51,7 @@ def test_the_hint_of_a_run_that_was_left_is_a_whole_command_with_its_limits_and_
         assert json.loads(run.fact("network")) == {"listen": [processes.endpoint], "beat": 0.2, "strict": True}
 
 
+@pytest.mark.slow
 def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept(processes, settings):
     stopped(processes, settings, "--generations", 60, "--minutes", 30)
     elsewhere = f"tcp/127.0.0.1:{free_port()}"

@@ -64,6 +64,7 @@ def resume(processes, name, *flags):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(processes, begin):
     coordinator = begin("calm")
     worker = processes.worker("--task", tasks.TOY, "--run", "calm")

@@ -87,6 +87,7 @@ def test_every_verb_drives_as_the_run_does(processes, random_bundle, evolve):
             assert not (drive["action"][:, 1] * drive["action"][:, 2]).any(), "nobody brakes on the gas"
 
 
+@pytest.mark.slow
 def test_a_run_begins_from_a_controller_that_drives_alike_alone(processes, random_bundle, evolve):
     evolve("one", "--variant", "pedals=one")
     runs = ("--runs-dir", processes.runs)
