@@ -76,8 +76,8 @@ def read_file(path: Path | None) -> dict[str, Any]:
 def settle(args: argparse.Namespace, environment: Mapping[str, str] = os.environ) -> None:
     """Complete parsed arguments from the file and the environment, and set how much is logged.
 
-    Afterwards `args` has every field of `SiteConfig`, `site` itself, `sources` for `config.load` of a verb's own
-    sections, and `given`: the names that flags gave.
+    Afterwards `args` has `site`, where the fleet is said to be (`reached` knows where it is by default), `sources` for
+    `config.load` of a verb's own sections, and `given`: the names that flags gave.
     """
     given = frozenset(vars(args))
     path = args.config or (Path(environment[f"{PREFIX}CONFIG"]) if environment.get(f"{PREFIX}CONFIG") else None)
@@ -86,8 +86,7 @@ def settle(args: argparse.Namespace, environment: Mapping[str, str] = os.environ
     site = load(SiteConfig, "", flags=args, environment=environment, file=file)
     args.sources = {"flags": argparse.Namespace(**vars(args)), "environment": environment, "file": file}
     args.given, args.site = given, site
-    args.connect, args.listen = site.connect or (DEFAULT_ENDPOINT,), site.listen
-    args.runs_dir, args.log_level = site.runs_dir, site.log_level
+    args.listen, args.runs_dir, args.log_level = site.listen, site.runs_dir, site.log_level
     logging.getLogger("dreamfleet").setLevel(site.log_level.upper())
     choose_format(site.log_format)
 

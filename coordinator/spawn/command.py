@@ -6,7 +6,6 @@ import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 from dreamfleet.common.config import add_flags
 from dreamfleet.common.credentials import MOST_BYTES
@@ -14,7 +13,7 @@ from dreamfleet.common.eta import duration
 from dreamfleet.common.files import read_regular
 from dreamfleet.common.listing import add_json, print_rows
 from dreamfleet.common.printable import one_line, printable
-from dreamfleet.common.site import joined, offer
+from dreamfleet.common.site import offer, reached
 from dreamfleet.coordinator.spawn.config import Host, SpawnConfig
 from dreamfleet.coordinator.spawn.many import bring_up, look
 from dreamfleet.coordinator.spawn.visit import FAILED, Reach, Row
@@ -43,9 +42,9 @@ def run(args: argparse.Namespace, hosts: Sequence[Host]) -> int:
 
 def _reach(args: argparse.Namespace) -> Reach:
     """Endpoints that were given, a worker's join file for all hosts, or by default this host's own."""
-    join: Path | None = args.site.join
-    if joined(args, ("worker",)) is None or join is None:
-        return Reach(args.connect)
+    network, join = reached(args, "worker"), args.site.join
+    if join is None:
+        return Reach(network.connect)
     return Reach(args.site.connect, read_regular(join, MOST_BYTES))
 
 

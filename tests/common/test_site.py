@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.site import offer, offer_everywhere, settle
+from dreamfleet.common.site import offer, offer_everywhere, reached, settle
 
 FILE = """
 connect = ["tcp/file:1"]
@@ -33,7 +33,7 @@ def settled(*words, environment=None):
 
 def test_defaults_stand_alone():
     args = settled()
-    assert (args.connect, args.listen, str(args.runs_dir)) == (("tcp/127.0.0.1:7447",), (), "runs")
+    assert (reached(args).connect, args.listen, str(args.runs_dir)) == (("tcp/127.0.0.1:7447",), (), "runs")
     assert args.given == {"config"}
 
 
@@ -43,7 +43,7 @@ def test_file_environment_and_flags_in_this_order(tmp_path):
     environment = {"DREAMFLEET_CONNECT": "tcp/environment:1,tcp/other:2", "DREAMFLEET_RUNS_DIR": "/from/environment"}
     flags = ("--config", path, "--runs-dir", "/from/flag")
     args = settled(*map(str, flags), environment=environment)
-    assert args.connect == ("tcp/environment:1", "tcp/other:2")
+    assert args.site.connect == ("tcp/environment:1", "tcp/other:2")
     assert args.listen == ("tcp/0.0.0.0:1",)
     assert str(args.runs_dir) == "/from/flag"
     assert args.log_level == "error"
@@ -61,7 +61,7 @@ def test_an_empty_variable_takes_back_the_join_file_that_the_file_names(tmp_path
 def test_the_file_can_be_named_in_the_environment(tmp_path):
     path = tmp_path / "fleet.toml"
     path.write_text(FILE)
-    assert settled(environment={"DREAMFLEET_CONFIG": str(path)}).connect == ("tcp/file:1",)
+    assert settled(environment={"DREAMFLEET_CONFIG": str(path)}).site.connect == ("tcp/file:1",)
 
 
 def test_quiet_logs_warnings_alone():
