@@ -43,6 +43,10 @@ class ConnectionFailedError(DreamfleetError):
     """Nobody answered over Zenoh, or the address cannot be listened on."""
 
 
+class NotLetInError(ConnectionFailedError):
+    """Somebody listens there and does not let this side in; the text says why."""
+
+
 class AccessError(DreamfleetError):
     """A join file or an authority's folder is missing, damaged, expired, or of another role than is needed."""
 

@@ -1,4 +1,4 @@
-"""Why a secured router does not let somebody in, in words: Zenoh says only that nobody could be reached."""
+"""Why a router does not let somebody in, in words: Zenoh says only that nobody could be reached."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from dreamfleet.common.credentials import Credentials
 PATIENCE = 2.0  # seconds
 
 
-def trouble_with(endpoints: Iterable[str], credentials: Credentials) -> str | None:
-    """What is wrong at the first endpoint where somebody listens; `None` if nobody does."""
+def trouble_with(endpoints: Iterable[str], credentials: Credentials | None) -> str | None:
+    """What is wrong at the first endpoint where somebody listens who did not let this side in; `None` if unknown."""
     for endpoint in endpoints:
         host, _, port = endpoint.partition("/")[2].rpartition(":")
         try:
@@ -20,10 +20,26 @@ def trouble_with(endpoints: Iterable[str], credentials: Credentials) -> str | No
         except (OSError, ValueError):  # a name that no host can have
             continue
         with link:
-            return (
-                f"{endpoint} lets {credentials.identity} ({credentials.name}) not in: {_said(link, host, credentials)}"
-            )
+            if credentials is not None:
+                why = _said(link, host, credentials)
+                return f"{endpoint} lets {credentials.identity} ({credentials.name}) not in: {why}"
+            if _speaks_tls(link):
+                return (
+                    f"{endpoint} speaks TLS: who joins its fleet has a join file; have one issued (`dreamfleet access "
+                    "issue`), and give --join FILE, which says where to connect, for --connect"
+                )
     return None
+
+
+def _speaks_tls(link: socket.socket) -> bool:
+    """Whether the other side is a TLS server, whoever's."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    try:
+        with context.wrap_socket(link):
+            return True
+    except (OSError, ValueError):
+        return False
 
 
 def _said(link: socket.socket, host: str, credentials: Credentials) -> str:
@@ -42,5 +58,7 @@ def _said(link: socket.socket, host: str, credentials: Credentials) -> str:
             f"its certificate is not good here ({error.verify_message.rstrip('.')}): it is another fleet's, has "
             "expired, or was issued without --host for this name; have the coordinator's join file issued again"
         )
+    except TimeoutError:  # an unsecured router waits for the rest of what it takes for a message
+        return "it answers nothing to TLS: its coordinator was started without --join, or it is too busy for now"
     except (OSError, ValueError):
-        return "it speaks no TLS: its coordinator was started without --join"
+        return "it speaks no TLS: its coordinator was started without --join, or another program has the port"

@@ -68,7 +68,7 @@ def _lookers() -> Iterator[dict[str, Any]]:
 
 
 def _workers() -> Iterator[dict[str, Any]]:
-    """What all workers have in common: they look for a run, fetch its world model, and see its coordinator."""
+    """What all workers have in common: they ask how runs are, fetch the world model, and see who coordinates."""
     yield _rule("work", (IN,), ("query", "liveliness_query", "declare_liveliness_subscriber"),
                 (_STATUS[0], _BUNDLE, _COORDINATORS))  # fmt: skip
     yield _rule("worked", (OUT,), ("reply", "declare_queryable", "liveliness_token", "declare_subscriber"),

@@ -21,10 +21,10 @@ import zenoh
 
 from dreamfleet.common.credentials import SEATS, Credentials, identity, password_of
 from dreamfleet.common.descriptors import room_for_connections
-from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
+from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, NotLetInError
 from dreamfleet.common.gate import guard
 from dreamfleet.common.handshake import trouble_with
-from dreamfleet.common.network import Network, check_endpoint
+from dreamfleet.common.network import SECURED, Network, check_endpoint
 from dreamfleet.common.rules import access_control
 
 ATTEMPT = 3.0  # seconds that a link may take to open: TLS takes four round trips and more
@@ -43,6 +43,8 @@ __all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_sessio
 
 def open_session(network: Network, *, timeout: float | None = ATTEMPT) -> zenoh.Session:
     """A router where `network.listen` is given, else a client; `ConnectionFailedError` after `timeout` seconds.
+
+    It is a `NotLetInError` where somebody listens who does not let this side in, and can be seen to.
 
     Once open, a client reconnects by itself for ever, at any of its addresses. Zenoh's own first attempt never leaves
     the first one, and blocks in native code where no signal is heard: so whoever wants to wait calls again, and the one
@@ -87,7 +89,7 @@ def _open(network: Network, begin: Callable[[], zenoh.Session]) -> zenoh.Session
     except zenoh.ZError as error:
         if "os error 24" in str(error):
             raise DreamfleetError(_NO_ROOM.format(_first_line(error))) from error
-        raise ConnectionFailedError(_explain(network, error)) from error
+        raise _explained(network, error) from error
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # Zenoh's own threads or descriptors, of which there are none left
             raise
@@ -180,17 +182,20 @@ def _dictionary(network: Network) -> Iterator[str | None]:
         yield str(path)
 
 
-def _explain(network: Network, error: zenoh.ZError) -> str:
+def _explained(network: Network, error: zenoh.ZError) -> ConnectionFailedError:
+    protocol = "tcp/" if network.credentials is None else SECURED
     if "Address already in use" in str(error) or "os error 98" in str(error):
-        taken = ", ".join(network.listen)
-        return f"{taken} is in use: stop what listens there, or choose another with --listen tcp/127.0.0.1:PORT"
-    if network.listen:
-        return f"cannot listen on {', '.join(network.listen)}: {_first_line(error)}"
-    if network.credentials is not None and (found := trouble_with(network.connect, network.credentials)):
-        return found
-    return (
+        return ConnectionFailedError(
+            f"{', '.join(network.listen)} is in use: stop what listens there, or choose another with --listen "
+            f"{protocol}127.0.0.1:PORT"
+        )
+    if network.listen and "Unable to connect" not in str(error):
+        return ConnectionFailedError(f"cannot listen on {', '.join(network.listen)}: {_first_line(error)}")
+    if found := trouble_with(network.connect, network.credentials):
+        return NotLetInError(found)
+    return ConnectionFailedError(
         f"nobody answers at {', '.join(network.connect)}: start `dreamfleet coordinator` or `dreamfleet router` "
-        "there, or name another address with --connect tcp/HOST:PORT"
+        f"there, or name another address with --connect {protocol}HOST:PORT"
     )
 
 

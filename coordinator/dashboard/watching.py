@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from dreamfleet.common import keys
 from dreamfleet.common.client import Client
 from dreamfleet.common.codec import MalformedError, from_plain
-from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
+from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, NotLetInError
 from dreamfleet.common.fields import known
 from dreamfleet.common.network import Network
 from dreamfleet.common.printable import shortened
@@ -70,7 +70,7 @@ class Watcher:
         self._client: Client | None = None
         self._farewells: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._followed: dict[str, _Followed] = {}
-        self._trouble = ""  # what the last look could not read
+        self._trouble = ""  # what the last look could not read, or why it is not let in
 
     def look(self) -> Picture:
         """Ask, and tell. Never raises for what comes over the wire."""
@@ -103,10 +103,10 @@ class Watcher:
                 heard = enqueue_into(self._farewells, "status", most=MOST_RUNS)
                 self._client.session.declare_subscriber(keys.event_status("*"), heard)
             found = self._client.statuses(ANSWER)
-        except ConnectionFailedError:
-            return {}
-        except MalformedError as error:
+        except (NotLetInError, MalformedError) as error:
             self._trouble = str(error)
+            return {}
+        except ConnectionFailedError:
             return {}
         named = {str(document.get("run")): document for document in found}
         return {name: named[name] for name in sorted(named)[:MOST_RUNS] if self._only in (None, name)}

@@ -1,6 +1,7 @@
 """A fleet with join files: who is let in, who may do what, and that a run is none the worse for the others."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -12,15 +13,19 @@ from dreamfleet.common import keys
 from dreamfleet.common.client import Client
 from dreamfleet.common.codec import encode, encode_json
 from dreamfleet.common.credentials import read_join
-from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.errors import ConnectionFailedError, NotLetInError
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.session import MAX_PASSED, Network, open_session
+from dreamfleet.coordinator.dashboard.watching import Watcher
 from dreamfleet.worker.service.admission import make_request
+from dreamfleet.worker.service.config import WorkerConfig
+from dreamfleet.worker.service.worker import Worker
 from tests.support import tasks
 from tests.support.access import PATIENCE, Access, begin, until, work
 from tests.support.processes import free_port
 from tests.support.relay import Relay
 from tests.support.samples import MSGPACK
+from tests.support.stage import drained, listening, wait_for
 
 LIFE = "0badc0de"
 
@@ -119,8 +124,34 @@ def test_who_is_not_of_the_fleet_is_not_let_in_and_is_told_why(access, endpoint,
                 open_session(Network(connect=(where,), credentials=credentials), timeout=1)
             assert why in str(refused.value), who
         open_session(Network(connect=(endpoint,), credentials=good)).close()
-        with pytest.raises(ConnectionFailedError):
-            open_session(Network(connect=(endpoint.replace("tls", "tcp"),)), timeout=1)
+        plain = Network(connect=(endpoint.replace("tls", "tcp"),))
+        with pytest.raises(NotLetInError, match=r"speaks TLS.* give --join FILE"):
+            open_session(plain, timeout=1)
+        assert b"speaks TLS" in Watcher(plain, None, tmp_path).look().absent
+
+
+def test_a_worker_that_is_not_let_in_says_why_once_and_tries_again(access, endpoint, tmp_path):
+    plain, other = Network(connect=(endpoint.replace("tls", "tcp"),)), Access(tmp_path / "other")
+    with open_session(Network(listen=(endpoint,), credentials=read_join(access.path("coordinator")))):
+        workers = [Worker(WorkerConfig(slots=1), each) for each in (plain, other.network("first", endpoint))]
+        with listening() as said, ThreadPoolExecutor() as threads:
+            serving = [threads.submit(each.serve) for each in workers]
+            lines = [wait_for(said, "trying again") for _ in workers]
+            for each in workers:
+                each.stop()
+        assert sum("speaks TLS" in line for line in lines) == sum("another fleet's" in line for line in lines) == 1
+        assert not [line for line in drained(said) if "trying again" in line]
+        assert [each.result() for each in serving] == [None, None]
+
+
+def test_a_plain_port_that_a_join_file_names_is_told_from_one_where_nobody_is(access):
+    plain, nobody = f"127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
+    served = open_session(Network(listen=(f"tcp/{plain}",)))
+    with served, pytest.raises(NotLetInError, match="started without --join"):
+        open_session(access.network("viewer", f"tls/{plain}"), timeout=1)
+    linked = Network((f"tls/{plain}",), (f"tls/{nobody}",), read_join(access.path("coordinator")))
+    with pytest.raises(ConnectionFailedError, match=f"nobody answers at tls/{nobody}"):
+        open_session(linked, timeout=1)
 
 
 def test_a_link_of_half_a_second_to_and_fro_lets_a_worker_in(processes, access, endpoint):

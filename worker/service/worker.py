@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import queue
 import random
+from collections import Counter
 from contextlib import ExitStack
 from dataclasses import replace
 from time import monotonic
@@ -17,7 +18,7 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.cores import cores
 from dreamfleet.common.credentials import seated
-from dreamfleet.common.errors import ConnectionFailedError, DownloadError, RefusedError
+from dreamfleet.common.errors import ConnectionFailedError, DownloadError, NotLetInError, RefusedError
 from dreamfleet.common.session import Network, open_session
 from dreamfleet.common.store import BundleStore, default_cache
 from dreamfleet.worker.service.admission import Admission, ask, make_request, neediest
@@ -73,15 +74,18 @@ class Worker:
 
     def _startup(self) -> zenoh.Session | None:
         """A session, however long the router takes to come up; `None` if it shall leave meanwhile."""
-        said = False
+        times: Counter[str] = Counter()
         while not self._leaving():
             try:
                 return open_session(self._network)
+            except NotLetInError as error:
+                why, telling = f"{error}; trying again", 2  # a coordinator that has just come up lets it in next time
             except ConnectionFailedError:
-                if not said:
-                    log.warning("waiting for a coordinator at %s", ", ".join(self._network.connect))
-                said = True
-                self._pause()
+                why, telling = f"waiting for a coordinator at {', '.join(self._network.connect)}", 1
+            times[why] += 1
+            if times[why] == telling:
+                log.warning("%s", why)
+            self._pause()
         return None
 
     def _main_loop(self, session: zenoh.Session) -> None:
@@ -123,7 +127,9 @@ class Worker:
             if admission is not None:
                 return admission
             if not said and not self._refusals.standing(monotonic()):
-                log.warning("waiting for %s", f"run {self._config.run}" if self._config.run else "a run")
+                awaited = f"run {self._config.run}" if self._config.run else "a run"
+                barred = "; if it is served already, this join file was revoked" if self._network.credentials else ""
+                log.warning("waiting for %s%s", awaited, barred)
             said = True
             self._pause()
         return None
