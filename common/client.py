@@ -175,8 +175,11 @@ class Client:
             if offset >= document["total"] or not document[part]:
                 return
 
-    def control(self, run: str, verb: str) -> None:
-        """Ask the coordinator to `pause`, `resume`, `drain` or `stop`; `RefusedError` says why it does not."""
+    def control(self, run: str, verb: str) -> str:
+        """Ask the coordinator to `pause`, `resume`, `drain` or `stop`; `RefusedError` says why it does not.
+
+        The command that continues the run on its host, if it is left now and its coordinator says so.
+        """
         for reply in self.session.get(keys.control(keys.check_run_name(run), verb), timeout=QUERY_TIMEOUT):
             if reply.ok is not None:
                 try:
@@ -188,7 +191,7 @@ class Client:
                     ) from error
                 if not answer.accepted:
                     raise RefusedError(answer.why)
-                return
+                return answer.again
         raise self._nobody(f"run {run!r}")
 
     def _controller_part(self, run: str, offset: int) -> dict[str, Any]:

@@ -170,7 +170,9 @@ def _ended(status: Status) -> str:
 
 
 def _left(status: Status) -> str:
-    return f"its coordinator left; `dreamfleet coordinator --resume {status.run}` goes on"
+    return (
+        f"its coordinator left; `dreamfleet coordinator --resume {status.run}` goes on (its log has the whole command)"
+    )
 
 
 SENTENCES: dict[str, Callable[[Status], str]] = {

@@ -381,6 +381,7 @@ class ControlReply:
     run: Word
     accepted: bool
     why: Text
+    again: Text = field(default="", metadata=OPTIONAL)  # the command that continues a run which is left
 
 
 WIRE: tuple[type[Message], ...] = (JobBatch, ResultBatch, Beat, BundlePart, UploadPart, ViewFrame)

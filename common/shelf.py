@@ -9,6 +9,7 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, ControllerError, JournalError, UsageError
 from dreamfleet.common.files import is_file, is_there
+from dreamfleet.common.processes import spoken
 from dreamfleet.common.runs import BUNDLE, CONTROLLER, JOURNAL, open_run
 from dreamfleet.common.store import BundleStore, default_cache, find_bundle, pretrained
 from dreamfleet.common.subspace import Subspace
@@ -39,7 +40,7 @@ def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Pa
     if is_file(run / JOURNAL):
         raise ControllerError(
             f"run {name} has no controller yet: it is written as the first generation is closed; an older run's is "
-            f"written once it is continued: dreamfleet coordinator --resume {name}"
+            f"written once it is continued: {spoken('coordinator', '--resume', name, '--runs-dir', runs_dir)}"
         )
     names = ", ".join(sorted(each.stem for each in pretrained().glob("*.npz"))) or "none"
     raise ControllerError(f"no controller {name!r}: give a file, a run, or one that ships: {names}")

@@ -15,7 +15,6 @@ from pathlib import Path
 from tempfile import gettempdir
 
 from dreamfleet.common.errors import DreamfleetError, JournalError
-from dreamfleet.common.processes import spoken
 from dreamfleet.common.runs import JOURNAL
 from dreamfleet.coordinator.journal import Journal, beside
 from dreamfleet.coordinator.served import ServedBundle
@@ -31,7 +30,9 @@ Identity = tuple[int, int]
 class Custody:
     """The files of one coordinator's life: its folder, its journal and that one's log, its bundle. Close it."""
 
-    def __init__(self, journal: Journal, bundle: ServedBundle | None) -> None:
+    def __init__(self, journal: Journal, bundle: ServedBundle | None, again: Callable[[Path], str]) -> None:
+        """`again` is the command that goes on with the run in a folder."""
+        self._again = again
         self._journal = journal
         self._bundle = bundle
         self._folder = journal.path.parent
@@ -39,6 +40,11 @@ class Custody:
         self._of_folder = identity(self._folder)
         self._own: dict[str, Identity | None] = {JOURNAL: identity(journal.path)}
         self._next = float("-inf")
+
+    @property
+    def command(self) -> str:
+        """What continues the run once its coordinator has left."""
+        return self._again(self._folder)
 
     def close(self) -> None:
         """Let go of the folder."""
@@ -68,7 +74,7 @@ class Custody:
         if folder is not None and folder != self._folder and self._whole(folder):
             raise JournalError(
                 f"the run's folder was moved to {folder} while it was served: nothing is lost; go on with: "
-                f"{_again(folder)}"
+                f"{self._again(folder)}"
             )
         raise JournalError(self._rescue(folder))
 
@@ -115,12 +121,12 @@ class Custody:
             clear = f"rm {left} && " if left else ""
             return (
                 f"{target} was replaced while it was served: what lies there now is left as it is, what the run had "
-                f"written is in {copy}; go on with: {clear}mv {copy} {target} && {_again(folder)}"
+                f"written is in {copy}; go on with: {clear}mv {copy} {target} && {self._again(folder)}"
             )
         copy.replace(target)
         return (
             f"{target} or its write-ahead log was removed or overwritten while it was served: rescued to the last "
-            f"result as {target}; go on with: {_again(folder)}"
+            f"result as {target}; go on with: {self._again(folder)}"
         )
 
     def _rescue_beside(self, parent: Path) -> str:
@@ -132,7 +138,7 @@ class Custody:
             self._bundle.put_back(folder)
         return (
             f"{self._folder} was removed while it was served: rescued to the last result as {folder / JOURNAL}; go on "
-            f"with: {_again(folder)}"
+            f"with: {self._again(folder)}"
         )
 
     def _restore_bundle(self) -> None:
@@ -162,7 +168,3 @@ def free(path: Path) -> Path:
         number += 1
         found = path.with_name(f"{path.stem}-{number}{path.suffix}")
     return found
-
-
-def _again(folder: Path) -> str:
-    return spoken("coordinator", "--resume", folder.name, "--runs-dir", folder.parent)

@@ -203,7 +203,7 @@ class Demo:
             spoken("replay", folder.name, "--candidate", "0/0", "--runs-dir", self._runs_dir),
             spoken("evaluate", "--controller", controller, "--episodes", 100),
             spoken("coordinator", "--run", "mine", "--preset", "frugal", "--listen", self._endpoint)
-            + "   # and, on any host: dreamfleet worker --connect tcp/HOST:PORT",
+            + f"   # and beside it: {spoken('worker', '--connect', self._endpoint)}",
         ):
             self._console.print(f"  {command}", style="green", highlight=False, soft_wrap=True, markup=False)
 

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.config import Table, read_table
 from dreamfleet.common.credentials import Credentials
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT
+from dreamfleet.common.processes import spoken
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.site import SiteConfig
 from dreamfleet.coordinator.config import LimitsConfig, NetworkConfig
@@ -57,6 +59,13 @@ def choose_addresses(
         connect = site.connect or (credentials.connect if credentials else ())
     default = DEFAULT_ENDPOINT if credentials is None else SECURED_ENDPOINT
     return replace(own, listen=listen or (() if connect else (default,)), connect=connect)
+
+
+def again(folder: Path, join: object = None, access_dir: Path = SiteConfig.access_dir) -> str:
+    """The command that continues the run in `folder`, as a person writes it: what is not kept with the run is said."""
+    joined = () if join is None else ("--join", join)
+    access = () if access_dir == SiteConfig.access_dir else ("--access-dir", access_dir)
+    return spoken("coordinator", "--resume", folder.name, "--runs-dir", folder.parent, *joined, *access)
 
 
 def settle_strict(network: NetworkConfig, *, said: bool) -> NetworkConfig:

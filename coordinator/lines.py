@@ -31,10 +31,11 @@ def summary(status: Status) -> tuple[str, dict[str, Any]]:
 
 
 def worker_command(network: Network, run: str) -> str:
-    """The command that starts a worker of the run, on this host or another."""
+    """The command that starts a worker of the run, on this host or another; a worker's join file says where itself."""
+    if network.credentials is not None:
+        return shlex.join(("dreamfleet", "worker", "--run", run, "--join", "FILE"))
     addresses = [_reached(each) for each in network.listen or network.connect]
-    join = () if network.credentials is None else ("--join", "FILE")
-    return shlex.join(("dreamfleet", "worker", "--run", run, "--connect", *addresses, *join))
+    return shlex.join(("dreamfleet", "worker", "--run", run, "--connect", *addresses))
 
 
 def _reached(endpoint: str) -> str:

@@ -14,16 +14,16 @@ from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageE
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.ledger import Revocations
 from dreamfleet.common.messages import Intervals
-from dreamfleet.common.processes import spoken
 from dreamfleet.common.runs import ARCHIVE, BUNDLE, JOURNAL, open_run, run_lock
 from dreamfleet.common.session import Network
+from dreamfleet.common.site import SiteConfig
 from dreamfleet.common.store import find_bundle
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.coordinator.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.custody import Custody
 from dreamfleet.coordinator.fleet import Fleet
 from dreamfleet.coordinator.journal import Journal
-from dreamfleet.coordinator.kept import facts_of
+from dreamfleet.coordinator.kept import again, facts_of
 from dreamfleet.coordinator.run import Run
 from dreamfleet.coordinator.served import ServedBundle
 from dreamfleet.coordinator.service import Service
@@ -41,19 +41,22 @@ class RunRequest:
     network: NetworkConfig
     start: Start | None = None  # of a new run; it begins with zero parameters otherwise
     credentials: Credentials | None = None
-    access_dir: Path = Path("access")  # whose list says what is revoked
-    join: Path | None = None  # where the credentials were read
+    join: Path | None = None  # the file of the credentials
+    access_dir: Path = SiteConfig.access_dir  # whose list says what is revoked
 
     @property
-    def again(self) -> str:
-        """The command that goes on with the run, under the same rules."""
-        rules = () if self.join is None else ("--join", self.join, "--access-dir", self.access_dir)
-        return spoken("coordinator", "--resume", self.name, "--runs-dir", self.runs_dir, *rules)
+    def folder(self) -> Path:
+        """Where the run lies."""
+        return self.runs_dir / check_run_name(self.name)
+
+    def again(self, folder: Path | None = None) -> str:
+        """The command that continues the run, also in a `folder` that it was moved to."""
+        return again(folder or self.folder, self.join, self.access_dir)
 
 
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
     """Serve a new or continued run until it ends or is stopped; `on_stoppable` is handed the way to stop it."""
-    folder = request.runs_dir / check_run_name(request.name)
+    folder = request.folder
     if request.config is not None and request.name == ARCHIVE:
         raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
     settings, bundle = _settle(request, folder)
@@ -66,7 +69,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
     with run_lock(folder), ExitStack() as stack:
         journal = stack.enter_context(closing(_open(request, folder, settings, bundle)))
         served = stack.enter_context(closing(ServedBundle(folder / BUNDLE))) if bundle else None
-        custody = stack.enter_context(closing(Custody(journal, served)))
+        custody = stack.enter_context(closing(Custody(journal, served, request.again)))
         service = _service(request, custody, served)
         on_stoppable(service.stop)
         fleet, strict = Fleet(request.network.beat, request.network.evaluation_share), request.network.strict
@@ -75,7 +78,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         except ConnectionFailedError as error:
             if request.config is None:
                 raise
-            raise ConnectionFailedError(f"{error}; the run is made, and begins with: {request.again}") from error
+            raise ConnectionFailedError(f"{error}; the run is made, and begins with: {request.again()}") from error
 
 
 def _service(request: RunRequest, custody: Custody, bundle: ServedBundle | None) -> Service:

@@ -16,6 +16,7 @@ from dreamfleet.common.printable import shortened
 from dreamfleet.coordinator.run import Run
 
 LONGEST_VERB = 60  # characters of a verb that nobody knows
+LEAVING = ("drain", "stop", "disband")
 
 
 def hello_reply(
@@ -53,12 +54,16 @@ def control_verb(asked_at: str) -> str:
     return asked_at.rsplit("/", 1)[-1]
 
 
-def control_reply(run: str, asked_at: str, known: Iterable[str]) -> ControlReply:
-    """Whether a control verb was obeyed: every known one is, if it was asked for at this run's own key."""
+def control_reply(run: str, asked_at: str, known: Iterable[str], again: str = "") -> ControlReply:
+    """Whether a control verb was obeyed: every known one is, if it was asked for at this run's own key.
+
+    After one by which the run is left, `again` continues it.
+    """
     known, verb = list(known), control_verb(asked_at)
     if asked_at != keys.control(run, verb):
         why = f"one run is steered at a time, by its own key: ask {keys.control(run, 'VERB')}"
         return ControlReply(v=keys.PROTOCOL_VERSION, run=run, accepted=False, why=why)
     asked = shortened(verb, LONGEST_VERB)
     why = "" if verb in known else f"{asked!r} is no control verb of this version; it knows: {', '.join(known)}"
-    return ControlReply(v=keys.PROTOCOL_VERSION, run=run, accepted=not why, why=why)
+    told = again if verb in LEAVING and len(again) <= MAX_TEXT and again.isprintable() else ""
+    return ControlReply(v=keys.PROTOCOL_VERSION, run=run, accepted=not why, why=why, again=told)

@@ -338,7 +338,7 @@ class Service:
         }
         with query:
             asked_at = str(query.key_expr)
-            reply = control_reply(self._name, asked_at, verbs)
+            reply = control_reply(self._name, asked_at, verbs, self._custody.command)
             if reply.accepted:
                 verbs[control_verb(asked_at)]()
             self._snapshot = self._take_snapshot()  # who asks after the answer sees what came of it

@@ -6,6 +6,7 @@ import argparse
 from dataclasses import dataclass
 
 from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.printable import printable
 from dreamfleet.common.site import offer, reached
 
 
@@ -17,6 +18,7 @@ class ControlVerb:
     SUMMARY: str
     outcome: str
     with_workers: str = ""  # what is asked for instead with --workers; empty where that is no flag
+    leaves: bool = False  # whether its coordinator leaves the run
     EXTRAS: tuple[str, ...] = ()
 
     def configure(self, parser: argparse.ArgumentParser) -> None:
@@ -36,19 +38,19 @@ class ControlVerb:
         asked = self.with_workers if self.with_workers and args.workers else self.name
         with Client(reached(args, "operator", "coordinator")) as client:
             name = args.run_name or client.status().run
-            client.control(name, asked)
-        answer(args, f"run {name} {self.outcome.format(run=name)}", run=name, asked=asked, accepted=True)
+            told = printable(client.control(name, asked))
+        again = {"continue": told or f"dreamfleet coordinator --resume {name}"} if self.leaves else {}
+        then = "".join(f"; continue it on its host with: {each}" for each in again.values())
+        answer(args, f"run {name} {self.outcome}{then}", run=name, asked=asked, accepted=True, **again)
         return 0
 
 
 PAUSE = ControlVerb("pause", "give out no more jobs; what runs is finished and counts", "is paused; go on with resume")
 RESUME = ControlVerb("resume", "go on after a pause; jobs that failed are tried again", "goes on")
 DRAIN = ControlVerb(
-    "drain", "give out no more jobs, wait for those that run, then leave; the run can be continued", "is draining"
-)
+    "drain", "give out no more jobs, wait for those that run, then leave; the run can be continued", "is draining",
+    leaves=True,
+)  # fmt: skip
 STOP = ControlVerb(
-    "stop",
-    "leave now; the run can be continued",
-    "is left by its coordinator; continue it on that host with: dreamfleet coordinator --resume {run}",
-    with_workers="disband",
+    "stop", "leave now; the run can be continued", "is left by its coordinator", with_workers="disband", leaves=True
 )

@@ -64,7 +64,7 @@ def _over(status: Status) -> str:
 def _lost(status: Status) -> str:
     return (
         "nobody answers for it: its coordinator was killed, or the network is cut. The page goes on once it is back; "
-        f"after a kill: dreamfleet coordinator --resume {status.run}"
+        f"after a kill: dreamfleet coordinator --resume {status.run}, with --runs-dir and --join where it had them"
     )
 
 

@@ -29,8 +29,13 @@ log = logging.getLogger("dreamfleet.coordinator.iterate")
 class Iteration:
     """One life of it, in a folder that is held."""
 
-    def __init__(self, layout: Layout, config: IterateConfig, ledger: Ledger, crew: Callable[[], Crew], stop: Stop):
+    def __init__(
+        self, layout: Layout, config: IterateConfig, ledger: Ledger, crew: Callable[[], Crew], stop: Stop,
+        reached: Words = (),
+    ) -> None:  # fmt: skip
+        """`reached` are the flags of its command that no ledger keeps: where workers come to, and how."""
         self.ledger = ledger
+        self._again = spoken("iterate", "--data", layout.root, *reached)
         self._layout, self._config, self._crew, self._stop = layout, config, crew, stop
         self._plan = Plan(config, bool(ledger.run.get("collect_every")))
 
@@ -77,8 +82,9 @@ class Iteration:
         try:
             yield
         except StoppedError as error:
-            again = spoken("iterate", "--data", self._layout.root)
-            raise StoppedError(f"{phase}: {error}; what is finished is kept, and goes on with: {again}") from error
+            raise StoppedError(
+                f"{phase}: {error}; what is finished is kept, and goes on with: {self._again}"
+            ) from error
         except DreamfleetError as error:
             raise type(error)(f"{phase}: {error}") from error
 

@@ -145,9 +145,8 @@ def request_of(
     credentials = joined(args, ("coordinator",))
     network = choose_addresses(own, args.site, kept, credentials)
     Network(network.listen, network.connect, credentials).check_open(insecure=network.insecure)
-    return RunRequest(
-        name, args.runs_dir, config, limits, network, start, credentials, args.site.access_dir, args.site.join
-    )
+    site = args.site
+    return RunRequest(name, args.runs_dir, config, limits, network, start, credentials, site.join, site.access_dir)
 
 
 def serve_request(
@@ -228,8 +227,8 @@ def _report(
     from dreamfleet.common.runs import CONTROLLER
     from dreamfleet.common.stored import told
 
-    again = request.again
-    path = request.runs_dir / request.name / CONTROLLER
+    again = request.again()
+    path = request.folder / CONTROLLER
     controller = path if path.is_file() else None
     facts: dict[str, Any] = {"run": request.name, "ended": run.ended, "controller": controller, "continue": again}
     facts["best"] = None if run.best is None else vars(run.best)

@@ -89,7 +89,9 @@ def _open(args: argparse.Namespace, layout: Layout, stop: Stop) -> Iteration:
     if config.local == 0 and not args.listen:
         raise UsageError("nobody would score: give --local slots here, or --listen for workers of other hosts")
     Network(args.listen, credentials=joined(args, ("coordinator",))).check_open(insecure=_insecure(args))
-    iteration = Iteration(layout, config, ledger, lambda: _crew(args, config, more, settings["task"]), stop)
+    iteration = Iteration(
+        layout, config, ledger, lambda: _crew(args, config, more, settings["task"]), stop, _reached(args)
+    )
     if args.redo:
         if (phase := Phase.of(args.redo)).name == INIT:
             find_init(config.init, layout.runs)  # before all that came of it goes
@@ -134,6 +136,13 @@ def _crew(args: argparse.Namespace, config: IterateConfig, more: tuple[str, ...]
 
     own = ("--task", task) if ":" in task else ()
     return Crew.of(args.listen, config.local, more, own, args.site.join, insecure=_insecure(args))
+
+
+def _reached(args: argparse.Namespace) -> tuple[str, ...]:
+    """The flags of where workers of other hosts come to."""
+    listen = ("--listen", *args.listen) if args.listen else ()
+    join = () if args.site.join is None else ("--join", str(args.site.join))
+    return (*listen, *join, *(("--insecure",) if _insecure(args) else ()))
 
 
 def _insecure(args: argparse.Namespace) -> bool:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.processes import spoken
+from dreamfleet.common.network import SECURED
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.site import offer
 
@@ -25,16 +25,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Copy, and look at the copy."""
     from dreamfleet.coordinator.backup import back_up
+    from dreamfleet.coordinator.kept import again, kept_network
 
     target = args.to / args.run_name
     with open_run(args.runs_dir, args.run_name) as source:
         back_up(source, target)
     with open_run(args.to, args.run_name) as copy:
         generations, results = len(copy.history()), copy.result_count()
-    again = spoken("coordinator", "--resume", args.run_name, "--runs-dir", args.to)
+        network = kept_network(copy)
+    secured = any(each.startswith(SECURED) for each in (*network.get("listen", ()), *network.get("connect", ())))
+    join = args.site.join or ("FILE" if secured else None)
     text = (
         f"copied to {target}: {generations} closed generations, {results} results; should the run's own folder be "
-        f"lost, go on with: {again}"
+        f"lost, go on with: {again(target, join)}"
     )
     answer(args, text, run=args.run_name, copy=target, generations=generations, results=results)
     return 0

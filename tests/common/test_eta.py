@@ -87,7 +87,10 @@ def test_limits_of_another_version_are_passed_over(strange):
             {"state": "waiting for workers", "refused": {"old-host": "no AVX2"}},
             "waiting for workers; old-host cannot join: no AVX2",
         ),
-        ({"state": "left"}, "its coordinator left; `dreamfleet coordinator --resume night` goes on"),
+        (
+            {"state": "left"},
+            "its coordinator left; `dreamfleet coordinator --resume night` goes on (its log has the whole command)",
+        ),
         (
             {"state": "ended", "why": "30 minutes", "best": None},
             "finished: 30 minutes; the last mean; it was not evaluated",

@@ -2,7 +2,7 @@
 
 import dataclasses
 import socket
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 from dreamfleet.common.credentials import Credentials
 from dreamfleet.common.network import Network
@@ -28,7 +28,10 @@ def test_the_command_names_an_address_that_others_reach():
     )
     everywhere = worker_command(Network(listen=("tcp/0.0.0.0:7448", "tcp/[::]:7449")), "night")
     assert everywhere.endswith(f"--connect tcp/{socket.gethostname()}:7448 tcp/{socket.gethostname()}:7449")
-    who = Credentials("coordinator", 1, "home", datetime.now(UTC), "")
-    secured = Network(listen=("tls/127.0.0.1:7447",), credentials=who)
-    assert worker_command(secured, "night").endswith(" --connect tls/127.0.0.1:7447 --join FILE")
     assert "tcp/router:1" in worker_command(Network(connect=("tcp/router:1",)), "night")
+
+
+def test_in_a_fleet_with_join_files_the_workers_own_says_where():
+    credentials = Credentials("coordinator", 1, "home", datetime.now(UTC) + timedelta(days=90), "")
+    command = worker_command(Network(listen=("tls/0.0.0.0:7447",), credentials=credentials), "night")
+    assert command == "dreamfleet worker --run night --join FILE"

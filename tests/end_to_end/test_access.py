@@ -180,8 +180,9 @@ def test_a_worker_that_is_revoked_counts_no_more_while_the_run_goes_on(processes
         work(processes, access, endpoint, "newcomer").wait_for("joined")
         before = client.status().generations
         until(lambda: client.status().generations > before + 1, "the run does not go on")
-        client.control("safe", "stop")
+        again = client.control("safe", "stop")
     coordinator.finish()
+    assert again.endswith(f"--join {access.path('coordinator')} --access-dir {access.folder}")
     # The next start: the router itself lets it do nothing.
     barred, said = frozenset({f"worker.{seats['fired']}"}), []
     network = Network(listen=(endpoint,), credentials=read_join(access.path("coordinator")), barred=barred)

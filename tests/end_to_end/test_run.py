@@ -152,9 +152,11 @@ def test_pause_resume_and_drain_from_the_command_line(processes, settings):
     assert processes.status()["state"] == "paused"
     assert "goes on" in say("resume", "test")
     coordinator.wait_for("generation", times=2)
-    assert "draining" in say("drain", "test")
+    drained = json.loads(say("drain", "test", "--json"))
     code, _ = coordinator.finish()
     assert code == 130
+    assert coordinator.lines[-1].rstrip().endswith(f"continue it with: {drained['continue']}")
+    assert f"--resume test --runs-dir {processes.runs}" in drained["continue"]
     with open_run(processes.runs, "test") as run:
         assert run.ended is None
         number = len(run.history())

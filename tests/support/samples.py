@@ -122,6 +122,7 @@ JSON = {
         sigma=0.09, seconds=12.5, environment_steps=64000,
     ),
     "control-reply": ControlReply(v=1, run="night", accepted=True, why=""),
+    "control-reply-left": ControlReply(v=1, run="night", accepted=True, why="", again="dreamfleet coordinator ..."),
     "claim": ClaimNote(run_uid=UID, incarnation=3, nonce="c0ffee00c0ffee00", began=1.7e9),
     "intervals": Intervals(beat=1.0, repeat=1.0),
     "task-spec": SPEC,
