@@ -14,6 +14,7 @@ from pathlib import Path
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.credentials import SOON, read_join, told_left
 from dreamfleet.common.errors import AccessError, DreamfleetError
+from dreamfleet.common.extras import PACKAGES, installs
 from dreamfleet.common.fingerprint import package_version
 from dreamfleet.common.store import default_cache, shipped_bundles
 
@@ -26,27 +27,6 @@ ROLES = {
     "train": ("everything", "worker", "train"),
     "dashboard": ("everything", "dashboard"),
     "export": ("everything", "export"),
-}
-# distribution -> (module, extra); the empty extra is what every role needs
-PACKAGES = {
-    "eclipse-zenoh": ("zenoh", ""),
-    "msgpack": ("msgpack", ""),
-    "numpy": ("numpy", ""),
-    "cma": ("cma", ""),
-    "gymnasium": ("gymnasium", "worker"),
-    "pygame-ce": ("pygame", "worker"),
-    "box2d": ("Box2D", "worker"),
-    "onnxruntime": ("onnxruntime", "worker"),
-    "av": ("av", "views"),
-    "matplotlib": ("matplotlib", "views"),
-    "torch": ("torch", "train"),
-    "onnx": ("onnx", "train"),
-    "safetensors": ("safetensors", "train"),
-    "plotly": ("plotly", "dashboard"),
-    "starlette": ("starlette", "dashboard"),
-    "uvicorn": ("uvicorn", "dashboard"),
-    "pyarrow": ("pyarrow", "export"),
-    "tensorboardX": ("tensorboardX", "export"),
 }
 LEAST_FREE_BYTES = 200_000_000
 
@@ -94,9 +74,8 @@ def lacking(role: str, findings: list[Finding]) -> list[Finding]:
 def _packages() -> Iterator[Finding]:
     for name, (module, extra) in PACKAGES.items():
         found = package_version(name) or (package_version("box2d-py") if name == "box2d" else None)
-        remedy = f"pip install 'dreamfleet[{extra}]'" if extra else "pip install dreamfleet"
         ok = found is not None and find_spec(module) is not None
-        yield Finding(name, ok, True, found or "-", extra or "everything", remedy)
+        yield Finding(name, ok, True, found or "-", extra or "everything", installs(extra))
 
 
 def _one_box2d() -> Finding:

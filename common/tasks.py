@@ -15,6 +15,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.extras import remedy_of
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 
 GROUP = "dreamfleet.tasks"
@@ -56,10 +57,10 @@ def load_task(name: str) -> Any:
         if colon:
             return _maker(import_module(head), rest)()
     except ModuleNotFoundError as error:
-        raise UsageError(
-            f"task {name!r} cannot be loaded: no module {error.name!r} here; install the package that has it, or name "
-            "its folder in PYTHONPATH: the current folder is not searched"
-        ) from error
+        remedy = remedy_of(error.name) or (
+            "install the package that has it, or name its folder in PYTHONPATH: the current folder is not searched"
+        )
+        raise UsageError(f"task {name!r} cannot be loaded: no module {error.name!r} here; {remedy}") from error
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise UsageError(f"task {name!r} cannot be loaded: {error}") from error
     known = ", ".join(f"{each}:ENVIRONMENT" if each == GYM else each for each in points) or "none"

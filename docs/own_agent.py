@@ -3,7 +3,7 @@
     python docs/own_agent.py --steps 3000000 --episodes 32
 
 It chooses one of gymnasium's five actions of CarRacing and holds it for four steps. It observes [z, h]: a latent alone
-does not tell how fast the car is. Needs `pip install 'dreamfleet[train]'`.
+does not tell how fast the car is. Needs `pip install '.[train]'`.
 """
 
 import argparse

@@ -33,10 +33,14 @@ def bare(tmp_path):
     return site
 
 
-def doctor(bare, tmp_path, *words):
+def call(bare, tmp_path, *words):
     seen = {**environment(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join([str(bare), str(ROOT)])}
-    command = [sys.executable, "-S", "-P", "-m", "dreamfleet", "doctor", *words]
-    done = subprocess.run(command, env=seen, capture_output=True, text=True, check=False, timeout=60)
+    command = [sys.executable, "-S", "-P", "-m", "dreamfleet", *words]
+    return subprocess.run(command, env=seen, capture_output=True, text=True, check=False, timeout=60)
+
+
+def doctor(bare, tmp_path, *words):
+    done = call(bare, tmp_path, "doctor", *words)
     assert not done.stderr, done.stderr
     return done.returncode, done.stdout
 
@@ -60,6 +64,12 @@ def test_its_exit_code_is_of_the_role_that_is_asked_about(bare, tmp_path, role, 
     assert report["ok"] is (code == 0)
     assert report["roles"]["coordinator"]
     assert not report["roles"]["worker"]
+
+
+def test_a_run_that_needs_a_workers_packages_to_begin_says_which_extra_has_them(bare, tmp_path):
+    done = call(bare, tmp_path, "coordinator", "--task", "gym:LunarLander-v3", "--runs-dir", str(tmp_path / "runs"))
+    assert done.returncode == 2
+    assert "no module 'gymnasium' here; pip install 'dreamfleet[worker]'" in done.stderr
 
 
 def test_a_worker_needs_no_folder_for_runs():
