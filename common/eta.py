@@ -9,6 +9,7 @@ from statistics import median
 from typing import Any
 
 from dreamfleet.common.effort import counted
+from dreamfleet.common.printable import plural
 from dreamfleet.common.status import Progress, Status
 from dreamfleet.common.stored import told
 
@@ -69,6 +70,19 @@ def sentence(status: Status) -> str:
     """What the run does now, and what it waits for; without its name."""
     tell = SENTENCES.get(status.state)
     return status.state if tell is None else tell(status)
+
+
+def summary(status: Status) -> str:
+    """How the run is in one line, for a log; without its name."""
+    if status.over:
+        return sentence(status)
+    opened, best = status.generation, status.confirmed or status.best
+    score = "nothing evaluated yet" if best is None else f"best mean {best.mean:.1f} ± {best.error:.1f}"
+    workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
+    return (
+        f"{status.state}, generation {opened.number} ({opened.episodes_done}/{opened.episodes} episodes), {score}, "
+        f"{status.throughput.steps_per_second:,.0f} steps/s, {workers} with {slots}, {eta_of(status).told}"
+    )
 
 
 def duration(seconds: float) -> str:

@@ -21,6 +21,11 @@ def one_line(text: str) -> str:
     return printable(" ".join(text.split()))
 
 
+def plural(count: float, noun: str) -> str:
+    """A number with its noun, of which there may be one: 1 seed, 1,000 seeds, 1.5 minutes."""
+    return f"{count:{',' if isinstance(count, int) else 'g'}} {noun}{'' if count == 1 else 's'}"
+
+
 def printable_lines(text: str) -> str:
     """Each line printable, of a text whose lines are our own."""
     return "\n".join(map(printable, text.split("\n")))

@@ -7,6 +7,7 @@ import socket
 from typing import Any
 
 from dreamfleet.common.eta import eta_of
+from dreamfleet.common.eta import summary as told
 from dreamfleet.common.network import Network
 from dreamfleet.common.status import Status
 
@@ -15,19 +16,14 @@ ANYWHERE = ("0.0.0.0", "[::]")  # noqa: S104 - hosts that an address may name, n
 
 def summary(status: Status) -> tuple[str, dict[str, Any]]:
     """One line about the run as it is, and the same as facts."""
-    opened, best, eta = status.generation, status.confirmed or status.best, eta_of(status)
-    rate, present = status.throughput.steps_per_second, status.workers.present
-    score = "nothing evaluated yet" if best is None else f"best mean {best.mean:.1f} ± {best.error:.1f}"
-    text = (
-        f"{status.state}, generation {opened.number} ({opened.episodes_done}/{opened.episodes} episodes), {score}, "
-        f"{rate:,.0f} steps/s, {present} workers with {status.slots} slots, {eta.told}"
-    )
+    best = status.confirmed or status.best
     facts = {
-        "event": "summary", "state": status.state, "generation": opened.number, "steps_per_second": rate,
-        "best": None if best is None else best.mean, "best_error": None if best is None else best.error,
-        "workers": present, "slots": status.slots, "eta_seconds": eta.seconds,
+        "event": "summary", "state": status.state, "generation": status.generation.number,
+        "steps_per_second": status.throughput.steps_per_second, "best": None if best is None else best.mean,
+        "best_error": None if best is None else best.error, "workers": status.workers.present, "slots": status.slots,
+        "eta_seconds": eta_of(status).seconds,
     }  # fmt: skip
-    return text, facts
+    return told(status), facts
 
 
 def worker_command(network: Network, run: str) -> str:

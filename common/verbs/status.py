@@ -27,7 +27,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--json", action="store_true", help="print the document as the wire has it; with --watch one line each time"
     )
-    parser.add_argument("--watch", action="store_true", help="stay and refresh until the coordinator leaves or Ctrl-C")
+    parser.add_argument(
+        "--watch", action="store_true",
+        help="stay and refresh until the coordinator leaves or Ctrl-C; in a file or a pipe a line at each change",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -62,13 +65,35 @@ def _print_lines(client: Client, name: str) -> int:
 
 
 def _show(client: Client, name: str) -> int:
+    from rich.console import Console
     from rich.live import Live
+
+    if not Console().is_terminal:
+        return _tell(client, name)
 
     from dreamfleet.common.table import RunPanel
 
     with Live(refresh_per_second=4, vertical_overflow="crop") as live:
         for status in client.watch(name, REFRESH):
             live.update(RunPanel(_with_all_workers(client, status), fitted=live.console.is_terminal), refresh=True)
+    return 0
+
+
+def _tell(client: Client, name: str) -> int:
+    """A line when a generation, an evaluation, the state or the number of workers is another; at last the picture."""
+    from rich.console import Console
+
+    from dreamfleet.common.eta import summary
+    from dreamfleet.common.printable import one_line
+    from dreamfleet.common.table import RunPanel
+
+    told = None
+    for status in client.watch(name, REFRESH):
+        now = status.state, status.generation.number, status.evaluations, status.workers.present
+        if now != told:
+            print(one_line(f"{status.run}: {summary(status)}"), flush=True)
+        told = now
+    Console().print(RunPanel(_with_all_workers(client, status)))
     return 0
 
 

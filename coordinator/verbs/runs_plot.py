@@ -11,7 +11,10 @@ from dreamfleet.common.runs import open_run
 from dreamfleet.common.saving import check_out
 from dreamfleet.common.site import offer
 
-SUMMARY = "draw runs' evaluated scores over environment steps and core-hours, or one run's fitness over generations"
+SUMMARY = (
+    "draw runs' evaluated scores over environment steps and core-hours, or one run's fitness over generations, as is "
+    "done of one that has no evaluated mean yet"
+)
 EXTRAS = ("views",)
 LEARNING, FITNESS = "learning.png", "fitness.png"
 
@@ -19,7 +22,7 @@ LEARNING, FITNESS = "learning.png", "fitness.png"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("run_names", metavar="RUN", nargs="+", help="names of runs of one world")
-    parser.add_argument("--fitness", action="store_true", help="draw what one run's candidates scored instead")
+    parser.add_argument("--fitness", action="store_true", help="draw what one run's candidates scored, in any case")
     parser.add_argument("--out", type=Path, help=f"a PNG or SVG to write (default {LEARNING}, or {FITNESS})")
     offer(parser, "runs_dir")
     add_json(parser)
@@ -29,13 +32,22 @@ def run(args: argparse.Namespace) -> int:
     """Draw, and print where it lies."""
     from dreamfleet.coordinator.plot import KINDS
 
-    out = args.out or Path(FITNESS if args.fitness else LEARNING)
+    fitness = args.fitness or _unevaluated(args)
+    out = args.out or Path(FITNESS if fitness else LEARNING)
     if out.suffix not in KINDS:
         raise UsageError(f"--out {out}: give a name that ends in {' or '.join(KINDS)}")
     check_out(out)
-    (_draw_fitness if args.fitness else _draw_learning)(args, out)
+    (_draw_fitness if fitness else _draw_learning)(args, out)
     answer(args, str(out), picture=out, runs=args.run_names)
     return 0
+
+
+def _unevaluated(args: argparse.Namespace) -> bool:
+    """Whether it is one run without any evaluated mean: then its fitness is all that there is."""
+    if len(args.run_names) > 1:
+        return False
+    with open_run(args.runs_dir, args.run_names[0]) as stored:
+        return not stored.evaluations()
 
 
 def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
@@ -44,6 +56,10 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
     if len(args.run_names) > 1:
         raise UsageError("--fitness is of one run: name one")
     with open_run(args.runs_dir, args.run_names[0]) as stored:
+        if not stored.history():
+            raise UsageError(
+                f"run {stored.name} has no closed generation, so there is nothing to draw: wait for the first"
+            )
         plot_fitness(stored, out)
 
 

@@ -55,6 +55,20 @@ def test_a_run_without_evaluations_has_no_curve(runs):
         curve_of(runs, "hidden")
 
 
+def test_one_run_without_evaluations_is_drawn_by_its_fitness_and_the_file_is_named_so(
+    runs, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["runs", "plot", "hidden", "--runs-dir", str(runs)]) == 0
+    assert capsys.readouterr().out == "fitness.png\n"
+    assert (tmp_path / "fitness.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_of_several_runs_one_without_evaluations_is_refused(runs, capsys):
+    assert cli.main(["runs", "plot", "reality", "hidden", "--runs-dir", str(runs)]) == 2
+    assert "run hidden has no evaluated mean" in capsys.readouterr().err
+
+
 def test_a_picture_names_runs_axes_and_published_marks_and_equal_ones_are_equal_files(tmp_path):
     paths = [tmp_path / "a.svg", tmp_path / "b.svg"]
     for path in paths:

@@ -1,6 +1,7 @@
 """Watching a run from anywhere, to its end, and judging what it reports."""
 
 import json
+import re
 import signal
 
 import pytest
@@ -46,6 +47,9 @@ def test_the_last_panel_shows_the_final_state(processes, settings):
     assert code == 0
     assert "ended" in out
     assert "2 generations" in out
+    # In a pipe a line at each change goes before it.
+    assert re.match(r"test: (waiting for workers|running), generation \d \(\d/8 episodes\), ", out)
+    assert "\ntest: finished: 2 generations; " in out
 
 
 def test_a_watcher_of_a_run_that_is_stopped_is_told_that_it_was_left_open(processes, settings):
