@@ -46,6 +46,11 @@ def family_of(name: str) -> str:
     return head if colon and head in registered_tasks() else name
 
 
+def is_own(name: str) -> bool:
+    """Whether it is `module:attribute`, which a worker must be told of: nothing that is registered here."""
+    return ":" in name and family_of(name) == name
+
+
 def load_task(name: str) -> Any:
     """The object that stands for a task; `UsageError` says what is known, or why it cannot be loaded."""
     points = registered_tasks()
@@ -76,7 +81,7 @@ def _maker(module: Any, name: str) -> Any:
 
 
 def describes_itself(name: str) -> bool:
-    """Whether a task needs no bundle, as far as that can be found out on this host."""
+    """Whether a task needs no bundle; `UsageError` for one that this host does not know."""
     if family_of(name) == GYM:
         return True
     point = registered_tasks().get(name)
@@ -84,8 +89,8 @@ def describes_itself(name: str) -> bool:
         return False  # not worth loading a simulator for
     try:
         return callable(getattr(load_task(name), "describe", None))
-    except UsageError:
-        return False
+    except UsageError as error:
+        raise UsageError(f"{error}; where workers alone have it, name its world model with --bundle") from error
 
 
 def check_task(name: str) -> None:

@@ -7,6 +7,7 @@ from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, package_version
 from dreamfleet.common.keys import PROTOCOL_VERSION
 from dreamfleet.common.messages import HelloRequest
 from dreamfleet.common.printable import shortened
+from dreamfleet.common.tasks import is_own
 
 MOST_REFUSED = 8  # names that are remembered
 MOST_TOLD = 100  # refusals that are news: no log should grow with what strangers call themselves
@@ -28,8 +29,12 @@ def refusal(
             f"install dreamfleet {package_version('dreamfleet')} on the worker's host"
         )
     if not {task, task.partition(":")[0]} & set(request.tasks):  # itself, or the family that it is of
-        return f"this run scores in {task!r}, which the worker does not know (it knows: {_known(request.tasks)})", (
-            "install the package that registers this task on the worker's host"
+        remedy = "install the package that registers this task on the worker's host"
+        if is_own(task):
+            remedy = f"start it with `dreamfleet worker --task {task}`, if you trust that, or {remedy}"
+        return (
+            f"this run scores in {task!r}, which the worker does not know (it knows: {_known(request.tasks)})",
+            remedy,
         )
     if request.packages != packages:
         named, own = (shortened(", ".join(each), LONGEST) for each in (request.packages, packages))

@@ -10,6 +10,7 @@ from dreamfleet.common.eta import eta_of
 from dreamfleet.common.eta import summary as told
 from dreamfleet.common.network import Network
 from dreamfleet.common.status import Status
+from dreamfleet.common.tasks import is_own
 
 ANYWHERE = ("0.0.0.0", "[::]")  # noqa: S104 - hosts that an address may name, none that is listened on
 
@@ -26,12 +27,15 @@ def summary(status: Status) -> tuple[str, dict[str, Any]]:
     return told(status), facts
 
 
-def worker_command(network: Network, run: str) -> str:
-    """The command that starts a worker of the run, on this host or another; a worker's join file says where itself."""
-    if network.credentials is not None:
-        return shlex.join(("dreamfleet", "worker", "--run", run, "--join", "FILE"))
+def worker_command(network: Network, run: str, task: str) -> str:
+    """The command that starts a worker of the run, on this host or another; `task` is named if nothing registers it.
+
+    A worker's join file says itself where the fleet is.
+    """
     addresses = [_reached(each) for each in network.listen or network.connect]
-    return shlex.join(("dreamfleet", "worker", "--run", run, "--connect", *addresses))
+    where = ("--connect", *addresses) if network.credentials is None else ("--join", "FILE")
+    told = ("--task", task) if is_own(task) else ()
+    return shlex.join(("dreamfleet", "worker", "--run", run, *where, *told))
 
 
 def _reached(endpoint: str) -> str:

@@ -197,7 +197,7 @@ class Service:
             self._alone_since = now
         elif now - self._alone_since > ALONE:
             self._alone_since = math.inf
-            command = worker_command(self._network, self._name)
+            command = worker_command(self._network, self._name, self._run.settings.task.task)
             log.warning("no worker is there: the run waits for one; on any host: %s", command,
                         extra={"facts": {"event": "no worker", "command": command}})  # fmt: skip
 

@@ -26,7 +26,9 @@ def test_who_does_not_know_the_task_is_told_what_to_install():
     why, remedy = refusal(hello(tasks=("dream",)), LANDER, None)
     assert LANDER in why
     assert "it knows: dream" in why
-    assert "install the package" in remedy
+    assert remedy.startswith("install the package")
+    _, remedy = refusal(hello(), "field:FieldTask", None)
+    assert "dreamfleet worker --task field:FieldTask" in remedy
 
 
 def test_a_fingerprint_of_other_packages_is_asked_for_again_before_it_is_judged():

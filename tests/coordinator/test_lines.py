@@ -23,15 +23,18 @@ def test_one_line_tells_generation_score_speed_workers_and_what_is_left():
 
 
 def test_the_command_names_an_address_that_others_reach():
-    assert worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night") == (
+    assert worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night", "car-racing") == (
         "dreamfleet worker --run night --connect tcp/127.0.0.1:7447"
     )
-    everywhere = worker_command(Network(listen=("tcp/0.0.0.0:7448", "tcp/[::]:7449")), "night")
+    everywhere = worker_command(Network(listen=("tcp/0.0.0.0:7448", "tcp/[::]:7449")), "night", "car-racing")
     assert everywhere.endswith(f"--connect tcp/{socket.gethostname()}:7448 tcp/{socket.gethostname()}:7449")
-    assert "tcp/router:1" in worker_command(Network(connect=("tcp/router:1",)), "night")
+    own = worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night", "field:FieldTask")
+    assert own.endswith("--connect tcp/127.0.0.1:7447 --task field:FieldTask")
+    assert "--task" not in worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night", "gym:CartPole-v1")
+    assert "tcp/router:1" in worker_command(Network(connect=("tcp/router:1",)), "night", "car-racing")
 
 
 def test_in_a_fleet_with_join_files_the_workers_own_says_where():
     credentials = Credentials("coordinator", 1, "home", datetime.now(UTC) + timedelta(days=90), "")
-    command = worker_command(Network(listen=("tls/0.0.0.0:7447",), credentials=credentials), "night")
+    command = worker_command(Network(listen=("tls/0.0.0.0:7447",), credentials=credentials), "night", "car-racing")
     assert command == "dreamfleet worker --run night --join FILE"
