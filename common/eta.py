@@ -41,6 +41,7 @@ class Eta:
     others: tuple[str, ...]  # limits that nobody can foretell, in words
     pace: float | None  # seconds a generation; `None` before the first is closed
     seconds: float | None  # until the first limit; `None` while nobody works, or where nothing tells
+    then: str = "at its limit"  # what is told where it is reached
 
     @property
     def told(self) -> str:
@@ -50,7 +51,7 @@ class Eta:
         if self.pace is not None:
             parts.append(f"{duration(self.pace)} a generation")
         if self.seconds is not None:
-            parts.append(f"about {duration(self.seconds)} to go" if self.seconds >= 1 else "at its limit")
+            parts.append(f"about {duration(self.seconds)} to go" if self.seconds >= 1 else self.then)
         return ", ".join(parts)
 
 
@@ -63,7 +64,7 @@ def eta_of(status: Status) -> Eta:
         bounds = tuple(sorted(bounds, key=lambda each: math.inf if each.seconds is None else each.seconds))
     known = [each.seconds for each in bounds if each.seconds is not None]
     seconds = min(known) if known and status.state in WORKING else None
-    return Eta(bounds, tuple(_others(status)), pace, seconds)
+    return Eta(bounds, tuple(_others(status)), pace, seconds, "confirming" if status.confirming.episodes else Eta.then)
 
 
 def sentence(status: Status) -> str:
@@ -103,23 +104,32 @@ def duration(seconds: float) -> str:
 
 def _bounds(status: Status, pace: float | None) -> Iterator[Bound]:
     """Each counted limit. A run ends as a generation closes: so the open one is waited for at least."""
-    limits, spent = status.limits, status.throughput
-    gone = status.generation.seconds
-    rest = None if pace is None else max(pace - gone, 0.0)
+    limits, spent, reached = status.limits, status.throughput, _reached(status)
+    gone = 0.0 if reached else status.generation.seconds
+    rest = None if pace is None else 0.0 if reached else max(pace - gone, 0.0)
     seconds: float | None
     if generations := _limit(limits, "generations"):
         closed = status.generations
         left = max(generations - closed, 0)
         seconds = None if pace is None or rest is None else (left - 1) * pace + rest if left else 0.0
-        yield Bound("generations", closed, generations, seconds, f"{closed:,} of {generations:,.0f} generations")
+        yield Bound(
+            "generations", closed, generations, seconds, f"{closed:,} of {plural(int(generations), 'generation')}"
+        )
     if steps := _limit(limits, "steps"):
         done, rate = spent.environment_steps, _rate(status)
         seconds = None if not rate or rest is None else max((steps - done) / rate, rest) if done < steps else rest
         yield Bound("steps", done, steps, seconds, f"{counted(done)} of {counted(int(steps))} steps")
     if (minutes := _limit(limits, "minutes")) and spent.seconds is not None:
         gone += spent.seconds
-        told_minutes = f"{_number(gone / 60)} of {_number(minutes)} minutes"
+        told_minutes = f"{_number(gone / 60)} of {_number(minutes)} minute{'' if minutes == 1 else 's'}"
         yield Bound("minutes", gone / 60, minutes, max(60 * minutes - gone, rest or 0.0), told_minutes)
+
+
+def _reached(status: Status) -> bool:
+    """Whether nobody scores the open generation, which is there for a later life with wider limits."""
+    generations, minutes = _limit(status.limits, "generations"), _limit(status.limits, "minutes")
+    by_time = bool(minutes) and (status.throughput.seconds or 0.0) >= 60 * minutes
+    return by_time or 0 < generations <= status.generations or status.confirming.episodes > 0
 
 
 def _rate(status: Status) -> float:

@@ -351,7 +351,9 @@ class LimitsConfig:
 
     generations: int = option(0, "stop after so many generations")
     steps: int = option(0, "stop after so many environment steps")
-    minutes: float = option(0.0, "stop after so many minutes of generations")
+    minutes: float = option(
+        0.0, "stop after so many minutes of generations; what is evaluated last, and confirmed, comes on top"
+    )
     target: float | None = option(None, "stop when an evaluated mean reaches this score")
     parted: int = option(0, "stop when so many evaluations in a row fell clearly behind the best one before them")
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from dreamfleet.common.messages import MOST_SLOTS, Beat, Kind, Result, Verdict, VerdictWord
+from dreamfleet.common.printable import plural
 from dreamfleet.coordinator.choice import Choice
 from dreamfleet.coordinator.jobs import Work
 from dreamfleet.coordinator.member import Handful, Lease, Member, Sent
@@ -200,7 +201,7 @@ class Fleet:
                 self._extend(member, gap)
             if member.lost is not None:
                 if now - max(member.lost, member.heard) >= DEPARTURE_GRACE:
-                    self._lose(member, now, "left")
+                    self._lose(member, now, "is gone without a word" if member.capacity else "left")
                     self._forget(member)
             elif now - member.heard > (FORGOTTEN if member.known else VISIT):
                 self._forget(member)
@@ -335,7 +336,8 @@ class Fleet:
     def _lose(self, member: Member, now: float, what: str) -> None:
         if not member.known:
             return  # nothing was given to it, and no log should grow with what strangers call themselves
-        self.notes.append(f"worker {member.identity} {what}: {len(member.leases)} jobs are free again")
+        freed = f"{plural(len(member.leases), 'job')} {'is' if len(member.leases) == 1 else 'are'} free again"
+        self.notes.append(f"worker {member.identity} {what}: {freed}")
         self.story.add(now, "left" if member.lost is not None else "silent", member.identity)
         if member.leases:
             last = self._records.get(member.identity.partition("/")[0], member.record)

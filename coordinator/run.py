@@ -146,6 +146,8 @@ class Run:
 
     def resume(self) -> None:
         """Go on; what failed is tried again anywhere."""
+        if self.paused is not None:
+            self.fleet.notes.append("resumed")
         self.paused = None
         self.fleet.paused = False
         self.fleet.jobs.pardon()

@@ -46,6 +46,12 @@ def test_of_several_limits_the_nearest_stands_first_and_counts():
     assert eta.seconds == eta.bounds[0].seconds
 
 
+@pytest.mark.parametrize(("confirming", "then"), [(Progress(0, 0), "at its limit"), (Progress(3, 16), "confirming")])
+def test_what_comes_after_the_limit_does_not_count_on(confirming, then):
+    eta = eta_of(status({"minutes": 1.0}, seconds=66.0, gone=40.0, state="evaluating", confirming=confirming))
+    assert eta.told == f"1.1 of 1 minute, 4.6 s a generation, {then}"
+
+
 def test_a_target_is_told_and_not_foretold():
     eta = eta_of(status({"target": 900.0, "parted": 3}, best=BEST))
     assert eta.told == (

@@ -28,6 +28,27 @@ def test_a_fleets_log_is_json_where_it_is_asked_for_and_tells_how_to_start_a_wor
     assert (closed["event"], closed["number"], closed["level"]) == ("generation", 0, "info")
     coordinator.popen.kill()
     assert "this worker waits for that run alone" in worker.wait_for("the coordinator of run test is gone")
+    worker.popen.terminate()
+    assert worker.finish()[0] == 0
+
+
+def test_what_ends_as_it_should_is_not_told_as_a_loss(processes, random_bundle):
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+        "--task", tasks.TOY, "--generations", 100000,
+    )  # fmt: skip
+    own, drained = (processes.worker("--task", tasks.TOY, "--name", name, *more)
+                    for name, more in (("own", ("--exit-when-done",)), ("drained", ())))  # fmt: skip
+    own.wait_for("joined run test")
+    drained.wait_for("joined run test")
+    coordinator.wait_for("generation 0: mean")
+    drained.popen.terminate()
+    assert "left: " in coordinator.wait_for("worker drained/")
+    for verb, said in (("pause", "paused: paused by hand"), ("resume", "resumed"), ("stop", "")):
+        assert processes.call(verb, "test", "--connect", processes.endpoint)[0] == 0
+        coordinator.wait_for(said)
+    assert "has left, as it does when a run ends" in own.wait_for("the coordinator of run test")
+    assert own.finish()[0] == 0
 
 
 def test_the_story_of_a_killed_workers_jobs_is_told_while_the_run_lives(processes, random_bundle):
@@ -38,7 +59,7 @@ def test_the_story_of_a_killed_workers_jobs_is_told_while_the_run_lives(processe
     worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "host-a")
     coordinator.wait_for("generation 0: mean")
     worker.popen.kill()
-    coordinator.wait_for("jobs are free again")
+    assert "host-a" in coordinator.wait_for("is gone without a word: ")
 
     def story(*words):
         code, out, err = processes.call("story", "test", "--connect", processes.endpoint, *words, "--json")

@@ -25,7 +25,7 @@ from dreamfleet.common.session import enqueue_into
 from dreamfleet.worker.service.admission import Admission
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.glimpses import Seen
-from dreamfleet.worker.service.membership import Hands, Membership
+from dreamfleet.worker.service.membership import GONE, Hands, Membership
 from dreamfleet.worker.service.outbox import Outbox
 from dreamfleet.worker.service.post import Post, Rate
 from dreamfleet.worker.service.slot import SlotEvent
@@ -113,6 +113,7 @@ class JoinedRun:
                 self._rejoin(now)
 
     def _shutdown(self, declared: list[Any]) -> None:
+        self._beat(monotonic(), capacity=0)  # tells its end from that of a worker that was killed
         for each in declared:
             each.undeclare()
         log.info(
@@ -154,11 +155,11 @@ class JoinedRun:
         if event.kind == zenoh.SampleKind.DELETE:
             self._membership.vanish(nonce, monotonic())
             then = (
-                "it is given up soon"
+                f"has left, as it does when a run ends; this worker does too if none is back within {GONE:g} s"
                 if self._membership.leaves_alone
-                else "this worker waits for that run alone (--any: the next one)"
+                else "is gone; this worker waits for that run alone (--any: the next one)"
             )
-            log.info("the coordinator of run %s is gone; %s", self._admission.run, then,
+            log.info("the coordinator of run %s %s", self._admission.run, then,
                      extra={"facts": {"event": "coordinator gone", "run": self._admission.run}})  # fmt: skip
         else:
             self._membership.appear(nonce)
@@ -226,19 +227,22 @@ class JoinedRun:
     def _send(self, now: float) -> None:
         if now >= self._beat_at:  # first, so that a coordinator that has just welcomed it listens to what follows
             self._beat_at = now + self._admission.intervals.beat
-            self._post.beat(
-                self._slots,
-                numbering=self._backlog.numbering,
-                seen=self._backlog.seen,
-                capacity=0 if self._membership.draining else self._slots.capacity,
-                queued=self._backlog.queued,
-                unacked=self._outbox.digests,
-                rate=self._rate.read(now, self._steps_finished + self._slots.steps),
-            )
+            self._beat(now, capacity=0 if self._membership.draining else self._slots.capacity)
         for results in self._outbox.due(now):
             self._post.results(self._slots, results)
         for piece in self._uploads.due(now):  # after the beat, which says that the job is in these hands
             self._post.upload(piece)
+
+    def _beat(self, now: float, capacity: int) -> None:
+        self._post.beat(
+            self._slots,
+            numbering=self._backlog.numbering,
+            seen=self._backlog.seen,
+            capacity=capacity,
+            queued=self._backlog.queued,
+            unacked=self._outbox.digests,
+            rate=self._rate.read(now, self._steps_finished + self._slots.steps),
+        )
 
     def _hands(self) -> Hands:
         return Hands(idle=self._slots.idle, owed=len(self._outbox) > 0, uploading=len(self._uploads) > 0)
