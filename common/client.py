@@ -43,6 +43,8 @@ class Client:
         if not network.connect:
             raise UsageError("a client needs an address: tcp/HOST:PORT")
         self._where = ", ".join(network.connect)
+        #: with which flags a worker is started that joins a run here; in a fleet with join files it brings its own
+        self.worker_flags = "--join FILE" if network.credentials else f"--connect {' '.join(network.connect)}"
         self.session = open_session(network)  # also for what asks in other words, as for a bundle
 
     def __enter__(self) -> Client:
@@ -71,7 +73,7 @@ class Client:
         documents = self._ask(f"{key}?{parameters}" if parameters else key)
         if len(documents) > 1:
             names = ", ".join(sorted(str(document.get("run")) for document in documents))
-            raise UsageError(f"several runs are live: name one with --run: {names}")
+            raise UsageError(f"several runs are live: name one of {names}")
         if not documents:
             raise self._nobody(f"run {run!r}" if run else "any run")
         return documents[0]

@@ -178,7 +178,9 @@ def _waiting(status: Status) -> str:
         name, why = next(iter(status.refused.items()))
         return f"waiting for workers; {name} cannot join: {why}"
     known = status.workers.known
-    return f"waiting for workers: none of {known} is there" if known else "waiting for workers: none has come yet"
+    if not known and not status.throughput.environment_steps:
+        return "waiting for workers: none has come yet"
+    return f"waiting for workers: none{f' of {known}' if known else ''} is there"
 
 
 def _episodes(part: Progress) -> str:

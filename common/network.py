@@ -69,7 +69,7 @@ def check_endpoint(endpoint: str) -> str:
     """Return `endpoint` if it is well formed, else raise `UsageError`."""
     found = _ENDPOINT.fullmatch(endpoint)
     if not found or int(found[3]) > 65535:
-        run = "" if "/" in endpoint or ":" in endpoint else "; if it is a run's name, that stands before the addresses"
+        run = "" if "/" in endpoint or ":" in endpoint else "; a run's name is none: --help says where it stands"
         raise UsageError(f"{endpoint!r} is no endpoint: write it as tcp/HOST:PORT, such as {DEFAULT_ENDPOINT}{run}")
     return endpoint
 

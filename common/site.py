@@ -58,6 +58,13 @@ def offer(parser: argparse.ArgumentParser, *names: str, texts: Mapping[str, str]
     add_flags(parser, SiteConfig, only=(*names, *(("join",) if "connect" in names else ())), texts=texts)
 
 
+def offer_run(parser: argparse.ArgumentParser) -> None:
+    """The live run that a verb is about, `args.run_name`: by its name alone, or behind `--run`."""
+    told = "name of the run (default: the only live one)"
+    parser.add_argument("run_name", nargs="?", metavar="RUN", default=argparse.SUPPRESS, help=told)
+    parser.add_argument("--run", dest="run_name", metavar="RUN", help="the same")
+
+
 def offer_everywhere(parser: argparse.ArgumentParser) -> None:
     """The flags that each verb has."""
     parser.add_argument("--config", type=Path, help="TOML file with settings (default $DREAMFLEET_CONFIG, else none)")

@@ -20,6 +20,7 @@ from dreamfleet.common.printable import printable
 from dreamfleet.common.roster import Roster
 from dreamfleet.common.status import FailureStatus, OpenGeneration, Population, Progress, Status
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.tasks import is_own
 
 STATE_STYLES = {
     "running": "green",
@@ -35,6 +36,7 @@ LABELS = 17  # columns of a fact's name
 TWO_COLUMNS = 110  # columns from which on facts stand in two
 BAR = 40  # columns at most
 CURVE = 8  # lines at most
+ANYWHERE = "--connect tcp/HOST:PORT"  # of a worker, where it is not known how the run is reached
 
 
 @dataclass(frozen=True)
@@ -49,10 +51,14 @@ class Block:
 
 
 class RunPanel:
-    """The whole picture; `fitted`: as high as the terminal at most, for one that is drawn again and again."""
+    """The whole picture; `fitted`: as high as the terminal at most, for one that is drawn again and again.
 
-    def __init__(self, status: Status, *, fitted: bool = False) -> None:
+    A worker is started with `worker_flags`, which say where the run is.
+    """
+
+    def __init__(self, status: Status, worker_flags: str = ANYWHERE, *, fitted: bool = False) -> None:
         self._status = status
+        self._worker_flags = worker_flags
         self._fitted = fitted
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
@@ -61,13 +67,13 @@ class RunPanel:
         lines = options.max_height - BORDERS - 1 if self._fitted else None  # the last line is for the shell's prompt
         state = printable(status.state), STATE_STYLES.get(status.state, "")
         title = Text.assemble((printable(status.run), "bold"), " · ", state)
-        content = Group(*picture(status, options.max_width - FRAME, lines))
+        content = Group(*picture(status, options.max_width - FRAME, lines, self._worker_flags))
         yield Panel(content, title=title, title_align="left", padding=(0, 1))
 
 
-def picture(status: Status, width: int, lines: int | None = None) -> list[Text]:
+def picture(status: Status, width: int, lines: int | None = None, worker_flags: str = ANYWHERE) -> list[Text]:
     """The picture without its frame, in `width` columns and at most so many lines; `None`: as many as it takes."""
-    blocks = list(_blocks(status, max(width, 1)))
+    blocks = list(_blocks(status, max(width, 1), worker_flags))
     return [line for block, given in zip(blocks, allot(blocks, lines), strict=True) if given
             for line in block.draw(given)[:given]]  # fmt: skip
 
@@ -90,7 +96,7 @@ def allot(blocks: Sequence[Block], lines: int | None) -> list[int]:
     return given
 
 
-def _blocks(status: Status, width: int) -> Iterator[Block]:
+def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
     """From top to bottom."""
     state = STATE_STYLES.get(status.state, "")
     yield _text_block(0, Text(printable(sentence(status)), style=state), width, least=2)
@@ -109,7 +115,7 @@ def _blocks(status: Status, width: int) -> Iterator[Block]:
         shown = population
         wanted = 1 + cells_wanted(shown, width)
         yield Block(5, 2, min(wanted, 4), wanted, lambda given: _candidates(status, shown, width, given))
-    yield _workers(status, width)
+    yield _workers(status, width, worker_flags)
 
 
 def _text_block(need: int, text: Text, width: int, least: int) -> Block:
@@ -258,12 +264,15 @@ def _curve(history: Sequence[StoredGeneration], width: int, lines: int) -> list[
     return [Text(f"{caption}, {shown[0][0]} to {shown[-1][0]}", style="dim"), *drawn]
 
 
-def _workers(status: Status, width: int) -> Block:
+def _workers(status: Status, width: int, worker_flags: str) -> Block:
     if status.worker_list:
         roster = Roster(status.worker_list, status.workers.known)
         most = roster.wanted(width)
         return Block(6, min(3, most), min(8, most), most, lambda given: roster.lines(width, given))
     said = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
-    said = said or ["no workers yet: start one with  dreamfleet worker --connect tcp/HOST:PORT"]
+    task = status.settings.task.task
+    own = f" --task {task}" if is_own(task) else ""
+    none = "no worker is there" if status.throughput.environment_steps else "no workers yet"
+    said = said or [f"{none}; start one with", f"dreamfleet worker --run {status.run} {worker_flags}{own}"]
     lines = [Text(part, style="yellow") for each in said for part in _wrapped(printable(each), width)]
     return Block(6, min(3, len(lines)), len(lines), len(lines), lambda given: lines[:given])

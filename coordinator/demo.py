@@ -181,7 +181,7 @@ class Demo:
         with Live(console=self._console, refresh_per_second=4) as live:
             while coordinator.poll() is None:
                 with suppress(ConnectionFailedError):  # it is starting, or has just ended
-                    live.update(RunPanel(client.status(run), fitted=self._console.is_terminal))
+                    live.update(RunPanel(client.status(run), client.worker_flags, fitted=self._console.is_terminal))
                 try:
                     coordinator.wait(REFRESH)
                 except subprocess.TimeoutExpired:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.errors import ConnectionFailedError
-from dreamfleet.common.site import offer, reached
+from dreamfleet.common.site import offer, offer_run, reached
 
 if TYPE_CHECKING:
     from dreamfleet.common.client import Client
     from dreamfleet.common.status import Status
+    from dreamfleet.common.table import RunPanel
 
 SUMMARY = "show how a run is: generation, population, best, workers, throughput, waste"
 EXTRAS = ()
@@ -23,7 +25,7 @@ REFRESH = 0.5  # seconds
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     offer(parser, "connect")
-    parser.add_argument("--run", help="name of the run (default: the only live one)")
+    offer_run(parser)
     parser.add_argument(
         "--json", action="store_true", help="print the document as the wire has it; with --watch one line each time"
     )
@@ -38,10 +40,10 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.client import Client
 
     with Client(reached(args)) as client:
-        document = client.document(args.run)
+        document = client.document(args.run_name)
         if args.watch:
-            name = str(document.get("run"))
-            return _print_lines(client, name) if args.json else _show(client, name)
+            watch = _print_lines if args.json else _show if sys.stdout.isatty() else _tell
+            return watch(client, str(document.get("run")))
         if args.json:
             print(json.dumps(document, indent=2))
         else:
@@ -53,9 +55,8 @@ def _print_once(client: Client, document: dict[str, Any]) -> None:
     from rich.console import Console
 
     from dreamfleet.common.status import read_status
-    from dreamfleet.common.table import RunPanel
 
-    Console().print(RunPanel(_with_all_workers(client, read_status(document))))
+    Console().print(_panel(client, read_status(document)))
 
 
 def _print_lines(client: Client, name: str) -> int:
@@ -65,17 +66,11 @@ def _print_lines(client: Client, name: str) -> int:
 
 
 def _show(client: Client, name: str) -> int:
-    from rich.console import Console
     from rich.live import Live
-
-    if not Console().is_terminal:
-        return _tell(client, name)
-
-    from dreamfleet.common.table import RunPanel
 
     with Live(refresh_per_second=4, vertical_overflow="crop") as live:
         for status in client.watch(name, REFRESH):
-            live.update(RunPanel(_with_all_workers(client, status), fitted=live.console.is_terminal), refresh=True)
+            live.update(_panel(client, status, fitted=True), refresh=True)
     return 0
 
 
@@ -85,7 +80,6 @@ def _tell(client: Client, name: str) -> int:
 
     from dreamfleet.common.eta import summary
     from dreamfleet.common.printable import one_line
-    from dreamfleet.common.table import RunPanel
 
     told = None
     for status in client.watch(name, REFRESH):
@@ -93,8 +87,14 @@ def _tell(client: Client, name: str) -> int:
         if now != told:
             print(one_line(f"{status.run}: {summary(status)}"), flush=True)
         told = now
-    Console().print(RunPanel(_with_all_workers(client, status)))
+    Console().print(_panel(client, status))
     return 0
+
+
+def _panel(client: Client, status: Status, *, fitted: bool = False) -> RunPanel:
+    from dreamfleet.common.table import RunPanel
+
+    return RunPanel(_with_all_workers(client, status), client.worker_flags, fitted=fitted)
 
 
 def _with_all_workers(client: Client, status: Status) -> Status:

@@ -88,7 +88,11 @@ def test_limits_of_another_version_are_passed_over(strange):
             "confirming what it will report: 3 of 1,600 episodes",
         ),
         ({"state": "waiting for workers"}, "waiting for workers: none of 1 is there"),
-        ({"state": "waiting for workers", "workers": WorkerCount(0, 0)}, "waiting for workers: none has come yet"),
+        (
+            {"state": "waiting for workers", "workers": WorkerCount(0, 0), "steps": 0},
+            "waiting for workers: none has come yet",
+        ),
+        ({"state": "waiting for workers", "workers": WorkerCount(0, 0)}, "waiting for workers: none is there"),
         (
             {"state": "waiting for workers", "refused": {"old-host": "no AVX2"}},
             "waiting for workers; old-host cannot join: no AVX2",

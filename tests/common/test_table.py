@@ -21,9 +21,9 @@ WORKER = dataclasses.replace(
 )
 
 
-def drawn(status, width):
+def drawn(status, width, *flags):
     console = Console(file=io.StringIO(), width=width)
-    console.print(RunPanel(status))
+    console.print(RunPanel(status, *flags))
     return console.file.getvalue()
 
 
@@ -142,7 +142,12 @@ def test_workers_beyond_the_head_are_counted():
 
 
 def test_a_run_without_workers_says_how_to_start_one():
-    assert "dreamfleet worker --connect" in drawn(dataclasses.replace(STATUS, worker_list=()), 80)
+    gone = dataclasses.replace(STATUS, worker_list=())
+    told = drawn(gone, 80, "--connect tcp/lab:7448")
+    assert "no worker is there; start one with" in told
+    assert "dreamfleet worker --run night --connect tcp/lab:7448" in told
+    new = dataclasses.replace(gone, throughput=dataclasses.replace(gone.throughput, environment_steps=0))
+    assert "no workers yet; start one with" in drawn(new, 80)
 
 
 HOSTILE = "[/bold][red]\x1b[2J\x1b]0;owned\x07\u202e\ud800[link=x]\n2026"

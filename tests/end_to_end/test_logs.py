@@ -44,6 +44,8 @@ def test_what_ends_as_it_should_is_not_told_as_a_loss(processes, random_bundle):
     coordinator.wait_for("generation 0: mean")
     drained.popen.terminate()
     assert "left: " in coordinator.wait_for("worker drained/")
+    code, out, err = processes.call("status", "test", "--connect", processes.endpoint)
+    assert (code, "╭─ test · running" in out) == (0, True), err
     for verb, said in (("pause", "paused: paused by hand"), ("resume", "resumed"), ("stop", "")):
         assert processes.call(verb, "test", "--connect", processes.endpoint)[0] == 0
         coordinator.wait_for(said)

@@ -13,7 +13,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.seeds import TEST
-from dreamfleet.common.site import offer, reached
+from dreamfleet.common.site import offer, offer_run, reached
 
 if TYPE_CHECKING:
     from dreamfleet.common.bundle import Bundle
@@ -32,7 +32,7 @@ LONGEST = 20  # seconds of pictures in files, unless told otherwise
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     offer(parser, "connect")
-    parser.add_argument("--run", dest="run_name", metavar="RUN", help="the live run (default: the only one)")
+    offer_run(parser)
     whom = parser.add_mutually_exclusive_group()
     whom.add_argument("--worker", metavar="NAME", help="what this worker scores (default: the busiest worker's)")
     whom.add_argument("--best", action="store_true", help="the run's best mean so far, driven here track after track")
@@ -87,7 +87,7 @@ def _check(args: argparse.Namespace) -> None:
     if not 1 <= args.fps <= FASTEST or args.seed < 0 or (args.seconds is not None and args.seconds <= 0):
         raise UsageError(f"--fps must be 1 to {FASTEST}, --seconds above 0, --seed at least 0")
     if args.controller and args.run_name:
-        raise UsageError("give either --run, to watch a live run, or --controller, which needs none")
+        raise UsageError("give either a live run to watch, or --controller, which needs none")
     if args.generation is not None and not args.controller:
         raise UsageError("--generation is of a run on this disk: name it with --controller")
 
