@@ -133,8 +133,8 @@ class Client:
         rows = document.get("story")
         if not isinstance(rows, list):
             raise MalformedError(
-                f"the coordinator of run {document.get('run')} tells no story: its dreamfleet is older than this verb; "
-                "install a newer one there"
+                f"the coordinator of run {document.get('run')} tells no story: a worker's join file may not ask for "
+                "it, or its dreamfleet is older than this verb; take a viewer's, or install a newer one there"
             )
         return [from_plain(Event, known(Event, row)) for row in rows], int(document.get("total", len(rows)))
 

@@ -49,9 +49,10 @@ def run(args: argparse.Namespace) -> int:
     who = Authority(args.site.access_dir).issue(
         args.role, args.name, args.out, connect=args.endpoints, hosts=args.host, days=args.days
     )
+    called = f"; who works with it is called *.{who.seat}" if who.role == "worker" else ""
     text = (
         f"{args.out}: {who.role} {who.name} ({who.identity}) until {who.expires:%Y-%m-%d}; use it with --join, or "
-        "DREAMFLEET_JOIN"
+        f"DREAMFLEET_JOIN{called}"
     )
     answer(
         args, text, out=args.out, role=who.role, name=who.name, identity=who.identity, expires=who.expires.isoformat()

@@ -33,5 +33,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _row(each: Issued) -> dict[str, object]:
     state = "revoked" if each.revoked is not None else told_left(each.when - datetime.now(UTC))
-    return {"name": each.name, "role": each.role, "identity": each.identity, "state": state,
+    return {"name": each.name, "role": each.role, "identity": each.identity, "workers": _workers(each), "state": state,
             "expires": f"{each.when:%Y-%m-%d %H:%M}", "serial": each.serial or None}  # fmt: skip
+
+
+def _workers(each: Issued) -> str | None:
+    """How status and story name whoever works with that file."""
+    return f"*.{each.seat}" if each.role == "worker" else None

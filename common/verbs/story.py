@@ -6,13 +6,18 @@ import argparse
 import json
 import re
 import sys
+from typing import TYPE_CHECKING
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, print_rows
 from dreamfleet.common.site import offer, reached
 
+if TYPE_CHECKING:
+    from dreamfleet.common.client import Client
+
 SUMMARY = "tell what happened to a live run's workers and jobs of late: given, seen, silent, reissued, accepted, ..."
 EXTRAS = ()
+MOST_TOLD = 8  # workers by name
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +40,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--worker {args.worker!r}: give a name as `dreamfleet status` shows it")
     with Client(reached(args)) as client:
         events, total = client.story(args.run_name, args.worker or "", args.job or "")
+        if args.worker is not None and not events:
+            _check_known(client, args.run_name or client.status().run, args.worker)
     if args.json:
         print(json.dumps([vars(each) for each in events]))
         return 0
@@ -45,3 +52,15 @@ def run(args: argparse.Namespace) -> int:
     elif total > len(events):
         print(f"the last {len(events)} of {total} events that are kept", file=sys.stderr)
     return 0
+
+
+def _check_known(client: Client, run: str, worker: str) -> None:
+    """`UsageError` with the names of those that are known, unless this is a worker's or a host's."""
+    events, _ = client.story(run)  # of those that are gone, too
+    known = [*(each.worker for each in client.workers(run)), *(each.worker for each in events)]
+    hosts = list(dict.fromkeys(each.partition("/")[0] for each in known))
+    if worker in (*known, *hosts):
+        return
+    more = f" and {len(hosts) - MOST_TOLD} more" if len(hosts) > MOST_TOLD else ""
+    there = f"known are {', '.join(hosts[:MOST_TOLD])}{more}" if hosts else "none has come"
+    raise UsageError(f"run {run} knows no worker {worker!r}: {there}")

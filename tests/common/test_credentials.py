@@ -138,6 +138,7 @@ def test_the_verbs_make_list_and_take_back(tmp_path, capsys):
     assert main(["access", "list", *folder]) == 0
     listed = capsys.readouterr().out
     assert "revoked" in listed
+    assert listed.count("*.1") == 2  # as it was issued, and in the list
     assert "BEGIN" not in listed
     assert main(["access", "init", *folder]) == 2
     assert main(["access", "issue", "worker", "w2", *folder, "--connect", "tcp/h:1", "--out", f"{out}2"]) == 2

@@ -75,6 +75,8 @@ def test_the_story_of_a_killed_workers_jobs_is_told_while_the_run_lives(processe
     assert {each["job"].split("/")[1] for each in story("--job", "0/3")} == {"3"}
     code, _, err = processes.call("story", "test", "--connect", processes.endpoint, "--job", "three")
     assert (code, "write generation/index" in err) == (2, True)
+    code, _, err = processes.call("story", "test", "--connect", processes.endpoint, "--worker", "host-b")
+    assert (code, "knows no worker 'host-b': known are host-a" in err) == (2, True), err
 
 
 def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(processes):
@@ -84,6 +86,6 @@ def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(proc
         session.declare_queryable(key, lambda query: query.reply(key, status))
         for run in ((), ("night",)):
             code, _, err = processes.call("story", *run, "--connect", processes.endpoint)
-            assert (code, "run night tells no story: its dreamfleet is older" in err) == (1, True), err
+            assert (code, "run night tells no story: a worker's join file may not" in err) == (1, True), err
     code, _, err = processes.call("story", "night", "--connect", processes.endpoint)
     assert (code, "nobody answers" in err) == (1, True), err
