@@ -43,8 +43,8 @@ class Custody:
 
     @property
     def command(self) -> str:
-        """What continues the run once its coordinator has left."""
-        return self._again(self._folder)
+        """What continues the run once its coordinator has left, in whichever folder somebody is."""
+        return self._again(self._folder.absolute())
 
     def close(self) -> None:
         """Let go of the folder."""

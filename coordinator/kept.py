@@ -64,7 +64,7 @@ def choose_addresses(
 def again(folder: Path, join: object = None, access_dir: Path = SiteConfig.access_dir) -> str:
     """The command that continues the run in `folder`, as a person writes it: what is not kept with the run is said."""
     joined = () if join is None else ("--join", join)
-    access = () if access_dir == SiteConfig.access_dir else ("--access-dir", access_dir)
+    access = () if join is None or access_dir == SiteConfig.access_dir else ("--access-dir", access_dir)
     return spoken("coordinator", "--resume", folder.name, "--runs-dir", folder.parent, *joined, *access)
 
 

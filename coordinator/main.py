@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
 
@@ -49,6 +49,13 @@ class RunRequest:
         """Where the run lies."""
         return self.runs_dir / check_run_name(self.name)
 
+    @property
+    def anywhere(self) -> RunRequest:
+        """The same with paths that hold in whichever folder somebody is."""
+        access = self.access_dir if self.access_dir == SiteConfig.access_dir else self.access_dir.absolute()
+        join = None if self.join is None else self.join.absolute()
+        return replace(self, runs_dir=self.runs_dir.absolute(), join=join, access_dir=access)
+
     def again(self, folder: Path | None = None) -> str:
         """The command that continues the run, also in a `folder` that it was moved to."""
         return again(folder or self.folder, self.join, self.access_dir)
@@ -69,7 +76,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
     with run_lock(folder), ExitStack() as stack:
         journal = stack.enter_context(closing(_open(request, folder, settings, bundle)))
         served = stack.enter_context(closing(ServedBundle(folder / BUNDLE))) if bundle else None
-        custody = stack.enter_context(closing(Custody(journal, served, request.again)))
+        custody = stack.enter_context(closing(Custody(journal, served, request.anywhere.again)))
         service = _service(request, custody, served)
         on_stoppable(service.stop)
         fleet, strict = Fleet(request.network.beat, request.network.evaluation_share), request.network.strict
