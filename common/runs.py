@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -37,6 +38,7 @@ from dreamfleet.common.stored import (
 JOURNAL = "journal.sqlite"
 BUNDLE = "bundle.zip"
 CONTROLLER = "controller.npz"
+LOOKS = (0.01, 0.05)  # seconds until a lock is tried again: whoever asks whether a run is live has it for an instant
 ARCHIVE = "archive"
 ROLLOUTS = "rollouts"
 CONFIRMED = "confirmed"  # the fact's name
@@ -71,6 +73,12 @@ class RunFolder:
     def spec(self) -> TaskSpec:
         """What is scored in."""
         return self.settings.task
+
+    @property
+    def state(self) -> str:
+        """In words: why it ended; else live, while a coordinator of this host holds it, or open, to be continued."""
+        ended = self.ended
+        return f"ended: {ended}" if ended else "live" if _is_held(self.path) else "open"
 
     @property
     def uid(self) -> str:
@@ -362,10 +370,26 @@ def run_lock(path: Path) -> Iterator[None]:
         yield
 
 
+def _is_held(path: Path) -> bool:
+    """Whether somebody holds a run's folder, as far as this host can tell; nothing is written."""
+    import fcntl
+
+    with suppress(OSError), (path / "lock").open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # for an instant: closed at once
+        except BlockingIOError:
+            return True
+    return False
+
+
 def _flock(descriptor: int, path: Path) -> None:
     import fcntl
 
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise UsageError(f"run {path.name} is held by a live coordinator; stop it first") from None
+    for pause in (*LOOKS, None):
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if pause is None:
+                raise UsageError(f"run {path.name} is held by a live coordinator; stop it first") from None
+            time.sleep(pause)

@@ -43,8 +43,8 @@ def one(runs_dir: Path, name: str) -> dict[str, Any]:
         reported = course.confirmed or best_of(course.evaluations)
         return {
             "run": run.name,
-            "state": _state(run),
-            "sentence": printable(f"{_state(run)}; {told(reported)}"),
+            "state": printable(run.state),
+            "sentence": printable(f"{run.state}; {told(reported)}"),
             "facts": _facts(run, course, total),
             "settings": flat(settings),
             "world": _world(run),
@@ -95,15 +95,11 @@ def _row(path: Path) -> dict[str, Any]:
                 "best": best.mean if best else None,
                 "confirmed": confirmed.mean if confirmed else None,
                 "error": confirmed.error if confirmed else best.error if best else None,
-                "state": _state(run),
+                "state": printable(run.state),
                 "damaged": False,
             }
     except JournalError as error:
         return {**dict.fromkeys(COLUMNS), "run": printable(path.name), "state": printable(str(error)), "damaged": True}
-
-
-def _state(run: RunFolder) -> str:
-    return printable(f"ended: {run.ended}") if run.ended else "open"
 
 
 def _world(run: RunFolder) -> str:

@@ -6,10 +6,14 @@ import json
 from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any, ClassVar
+from warnings import catch_warnings, filterwarnings
 
-import cma
 import numpy as np
 from numpy.typing import NDArray
+
+with catch_warnings():
+    filterwarnings("ignore", "Could not import matplotlib")  # which a coordinator need not have
+    import cma
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.optimisers import pycma_state

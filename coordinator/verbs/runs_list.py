@@ -51,7 +51,7 @@ def _row(path: Path) -> dict[str, object]:
                 "evaluated": round(evaluations[-1].mean, 1) if evaluations else None,
                 "confirmed": round(confirmed.mean, 1) if confirmed else None,
                 "classes": run.classes.total,
-                "state": f"ended: {run.ended}" if run.ended else "open",
+                "state": run.state,
             }
     except JournalError as error:
         return {"run": path.name, "created": None, "task": None, "generations": None, "mean": None,

@@ -33,9 +33,9 @@ def bare(tmp_path):
     return site
 
 
-def call(bare, tmp_path, *words):
+def call(bare, tmp_path, *words, module=("-m", "dreamfleet")):
     seen = {**environment(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join([str(bare), str(ROOT)])}
-    command = [sys.executable, "-S", "-P", "-m", "dreamfleet", *words]
+    command = [sys.executable, "-S", "-P", *module, *words]
     return subprocess.run(command, env=seen, capture_output=True, text=True, check=False, timeout=60)
 
 
@@ -70,6 +70,11 @@ def test_a_run_that_needs_a_workers_packages_to_begin_says_which_extra_has_them(
     done = call(bare, tmp_path, "coordinator", "--task", "gym:LunarLander-v3", "--runs-dir", str(tmp_path / "runs"))
     assert done.returncode == 2
     assert "no module 'gymnasium' here; pip install 'dreamfleet[worker]'" in done.stderr
+
+
+def test_the_search_says_nothing_of_pictures_that_nobody_asked_for(bare, tmp_path):
+    done = call(bare, tmp_path, module=("-c", "import dreamfleet.coordinator.optimisers.pycma"))
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_worker_needs_no_folder_for_runs():

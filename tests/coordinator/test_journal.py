@@ -149,6 +149,19 @@ def test_a_folder_is_held_by_one(folder):
         pass
 
 
+def test_a_run_is_live_while_its_folder_is_held(journal, folder):
+    journal.commit()
+    with RunFolder(folder) as run:
+        assert run.state == "open"
+        with run_lock(folder):
+            assert run.state == "live"
+        assert run.state == "open"
+    journal.set_fact("ended", "7 generations")
+    journal.commit()
+    with RunFolder(folder) as run, run_lock(folder):
+        assert run.state == "ended: 7 generations"
+
+
 def test_a_journal_that_is_overwritten_in_place_is_noticed_and_readers_are_not(journal, folder):
     fill(journal)
     journal.begin_incarnation()

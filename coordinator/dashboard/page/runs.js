@@ -133,8 +133,8 @@ export const showRun = guarded(async (current, name) => {
   if (!current()) return;
   const page = open("run");
   say(page.run, found.run);
-  say(page.state, found.state.startsWith("ended") ? "finished" : "open");
-  page.state.dataset.tone = found.state.startsWith("ended") ? "done" : "wait";
+  say(page.state, found.state.startsWith("ended") ? "finished" : found.state);
+  page.state.dataset.tone = found.state.startsWith("ended") ? "done" : found.state === "live" ? "good" : "wait";
   say(page.sentence, found.sentence);
   facts(page.facts, found.facts);
   facts(page.settings, found.settings);
