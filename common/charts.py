@@ -54,5 +54,5 @@ def _draw_confirmed(axes: Any, run: RunFolder) -> None:
     if (confirmed := run.confirmation()) is not None:
         axes.errorbar(
             confirmed.generation, confirmed.mean, confirmed.error, fmt="*", color="tab:red", capsize=3, markersize=10,
-            label=f"reported: confirmed on {confirmed.episodes} fresh tracks (± standard error)",
+            label=f"reported: confirmed on {confirmed.episodes} fresh seeds (± standard error)",
         )  # fmt: skip

@@ -11,7 +11,7 @@ from typing import Any
 from dreamfleet.common.effort import counted
 from dreamfleet.common.printable import plural
 from dreamfleet.common.status import Progress, Status
-from dreamfleet.common.stored import told
+from dreamfleet.common.stored import told, with_error
 
 PACED_BY = 10  # closed generations whose median is the pace: one that was paused for hours tells nothing
 WORKING = ("running", "evaluating")
@@ -78,7 +78,7 @@ def summary(status: Status) -> str:
     if status.over:
         return sentence(status)
     opened, best = status.generation, status.confirmed or status.best
-    score = "nothing evaluated yet" if best is None else f"best mean {best.mean:.1f} ± {best.error:.1f}"
+    score = "nothing evaluated yet" if best is None else f"best mean {with_error(best)}"
     workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
     return (
         f"{status.state}, generation {opened.number} ({opened.episodes_done}/{opened.episodes} episodes), {score}, "

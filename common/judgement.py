@@ -103,7 +103,9 @@ def _check(drives: tuple[Drive, ...]) -> None:
 
 
 def _score(found: Evaluated) -> str:
-    error = "" if found.error is None else f" ± {found.error:.1f} (standard error)"
+    if found.error is None:
+        return f"{found.mean:.1f} on one seed; judged by gymnasium's own environment"
+    error = f" ± {found.error:.1f} (standard error)"
     return (
         f"{found.mean:.1f}{error} on {len(found.drives)} seeds, {found.least:.0f} to {found.most:.0f}, "
         f"median {found.median:.0f}, standard deviation {found.std:.1f}; judged by gymnasium's own environment"

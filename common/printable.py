@@ -21,9 +21,16 @@ def one_line(text: str) -> str:
     return printable(" ".join(text.split()))
 
 
-def plural(count: float, noun: str) -> str:
-    """A number with its noun, of which there may be one: 1 seed, 1,000 seeds, 1.5 minutes."""
-    return f"{count:{',' if isinstance(count, int) else 'g'}} {noun}{'' if count == 1 else 's'}"
+def plural(count: float, noun: str, nouns: str = "") -> str:
+    """A number with its noun, of which there may be one: 1 seed, 1,000 seeds, 1.5 minutes, 2 batches."""
+    return f"{count:{',' if isinstance(count, int) else 'g'}} {noun if count == 1 else nouns or f'{noun}s'}"
+
+
+def setting(value: object) -> str:
+    """A setting's value as people write it: yes or no, the parts of a list after one another."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
 def printable_lines(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
@@ -75,6 +76,7 @@ def fitted(unit: str, console: Console) -> Progress:
 
 @contextmanager
 def progress_bar(description: str, total: int, unit: str) -> Iterator[Bar]:
-    """A bar on stderr with time gone and time left."""
-    with fitted(unit, Console(stderr=True)) as progress:
+    """A bar on stderr with time gone and time left; none where warnings and errors alone are wanted (`-q`)."""
+    quiet = logging.getLogger("dreamfleet").level > logging.INFO
+    with fitted(unit, Console(stderr=True, quiet=quiet)) as progress:
         yield Bar(progress, description, total)

@@ -71,7 +71,7 @@ def offer_everywhere(parser: argparse.ArgumentParser) -> None:
     offer(parser, "log_level", "log_format")
     parser.add_argument(
         "-q", "--quiet", dest="log_level", action="store_const", const="warning", default=argparse.SUPPRESS,
-        help="log warnings and errors alone",
+        help="log warnings and errors alone, and draw no progress bar",
     )  # fmt: skip
 
 

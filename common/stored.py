@@ -14,6 +14,7 @@ from dreamfleet.common.errors import JournalError
 from dreamfleet.common.fields import OPTIONAL, written
 from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.messages import Between, Count, Horizon, Length, Packages, Patience, Share, TaskSpec
+from dreamfleet.common.printable import plural
 
 MOST_STAGES = 32  # of a schedule: a status carries them too
 Population = Annotated[int, Between(2, 10**5)]
@@ -209,7 +210,14 @@ def told(found: StoredEvaluation | StoredConfirmation | None) -> str:
     """A mean's score in words, and whether it can be trusted."""
     if found is None:
         return "the last mean; it was not evaluated"
-    score = f"generation {found.generation}'s mean scored {found.mean:.1f} ± {found.error:.1f} (standard error)"
+    score = f"generation {found.generation}'s mean scored {with_error(found)}"
+    score += " (standard error)" if found.episodes > 1 else ""
     if isinstance(found, StoredConfirmation):
-        return f"{score} on {found.episodes} fresh validation tracks; confirmed: they took no part in its choice"
-    return f"{score} on {found.episodes} validation tracks; provisional: it is the best of several looks"
+        seeds = plural(found.episodes, "fresh validation seed")
+        return f"{score} on {seeds}; confirmed: they took no part in its choice"
+    return f"{score} on {plural(found.episodes, 'validation seed')}; provisional: it is the best of several looks"
+
+
+def with_error(found: StoredEvaluation | StoredConfirmation) -> str:
+    """A mean with its standard error, which a single episode does not have."""
+    return f"{found.mean:.1f}" if found.episodes == 1 else f"{found.mean:.1f} ± {found.error:.1f}"

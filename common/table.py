@@ -16,10 +16,10 @@ from rich.text import Text
 from dreamfleet.common.cells import bar, bars, cell_lines, cells_wanted
 from dreamfleet.common.credentials import SOON, told_left
 from dreamfleet.common.eta import eta_of, sentence
-from dreamfleet.common.printable import printable
+from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.roster import Roster
 from dreamfleet.common.status import FailureStatus, OpenGeneration, Population, Progress, Status
-from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration, with_error
 from dreamfleet.common.tasks import is_own
 
 STATE_STYLES = {
@@ -145,8 +145,8 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
     yield 2, "reported", _reported(status)
     rate, steps = status.throughput.steps_per_second, status.throughput.environment_steps
     yield 3, "throughput", f"{rate:,.0f} steps/s, {steps:,} in all"
-    resent = f", {waste.resent_batches} batches sent again" if waste.resent_batches else ""
-    yield 4, "waste", f"{waste.share:.1%}, {waste.reissued} jobs issued again{resent}"
+    resent = f", {plural(waste.resent_batches, 'batch', 'batches')} sent again" if waste.resent_batches else ""
+    yield 4, "waste", f"{waste.share:.1%}, {plural(waste.reissued, 'job')} issued again{resent}"
     if status.classes.total:
         yield 4 if status.classes.mixed else 7, "hosts", status.classes.told
     if status.expires is not None:
@@ -197,8 +197,8 @@ def _optimiser(settings: RunSettings) -> str:
 def _evaluated(each: StoredEvaluation | StoredConfirmation | None) -> str:
     if each is None:
         return "-"
-    tracks = f"{each.episodes} fresh tracks" if isinstance(each, StoredConfirmation) else f"{each.episodes} tracks"
-    return f"{each.mean:.1f} ± {each.error:.1f} on {tracks} (generation {each.generation})"
+    seeds = plural(each.episodes, "fresh seed" if isinstance(each, StoredConfirmation) else "seed")
+    return f"{with_error(each)} on {seeds} (generation {each.generation})"
 
 
 def _reported(status: Status) -> str:

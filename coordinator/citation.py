@@ -50,7 +50,7 @@ def _rows(run: RunFolder, controller: Controller, receipt: Receipt, settings: Ru
     size = f"population {settings.population} x {settings.episodes} episodes, sigma0 {settings.sigma0:g}"
     yield "search", f"{settings.optimiser}, {settings.covariance}, {size}, {receipt.generations} generations"
     yield "spent", receipt.total.told
-    yield "seed", f"{settings.seed}; training tracks follow from it, from {TRAINING_FIRST} up"
+    yield "seed", f"{settings.seed}; training seeds follow from it, from {TRAINING_FIRST} up"
     for what, (first, count) in (receipt.seeds or {}).items():
         yield f"seeds of the {what}", f"{first} to {first + count - 1}"
     if receipt.start is not None:
@@ -79,7 +79,7 @@ def _commands(run: RunFolder) -> dict[str, str]:
             "replay", run.name, "--candidate", f"{last}/0", *beside,
         ),
         "the whole run again, to the bit": ("repeat", controller, *beside),
-        "its score on unseen tracks": ("evaluate", "--controller", controller, "--episodes", "100"),
+        "its score on unseen seeds": ("evaluate", "--controller", controller, "--episodes", "100"),
     }  # fmt: skip
     return {why: shlex.join(("dreamfleet", *each)) for why, each in words.items()}
 

@@ -100,7 +100,7 @@ def difference(one: Scores, other: Scores) -> Difference | str:
     try:
         return Difference.of(one, other)
     except UsageError:
-        return "no difference can be told: fewer than 2 tracks are in both"
+        return "no difference can be told: fewer than 2 seeds are in both"
 
 
 def _flat(plain: dict[str, Any], prefix: str = "") -> dict[str, Any]:

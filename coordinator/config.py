@@ -62,7 +62,7 @@ class RunConfig:
     hidden_units: int = option(8, "units of a hidden controller's layer")
     features: Literal["zh", "z"] = option("zh", "what the controller sees: latent and hidden state, or latent alone")
     population: int = option(32, "candidates a generation")
-    episodes: int = option(2, "episodes a candidate, on the same fresh tracks for all")
+    episodes: int = option(2, "episodes a candidate, on the same fresh seeds for all")
     sigma0: float = option(0.1, "first step size")
     optimiser: str = option("cma", "what asks for candidates: cma, cmaes-lra, cmaes-sep, or yours as module:attribute")
     optimiser_options: tuple[str, ...] = option((), "the optimiser's own options, each as name=value")
@@ -89,17 +89,17 @@ class RunConfig:
     heat: float = option(
         1.0, "multiply the temperature by this each time that the evaluated mean falls clearly behind; 1: never"
     )
-    seed: int = option(1, "makes the run: population and tracks follow from it")
+    seed: int = option(1, "makes the run: population and training seeds follow from it")
     evaluate_every: int = option(25, "drive the mean in reality every so many generations; 0: never")
-    evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation tracks")
+    evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation seeds")
     confirm_episodes: int | None = option(
         None,
         "confirm what is reported as the run ends, after its limits: the best evaluated means drive about twice as "
-        "many tracks in rounds, then the one that is left so many fresh ones, which give its score (default as many "
+        "many seeds in rounds, then the one that is left so many fresh ones, which give its score (default as many "
         "as of an evaluation, 2 at least); 0: never",
     )
     collect_every: int = option(0, "keep rollouts of the mean for training, every so many generations; 0: never")
-    collect_episodes: int = option(8, "drives that are kept each time, on training tracks")
+    collect_episodes: int = option(8, "drives that are kept each time, on training seeds")
     schedule: str | None = option(
         None,
         "a TOML file of stages, each a [[stage]] with its end (generations, steps, score) and its own horizon, "
@@ -118,7 +118,7 @@ class RunConfig:
             if value > most:
                 raise UsageError(f"{flag} must be at most {most}, not {value}")
         if self.confirm_episodes == 1:
-            raise UsageError("--confirm-episodes must be 0 or at least 2: one track has no standard error")
+            raise UsageError("--confirm-episodes must be 0 or at least 2: one episode has no standard error")
         check_task(self.task)
         if self.racing and self.episodes < 2:
             raise UsageError("--racing needs at least 2 episodes: there is no second half of one")

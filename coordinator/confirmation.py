@@ -17,6 +17,7 @@ from math import fsum
 import numpy as np
 
 from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.printable import plural
 from dreamfleet.common.seeds import CHOOSING, CONFIRMING, validation_seeds
 from dreamfleet.common.stored import StoredConfirmation
 from dreamfleet.coordinator.jobs import Work, make_work
@@ -66,12 +67,12 @@ class Confirmation:
     @property
     def round(self) -> str:
         """The open round in words."""
-        tracks = len(self._digests) // len(self._standing)
+        seeds = len(self._digests) // len(self._standing)
         if len(self._standing) == 1:
-            fresh = f"{tracks} fresh tracks" if tracks > 1 else "a fresh track"
+            fresh = plural(seeds, "fresh seed")
             return f"confirming: generation {self._standing[0].generation}'s mean on {fresh}, for its score"
         names = ", ".join(str(each.generation) for each in self._standing)
-        more = f"{tracks} more tracks" if tracks > 1 else "another track"
+        more = plural(seeds, "more seed")
         return f"confirming: the means of generations {names} on {more} each; the better half goes on"
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dreamfleet.common.printable import plural
 from dreamfleet.coordinator.config import LimitsConfig
 from dreamfleet.coordinator.evaluation import Evaluations
 from dreamfleet.coordinator.history import History
@@ -10,11 +11,11 @@ from dreamfleet.coordinator.history import History
 def stop_reason(limits: LimitsConfig, history: History, evaluations: Evaluations) -> str | None:
     """The limit that is reached, in words; `None` while there is none. The cost does not grow with the run."""
     if limits.generations and len(history) >= limits.generations:
-        return f"{len(history)} generations"
+        return plural(len(history), "generation")
     if limits.steps and history.steps >= limits.steps:
         return f"{history.steps} environment steps"
     if limits.minutes and history.seconds >= 60 * limits.minutes:
-        return f"{limits.minutes:g} minutes"
+        return plural(limits.minutes, "minute")
     best = evaluations.best
     if limits.target is not None and best is not None and best.mean >= limits.target:
         return f"the mean of generation {best.generation} reached {best.mean:.1f}"

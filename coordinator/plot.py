@@ -85,7 +85,7 @@ def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Sequence[fl
     if curve.confirmed is not None:
         axes.errorbar(
             spent[count], curve.confirmed.score, curve.confirmed.error, fmt="*", color=colour, markersize=13, capsize=3,
-            markeredgecolor="black", label=f"{curve.name}, confirmed on fresh tracks: {curve.confirmed.score:.0f}",
+            markeredgecolor="black", label=f"{curve.name}, confirmed on fresh seeds: {curve.confirmed.score:.0f}",
         )  # fmt: skip
 
 
@@ -100,7 +100,7 @@ def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]]) -> None:
 
 def _score_axis(curves: Sequence[LearningCurve]) -> str:
     (world,) = {each.world for each in curves}
-    return f"{world}: score of the mean, whole episodes\non validation tracks, ± standard error"
+    return f"{world}: score of the mean, whole episodes\non validation seeds, ± standard error"
 
 
 def _save(figure: Any, path: Path) -> None:

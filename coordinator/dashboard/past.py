@@ -11,7 +11,7 @@ from typing import Any
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.effort import START_EFFORT, Effort, start_effort
 from dreamfleet.common.errors import DreamfleetError, JournalError
-from dreamfleet.common.printable import printable
+from dreamfleet.common.printable import printable, setting
 from dreamfleet.common.runs import RunFolder, open_run, run_paths
 from dreamfleet.common.stages import stages_of
 from dreamfleet.common.stored import RunSettings, StoredGeneration, best_of, told
@@ -74,8 +74,7 @@ def flat(settings: RunSettings) -> Facts:
             for number, inner in enumerate(value, 1):
                 walk(f"{prefix}.{number}", inner)
         elif value not in (None, "", ()):
-            told_value = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
-            rows.append((prefix, printable(told_value)))
+            rows.append((prefix, printable(setting(value))))
 
     walk("", asdict(settings))
     return rows
@@ -125,7 +124,7 @@ def _facts(run: RunFolder, course: Course, total: Effort) -> Facts:
         ("hosts", run.classes.told),
         ("best evaluation", NONE if best is None else f"{score(best)}, generation {best.generation}"),
         ("confirmed", NONE if course.confirmed is None else
-         f"{score(course.confirmed)} on {course.confirmed.episodes} fresh tracks"),
+         f"{score(course.confirmed)} on {course.confirmed.episodes} fresh seeds"),
     ]  # fmt: skip
     return [(name, printable(value)) for name, value in facts]
 

@@ -20,8 +20,9 @@ SUMMARY = (
     "compare runs: settings that differ, scores at equal steps and core-hours, confirmed scores, each to the first"
 )
 EXTRAS = ()
-SAME_TRACKS = (
-    "all runs drive the same validation tracks, so their ± are not independent: differences are told track by track"
+SAME_SEEDS = (
+    "all runs are judged on the same validation seeds, so their ± are not independent: differences are told seed by "
+    "seed"
 )
 
 
@@ -59,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     for each in equal:
         print(_told(sides, each))
     if found:
-        print(f"\n{SAME_TRACKS}")
+        print(f"\n{SAME_SEEDS}")
         print("\n".join(f"{each['of']}: {each['run']} less {each['against']}: {each['told']}" for each in found))
     return 0
 
@@ -72,7 +73,7 @@ def _row(side: Side) -> dict[str, object]:
         "spent": side.total.told,
         "last evaluation": None if last is None else f"{last.score:.1f} ± {last.error:.1f}",
         "confirmed": None if confirmed is None else f"{confirmed.mean:.1f} ± {confirmed.error:.1f} on "
-        f"{confirmed.episodes} tracks",
+        f"{confirmed.episodes} seeds",
     }  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from typing import Any
 
 from dreamfleet.common.listing import add_json, print_rows
+from dreamfleet.common.printable import setting
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.site import offer
 from dreamfleet.common.stages import BegunStage, begun_stages, stages_of
@@ -76,7 +77,7 @@ def _flat(settings: RunSettings) -> dict[str, object]:
     del plain["stages"]
     for name, value in plain.items():
         flat |= {name: value} if not isinstance(value, dict) else _within(name, value)
-    return flat
+    return {name: None if value in (None, "", ()) else setting(value) for name, value in flat.items()}
 
 
 def _within(name: str, parts: dict[str, object]) -> dict[str, object]:

@@ -37,6 +37,10 @@ def test_figures_are_of_all_drives_and_a_long_one_counts_for_more():
     assert (found.speed, found.braking) == (pytest.approx(60.0), pytest.approx(0.1))
 
 
+def test_one_drive_has_no_spread():
+    assert scored(839.0).told.startswith("839.0 on one seed; judged by")
+
+
 def test_a_world_that_tells_nothing_leaves_its_figures_out():
     found = scored(1.0).evaluated
     assert (found.finished, found.speed, found.braking, found.error) == (None, None, None, None)

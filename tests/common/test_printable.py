@@ -1,6 +1,6 @@
 import pytest
 
-from dreamfleet.common.printable import printable
+from dreamfleet.common.printable import plural, printable, setting
 
 
 @pytest.mark.parametrize(
@@ -15,3 +15,12 @@ from dreamfleet.common.printable import printable
 )
 def test_what_a_terminal_would_obey_is_written_out(text, shown):
     assert printable(text) == shown
+
+
+def test_of_one_there_is_one():
+    told = plural(1, "seed"), plural(1000, "seed"), plural(1.0, "minute"), plural(1.5, "minute")
+    assert (*told, plural(2, "batch", "batches")) == ("1 seed", "1,000 seeds", "1 minute", "1.5 minutes", "2 batches")
+
+
+def test_settings_are_told_as_people_write_them():
+    assert [setting(each) for each in (True, False, ("numpy", "cma"), 0.1)] == ["yes", "no", "numpy, cma", "0.1"]

@@ -1,11 +1,12 @@
 """A bar's line in a terminal of any width."""
 
 import io
+import logging
 
 import pytest
 from rich.console import Console
 
-from dreamfleet.common.progress import Bar, fitted
+from dreamfleet.common.progress import Bar, fitted, progress_bar
 
 NOTE = "likelihood -12.345  reward 0.0123"
 
@@ -23,3 +24,13 @@ def test_what_matters_least_is_left_out_and_nothing_is_cut(width, kept, left_out
         assert part in line
     assert "…" not in line
     assert not any(part in line for part in left_out)
+
+
+@pytest.mark.parametrize(("level", "drawn"), [("INFO", True), ("WARNING", False)])
+def test_a_verb_that_is_to_be_quiet_draws_none(capsys, monkeypatch, level, drawn):
+    log = logging.getLogger("dreamfleet")
+    monkeypatch.setattr(log, "level", log.level)  # and so it is put back
+    log.setLevel(level)
+    with progress_bar("evaluate", 4, "episodes") as bar:
+        bar.move(4)
+    assert ("evaluate" in capsys.readouterr().err) == drawn

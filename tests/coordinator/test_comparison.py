@@ -66,7 +66,7 @@ def test_the_verb_tells_the_difference_in_words_and_as_json(runs, capsys):
     words = ["runs", "compare", "dream", "reality", "--runs-dir", str(runs)]
     assert cli.main(words) == 0
     text = capsys.readouterr().out
-    assert "the same validation tracks" in text
+    assert "the same validation seeds" in text
     assert "confirmed: reality less dream: +1.1 ± 0.2 (standard error) on 4 equal seeds: better" in text
     assert cli.main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

@@ -178,7 +178,7 @@ def test_the_end_waits_for_every_drive(bench):
         for part in bench.parts(job):
             bench.upload(name, part)
         bench.deliver(name, result_of(job))
-    assert bench.run.ended == "1 generations"
+    assert bench.run.ended == "1 generation"
     assert bench.kept() == [drive_of(job) for _, job in jobs]
 
 

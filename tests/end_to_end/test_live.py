@@ -119,7 +119,7 @@ def test_fifty_views_one_of_which_never_looks_leave_the_run_as_it_is(processes, 
         assert [len(sights(view, 2)) for view in views[1:]] == [2] * 49
         while not views[1].over:
             views[1].next(0.1)
-        assert (views[1].status.state, views[1].status.why) == ("ended", "1 generations")
+        assert (views[1].status.state, views[1].status.why) == ("ended", "1 generation")
         assert watched.finish()[0] == 0
     told = []
     for name in ("plain", "watched"):
@@ -160,7 +160,7 @@ def test_the_verb_ends_with_the_run_and_says_how_that_ended(processes, settings,
     live.wait_for("watching run test")
     processes.worker("--task", tasks.PAINTED)
     assert coordinator.finish()[0] == 0
-    live.wait_for("run test ended: 1 generations")
+    live.wait_for("run test ended: 1 generation")
     code, out = live.finish()
     assert (code, (tmp_path / "live.mp4").stat().st_size > 1000) == (0, True), out
 

@@ -20,7 +20,7 @@ def offer_videos(parser: argparse.ArgumentParser) -> None:
     """Add what both verbs take."""
     parser.add_argument(
         "--seed", type=int, nargs="+", default=[TEST.start], metavar="N",
-        help=f"the track (default {TEST.start}); of several each has a video of its own, drive-N.mp4",
+        help=f"the seed, as of a track (default {TEST.start}); of several each has a video of its own, drive-N.mp4",
     )  # fmt: skip
     parser.add_argument("--steps", type=int, default=1000, help="steps at most (default 1000)")
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help="the video to write (default drive.mp4)")
@@ -58,8 +58,8 @@ def record_videos(args: argparse.Namespace, videos: dict[int, Path], record: Rec
                 score = record(seed, video, move, stop)
             if stop():
                 raise StoppedError(
-                    f"stopped: {video} shows the first {driven} steps on track {seed}, with a score of {score:.1f}; "
+                    f"stopped: {video} shows the first {driven} steps on seed {seed}, with a score of {score:.1f}; "
                     "the same command records whole drives"
                 )
-            answer(args, f"{video}: score {score:.1f} on track {seed}", video=video, score=score, seed=seed)
+            answer(args, f"{video}: score {score:.1f} on seed {seed}", video=video, score=score, seed=seed)
     return 0

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dreamfleet.common.judgement import Judgement
     from dreamfleet.worker.scoring.agents import Agent
 
-SUMMARY = "judge a controller on unseen tracks, in gymnasium's own unmodified environment"
+SUMMARY = "judge a controller on unseen seeds, in gymnasium's own unmodified environment"
 EXTRAS = ("worker",)
 
 
@@ -28,8 +28,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--controller", help="a file, a run, one that ships, or a trained agent's file")
     parser.add_argument("--run", dest="run_name", metavar="RUN", help="judge what this live run reports instead")
     offer(parser, "connect", texts={"connect": "ask the live run here (give --run too where there are several)"})
-    parser.add_argument("--episodes", type=int, default=100, help="tracks (default 100)")
-    parser.add_argument("--first-seed", type=int, default=TEST.start, help=f"first track's seed (default {TEST.start})")
+    parser.add_argument("--episodes", type=int, default=100, help="whole episodes, one a seed (default 100)")
+    parser.add_argument("--first-seed", type=int, default=TEST.start, help=f"the first seed (default {TEST.start})")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
     offer(parser, "runs_dir")
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     name, agent = _choose(args)
     seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
     if seeds[0] not in TEST or seeds[-1] not in TEST:
-        print(f"note: test tracks are {TEST.start} to {TEST.stop - 1}; some of these are not", file=sys.stderr)
+        print(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; some of these are not", file=sys.stderr)
     judgement = judge(name, agent, seeds, args.jobs)
     print(judgement.to_json() if args.json else judgement.told, flush=True)
     if args.out:
@@ -64,7 +64,7 @@ def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> Judgeme
     def move(drives: list[Drive]) -> None:
         bar.move(len(drives), f"mean {sum(each.score for each in drives) / len(drives):.1f}")
 
-    with progress_bar("evaluate", len(seeds), "tracks") as bar:
+    with progress_bar("evaluate", len(seeds), "episodes") as bar:
         return judgement(name, agent, seeds, jobs, move)
 
 

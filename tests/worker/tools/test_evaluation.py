@@ -81,7 +81,7 @@ def test_the_verb_reports_every_score_and_warns_of_tracks_that_are_no_test_track
     )  # fmt: skip
     report = json.loads(out)
     assert code == 0
-    assert "test tracks are 10000 to 19999" in err
+    assert "test seeds are 10000 to 19999" in err
     assert report["seeds"] == [9_999, 10_000]
     assert report["mean"] == pytest.approx(sum(report["scores"]) / 2)
     assert (report["task"], report["bundle"]) == (tasks.TOY, random_bundle.sha256)
