@@ -14,6 +14,7 @@ from itertools import groupby
 from typing import Any
 
 from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.printable import plural
 from dreamfleet.common.stored import NAMED, RunSettings, StageSettings, StoredEvaluation, StoredGeneration
 
 
@@ -42,7 +43,7 @@ class Stage:
     def ending(self) -> str:
         """What ends it, in words."""
         end = self.end
-        said = [f"{end.generations} generations"] if end.generations else []
+        said = [plural(end.generations, "generation")] if end.generations else []
         said += [f"{end.steps} environment steps"] if end.steps else []
         said += [f"a score of {end.score:g}"] if end.score is not None else []
         return f"until {' or '.join(said)}" if said else "to the end"
@@ -177,7 +178,7 @@ class Stages:
         """What the latest stage ends by before generation `_seen`; empty where it goes on."""
         end, since = self._begun[-1].stage.end, self._begun[-1].since
         if end.generations and self._seen - since >= end.generations:
-            return f"{self._seen - since} generations"
+            return plural(self._seen - since, "generation")
         if end.steps and self._steps >= end.steps:
             return f"{self._steps} environment steps"
         found = finished.get(self.awaited(self._seen))

@@ -81,7 +81,10 @@ class Journal:
         """
         path = folder / JOURNAL
         if path.exists():
-            raise JournalError(f"run {folder.name} exists: choose another --run, or continue it with --resume")
+            raise JournalError(
+                f"run {folder.name} exists: choose another --run, continue it with --resume {folder.name}, or delete it "
+                f"with `dreamfleet runs delete {folder.name}`"
+            )
         aside = path.with_suffix(".new")
         created = datetime.now(UTC).isoformat(timespec="seconds")
         own = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": created}

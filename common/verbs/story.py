@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 SUMMARY = "tell what happened to a live run's workers and jobs of late: given, seen, silent, reissued, accepted, ..."
 EXTRAS = ()
 MOST_TOLD = 8  # workers by name
+LAST = 40  # events that people are shown unless they say otherwise
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +27,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--worker", metavar="W", help="of this worker, or of all lives of this host's worker")
     which.add_argument("--job", metavar="G/I", help="of this candidate's jobs: generation/index, such as 3/0")
+    parser.add_argument(
+        "--last", type=int, metavar="N", help=f"so many events at most (default {LAST}; with --json all that are told)"
+    )
     offer(parser, "connect")
     add_json(parser)
 
@@ -38,10 +42,13 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--job {args.job!r}: write generation/index, such as 3/0")
     if args.worker is not None and not re.fullmatch(r"[A-Za-z0-9._/-]+", args.worker):
         raise UsageError(f"--worker {args.worker!r}: give a name as `dreamfleet status` shows it")
+    if args.last is not None and args.last < 1:
+        raise UsageError("--last must be at least 1")
     with Client(reached(args)) as client:
         events, total = client.story(args.run_name, args.worker or "", args.job or "")
         if args.worker is not None and not events:
             _check_known(client, args.run_name or client.status().run, args.worker)
+    events = events[-(args.last or (len(events) if args.json else LAST)) :]
     if args.json:
         print(json.dumps([vars(each) for each in events]))
         return 0
@@ -50,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     if not events:
         print("nothing of that is kept: it is too long ago, or not yet", file=sys.stderr)
     elif total > len(events):
-        print(f"the last {len(events)} of {total} events that are kept", file=sys.stderr)
+        print(f"the last {len(events)} of {total} events that are kept; --last tells more", file=sys.stderr)
     return 0
 
 

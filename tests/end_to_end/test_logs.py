@@ -73,6 +73,9 @@ def test_the_story_of_a_killed_workers_jobs_is_told_while_the_run_lives(processe
     assert whats[0] == "joined"
     assert {"given", "accepted", "reissued"} <= set(whats)
     assert {each["job"].split("/")[1] for each in story("--job", "0/3")} == {"3"}
+    assert len(story("--last", "3")) == 3
+    code, out, err = processes.call("story", "test", "--connect", processes.endpoint, "--last", "2")
+    assert (code, len(out.splitlines()), "the last 2 of " in err) == (0, 3, True), err
     code, _, err = processes.call("story", "test", "--connect", processes.endpoint, "--job", "three")
     assert (code, "write generation/index" in err) == (2, True)
     code, _, err = processes.call("story", "test", "--connect", processes.endpoint, "--worker", "host-b")
