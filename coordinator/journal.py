@@ -82,8 +82,8 @@ class Journal:
         path = folder / JOURNAL
         if path.exists():
             raise JournalError(
-                f"run {folder.name} exists: choose another --run, or continue it with --resume; `dreamfleet runs delete "
-                f"{folder.name}` removes it"
+                f"run {folder.name} exists: choose another --run, or continue it with --resume; "
+                f"`dreamfleet runs delete {folder.name}` removes it"
             )
         aside = path.with_suffix(".new")
         created = datetime.now(UTC).isoformat(timespec="seconds")
