@@ -34,8 +34,8 @@ def worker_command(network: Network, run: str, task: str) -> str:
     """
     addresses = [_reached(each) for each in network.listen or network.connect]
     where = ("--connect", *addresses) if network.credentials is None else ("--join", "FILE")
-    told = ("--task", task) if is_own(task) else ()
-    return shlex.join(("dreamfleet", "worker", "--run", run, *where, *told))
+    own = ("--task", task) if is_own(task) else ()
+    return shlex.join(("dreamfleet", "worker", "--run", run, *where, *own))
 
 
 def _reached(endpoint: str) -> str:
