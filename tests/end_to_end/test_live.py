@@ -168,7 +168,7 @@ def test_the_verb_ends_with_the_run_and_says_how_that_ended(processes, settings,
 def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
     for flags, said in (
         (("--controller", "tiny"), "write a file by --out"),
-        (("--controller", "tiny", "--run", "x", "--out", tmp_path / "a"), "give either --run"),
+        (("--controller", "tiny", "--run", "x", "--out", tmp_path / "a"), "give either a live run"),
         (("--generation", 3, "--out", tmp_path / "a"), "name it with --controller"),
         (("--fps", 0), "--fps must be 1 to 50"),
         (("--controller", "nothing", "--out", tmp_path / "a"), "no controller 'nothing'"),
