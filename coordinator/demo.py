@@ -157,11 +157,11 @@ class Demo:
         arguments = [text for name, value in flags.items() for text in (f"--{name}", value)]
         with ExitStack() as stack:
             log = logs / "coordinator.log"
-            coordinator = stack.enter_context(Child("coordinator", *arguments, log=log))
+            coordinator = stack.enter_context(Child("coordinator", *arguments, inside=leash(), log=log))
             client = stack.enter_context(self._connect(coordinator))
             for name in (f"core-{number}" for number in range(workers)):
-                where = ("--connect", self._endpoint, "--run", stage.run)
-                stack.enter_context(Child("worker", *where, "--name", name, "--slots", 1, log=logs / f"{name}.log"))
+                where = ("--connect", self._endpoint, "--run", stage.run, "--name", name, "--slots", 1)
+                stack.enter_context(Child("worker", *where, inside=leash(), log=logs / f"{name}.log"))
             self._watch(client, coordinator.popen, stage.run)
             if coordinator.finish()[0] != 0:
                 raise DreamfleetError(f"the coordinator failed; its words are in {log}")

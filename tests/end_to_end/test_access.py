@@ -218,6 +218,14 @@ def answered(replies):
     return any(reply.ok for reply in replies)
 
 
+def test_a_worker_leaves_before_its_join_file_ends_and_says_so(processes, access, endpoint, random_bundle):
+    begin(processes, access, endpoint, random_bundle, "--generations", 10_000)
+    access.authority.issue("worker", "brief", access.path("brief"), connect=[endpoint], days=15 / 86400)
+    worker = work(processes, access, endpoint, "brief", "safe", "--drain-timeout", 1)
+    assert worker.finish()[0] == 1
+    assert "issued again" in worker.last_words()
+
+
 def test_a_fleet_is_joined_by_passwords_too(processes, tmp_path, endpoint, random_bundle):
     access = Access(tmp_path / "access", passwords=True)
     assert not read_join(access.path("first")).certificate

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,27 @@ def test_what_it_begins_is_of_no_other_fleet(monkeypatch):
     joins = []
     assert main(["demo"]) == 0
     assert joins == [""]
+
+
+def test_killed_it_leaves_nobody_behind(processes, random_bundle):
+    demo = processes.start(
+        "demo", "--run", "demo", "--runs-dir", processes.runs, "--port", processes.port, "--bundle", random_bundle.path,
+        "--workers", 1, "--no-page",
+    )  # fmt: skip
+    while not ((status := processes.status()) and status["workers"]["present"]):
+        assert demo.popen.poll() is None
+    begun = Path(f"/proc/{demo.popen.pid}/task/{demo.popen.pid}/children").read_text().split()
+    demo.popen.kill()
+    assert len(begun) == 2
+    while any(_runs(each) for each in begun):
+        time.sleep(0.05)
+
+
+def _runs(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def test_without_the_page_none_is_begun(processes, random_bundle):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 import queue
 import random
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import replace
+from datetime import UTC, datetime
 from time import monotonic
 from typing import Any
 
@@ -18,7 +20,7 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.codec import Inbox
 from dreamfleet.common.cores import cores
 from dreamfleet.common.credentials import seated
-from dreamfleet.common.errors import ConnectionFailedError, DownloadError, NotLetInError, RefusedError
+from dreamfleet.common.errors import AccessError, ConnectionFailedError, DownloadError, NotLetInError, RefusedError
 from dreamfleet.common.session import Network, open_session
 from dreamfleet.common.store import BundleStore, default_cache
 from dreamfleet.worker.service.admission import Admission, ask, make_request, neediest
@@ -52,7 +54,8 @@ class Worker:
         self._network = network
         self._slot_count = config.slots or cores()
         self._hello = make_request(self.identity, (*known_tasks(), *tasks), self._slot_count)
-        terms = Terms(config.lifetime, config.drain_timeout, leaves_alone=config.exit_when_done or config.any)
+        lifetime = min(config.lifetime or math.inf, self._good_for)
+        terms = Terms(lifetime, config.drain_timeout, leaves_alone=config.exit_when_done or config.any)
         self._membership = Membership(terms, monotonic())
         self._refusals = Refusals() if config.any else Refusals(*ALONE)
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
@@ -63,14 +66,25 @@ class Worker:
         self._events.put(("wake", None))
 
     def serve(self) -> None:
-        """Work until told to stop, or until the run is over if so configured."""
+        """Work until told to stop, or until the run is over if so configured; `AccessError` as its join file ends."""
         session = self._startup()
-        if session is None:
-            return
-        try:
-            self._main_loop(session)
-        finally:
-            session.close()  # type: ignore[no-untyped-call]
+        if session is not None:
+            try:
+                self._main_loop(session)
+            finally:
+                session.close()  # type: ignore[no-untyped-call]
+        who = self._network.credentials
+        if who is not None and self._good_for <= 0:
+            raise AccessError(
+                f"the join file of {who.identity} ({who.name}) ends at {who.expires:%Y-%m-%d %H:%M} UTC: have it "
+                "issued again, and start this worker with that"
+            )
+
+    @property
+    def _good_for(self) -> float:
+        """Seconds until it had better drain, for links are closed as a join file ends."""
+        who = self._network.credentials
+        return math.inf if who is None else who.left(datetime.now(UTC)).total_seconds() - self._config.drain_timeout
 
     def _startup(self) -> zenoh.Session | None:
         """A session, however long the router takes to come up; `None` if it shall leave meanwhile."""
