@@ -56,7 +56,8 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         assert dream.evaluations()
         assert Controller.load(real.controller_path).bundle == random_bundle.sha256
         best = max((real, dream), key=lambda run: run.confirmation().mean).name
-        confirmed = [f"{run.confirmation().mean:.0f} ± {run.confirmation().error:.0f} (16)" for run in (real, dream)]
+        found = [run.confirmation() for run in (real, dream)]
+        confirmed = [f"{each.mean:.0f} ± {each.error:.0f} ({each.episodes})" for each in found]
         told = Controller.load((real if best == "demo" else dream).controller_path).provenance
     assert told["confirmed"]
     assert f"run {best}'s" in out.replace("\n", " ")
