@@ -69,6 +69,7 @@ def facts(page):
     return dict(zip(names, values, strict=False))
 
 
+@pytest.mark.slow
 def test_pictures_come_with_their_facts_while_somebody_sees_them(browser, processes, run):
     with dashboard(processes) as started, tab(browser) as page, tab(browser) as other:
         page.goto(started.address)
@@ -102,6 +103,7 @@ def test_pictures_come_with_their_facts_while_somebody_sees_them(browser, proces
         assert page.inner_text("[data-part=view-pause]") == "Watch"
 
 
+@pytest.mark.slow
 def test_a_worker_a_mean_and_an_earlier_generations_are_chosen_and_what_is_gone_is_said(browser, processes, run):
     with dashboard(processes, "--views", 1) as started, \
             tab(browser, viewport={"width": 390, "height": 844}, reduced_motion="reduce") as page:  # fmt: skip

@@ -23,6 +23,7 @@ def test_a_worker_without_descriptors_for_its_slots_ends_and_says_so(processes, 
     assert not any("Traceback" in line for line in worker.lines)
 
 
+@pytest.mark.slow
 def test_strangers_cannot_take_a_coordinators_last_descriptor(processes, random_bundle):
     coordinator = processes.start(
         "coordinator", "--run", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", "0.2",

@@ -40,6 +40,7 @@ def evolve(processes, name, workers, *settings):
     return outcome(processes, name)
 
 
+@pytest.mark.slow
 def test_a_run_without_a_bundle_evolves_and_any_fleet_gives_its_bits(processes):
     settings = ("--task", "gym:CartPole-v1", "--population", 6, "--episodes", 2, "--generations", 3,
                 "--evaluate-every", 2, "--evaluation-episodes", 3)  # fmt: skip

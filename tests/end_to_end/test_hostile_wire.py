@@ -167,6 +167,7 @@ def test_large_messages_fill_no_memory_and_the_run_goes_on(processes, random_bun
     assert most - before < 100e6
 
 
+@pytest.mark.slow
 def test_a_flood_of_hellos_leaves_few_guests_and_the_run_goes_on(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,

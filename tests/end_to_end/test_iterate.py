@@ -33,7 +33,7 @@ from tests.support.drives import write_drives
 from tests.support.processes import processes_in
 from tests.support.variants import controller_of
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.timeout(600), pytest.mark.slow]
 EYES = VAEConfig(latent=4, channels=(2, 2, 2, 2))
 SECONDS = 300  # that an iteration may take
 RUN = (
@@ -123,7 +123,6 @@ def test_each_round_makes_a_model_from_all_drives_and_evolves_in_its_dream(undis
     assert [tuple(line.split()[1:3]) for line in lines] == [(str(number), name) for number, name in PHASES]
 
 
-@pytest.mark.slow
 def test_a_rounds_dreams_may_begin_where_its_drives_were(processes):
     layout = Layout(processes.folder / "data")
     flags = ("--rounds", 1, "--drive-steps", 24, "--run-flags", f"{RUN} --recorded 0.5")
@@ -232,7 +231,6 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
     assert layout.ledger.read_bytes() == before
 
 
-@pytest.mark.slow
 def test_a_later_round_searches_what_its_model_foretells(processes):
     layout = Layout(processes.folder / "data")
     flags = ("--go-on", "--subspace", "--drive-steps", 150, "--own-drives", 6, "--drives", 6, "--gate-drives", 0)
@@ -257,7 +255,6 @@ def pilot(tmp_path_factory):
     return folder / "pilot.npz"
 
 
-@pytest.mark.slow
 def test_an_iteration_goes_on_from_a_controller_and_its_world_model(processes, pilot):
     layout = Layout(processes.folder / "data")
     flags = ("--rounds", 1, "--init", pilot, "--vae", "keep", "--go-on")
@@ -287,7 +284,6 @@ def test_an_iteration_goes_on_from_a_controller_and_its_world_model(processes, p
     assert hashes(layout)["rounds/01/round-1.zip"] == made.sha256
 
 
-@pytest.mark.slow
 def test_until_it_has_what_it_goes_on_from_flags_may_be_mended(processes, pilot):
     root = processes.folder / "data"
     wrong = ("--mdnrnn-flags", "--latent 4 --hidden 5", "--vae-flags", "--latent 4 --channels 2 2 2 2")
@@ -389,7 +385,6 @@ def disturb(processes, layout, phases):
     return json.loads(out)
 
 
-@pytest.mark.slow
 def test_killed_it_goes_on_to_the_same_models(undisturbed, processes):
     whole, told, _ = undisturbed
     layout = Layout(processes.folder / "data")

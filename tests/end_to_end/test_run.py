@@ -191,6 +191,7 @@ def test_parameters_of_another_world_model_are_no_beginning(processes, settings)
     assert "belongs to the world model" in err
 
 
+@pytest.mark.slow
 def test_a_race_that_is_stopped_between_its_stages_equals_one_that_is_not(processes, settings):
     flags = (*settings[:4], "--episodes", 4, "--evaluate-every", 0, "--racing", "--task", tasks.SLOW_TOY)
     whole = processes.coordinator(*flags, "--generations", 2, name="whole")
