@@ -29,7 +29,6 @@ from dreamfleet.common.rules import access_control
 
 ATTEMPT = 3.0  # seconds that a link may take to open: TLS takes four round trips and more
 LEASE_MS = 4000  # announced by each side: after so long without a sign the other side drops its token
-HANDSHAKE_MS = 3000  # of TLS: as long as our own clients wait for it
 MOST_SESSIONS = 10_000
 MAX_RECEIVED = (
     128 * 1024
@@ -144,7 +143,7 @@ def settings_of(network: Network, timeout: float | None, dictionary: str | None 
 
 def _listening(network: Network) -> list[str]:
     """Where a router listens, and for how long a secured one holds a stranger who says nothing."""
-    patience = "" if network.credentials is None else f"#tls_handshake_timeout_ms={HANDSHAKE_MS}"
+    patience = "" if network.credentials is None else f"#tls_handshake_timeout_ms={int(1000 * ATTEMPT)}"
     return [each + patience for each in network.listen]
 
 

@@ -1,8 +1,10 @@
 import pytest
 
 from tests.support import tasks
+from tests.support.access import Access
 from tests.support.attacks import SETTINGS, outcome
-from tests.support.processes import processes_in
+from tests.support.processes import free_port, processes_in
+from tests.support.sshd import ssh_hosts
 
 
 @pytest.fixture(scope="session")
@@ -13,3 +15,21 @@ def unharmed(tmp_path_factory, random_bundle):
         processes.worker("--task", tasks.SLOW_TOY, "--name", "own")
         assert coordinator.finish()[0] == 0
         return outcome(processes)
+
+
+@pytest.fixture(scope="module")
+def access(tmp_path_factory):
+    return Access(tmp_path_factory.mktemp("certificates") / "access")
+
+
+@pytest.fixture
+def endpoint():
+    return f"tls/127.0.0.1:{free_port()}"
+
+
+@pytest.fixture
+def hosts(tmp_path):
+    with ssh_hosts(tmp_path) as found:
+        if found is None:
+            pytest.skip("there is no sshd here")
+        yield found

@@ -30,16 +30,6 @@ from tests.support.stage import drained, listening, wait_for
 LIFE = "0badc0de"
 
 
-@pytest.fixture(scope="module")
-def access(tmp_path_factory):
-    return Access(tmp_path_factory.mktemp("certificates") / "access")
-
-
-@pytest.fixture
-def endpoint():
-    return f"tls/127.0.0.1:{free_port()}"
-
-
 def fitness(processes, name, generations=3):
     with open_run(processes.runs, name) as run:
         return [[run.fitness(generation, index) for index in range(4)] for generation in range(generations)]

@@ -22,7 +22,7 @@ from dreamfleet.coordinator.spawn.parcel import pack_wheel
 from tests.support.disks import small_disk
 from tests.support.hosts import new_host
 from tests.support.processes import free_port
-from tests.support.sshd import new_key, ssh_hosts
+from tests.support.sshd import new_key
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1800)]
 log = logging.getLogger(__name__)
@@ -77,14 +77,6 @@ class Newcomer:
 @pytest.fixture(scope="module")
 def newcomer(tmp_path_factory):
     return Newcomer(tmp_path_factory.mktemp("new"))
-
-
-@pytest.fixture
-def hosts(tmp_path):
-    with ssh_hosts(tmp_path) as found:
-        if found is None:
-            pytest.skip("there is no sshd here")
-        yield found
 
 
 @pytest.mark.parametrize("source", ["wheelhouse", "index"])

@@ -9,21 +9,10 @@ import pytest
 
 from dreamfleet.common.client import Client
 from dreamfleet.common.credentials import read_join
-from tests.support.access import Access, begin, until, work
+from tests.support.access import begin, until, work
 from tests.support.attacks import CLAIMED, RUN, SECURED, SETTINGS, attacking, outcome, steers_by_name
-from tests.support.processes import free_port
 
 pytestmark = pytest.mark.timeout(300)
-
-
-@pytest.fixture(scope="module")
-def access(tmp_path_factory):
-    return Access(tmp_path_factory.mktemp("certificates") / "access")
-
-
-@pytest.fixture
-def endpoint():
-    return f"tls/127.0.0.1:{free_port()}"
 
 
 # What arrives of each, and is counted: nothing of who only looks or steers; of a worker what it says in its own name.

@@ -18,20 +18,12 @@ from dreamfleet.coordinator.spawn.parcel import pack_wheel
 from tests.support import tasks
 from tests.support.disks import small_disk
 from tests.support.hosts import new_host
-from tests.support.sshd import closed_port, new_key, ssh_hosts
+from tests.support.sshd import closed_port, new_key
 
 pytestmark = pytest.mark.timeout(300)
 PATIENCE = 120
 BARE = "/usr/local/bin:/usr/bin:/bin"  # where no dreamfleet is installed
 TOY = ("--task", tasks.TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0)
-
-
-@pytest.fixture
-def hosts(tmp_path):
-    with ssh_hosts(tmp_path) as found:
-        if found is None:
-            pytest.skip("there is no sshd here")
-        yield found
 
 
 def words(hosts, *more):
