@@ -39,7 +39,7 @@ def test_a_crowd_of_strangers_keeps_newcomers_out_for_seconds_and_nobody_else(tm
             until(lambda: "prove nothing" in caplog.text, "a crowd goes unnoticed")
             assert [each.zid for each in router.info.transports()] == [each.zid for each in inside]
         until(lambda: joined(viewer), "a newcomer is not let in")
-        with ExitStack() as fleet, ThreadPoolExecutor(8) as threads:  # who proves something is no crowd
+        with ExitStack() as fleet, ThreadPoolExecutor(2 * MOST_UNPROVEN) as threads:  # who proves something is no crowd
             for session in threads.map(lambda _: open_session(viewer, timeout=30), range(2 * MOST_UNPROVEN)):
                 fleet.enter_context(session)
             assert joined(viewer)
