@@ -61,12 +61,12 @@ class Classes:
     @property
     def told(self) -> str:
         """In words."""
-        if not self.total:
+        if not self.largest:
             return "no result yet"
         if not self.mixed:
             by = ", by its fingerprint" if self.largest[0].host_class.startswith(BY_FINGERPRINT) else ""
             return f"one class{by}: to the bit"
-        shares = ", ".join(f"{each.results / self.results:.1%}" for each in self.largest)
+        shares = ", ".join(f"{each.results / max(self.results, 1):.1%}" for each in self.largest)
         more = f" and {self.total - len(self.largest)} more" if self.total > len(self.largest) else ""
         return f"mixed: {self.total} classes, {shares}{more} of results"
 

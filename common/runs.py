@@ -234,6 +234,8 @@ class RunFolder:
         try:
             return self._connection.execute(query, values).fetchall()
         except (sqlite3.Error, OverflowError, UnicodeError) as error:
+            if _is_locked(error):
+                raise JournalError(f"the journal of run {self.name} cannot be read: {_mend(error)}") from error
             raise self._damaged(one_line(str(error))) from error
 
     def _typed(self, rows: list[Any], kinds: str) -> list[Any]:
@@ -342,10 +344,21 @@ def _connect_read_only(path: Path) -> tuple[sqlite3.Connection, int]:
         return connection, schema.check(connection, path)
     except (sqlite3.Error, UnicodeError) as error:
         connection.close()
-        raise JournalError(f"{path} cannot be read: {one_line(str(error))}; restore it from a copy") from error
+        raise JournalError(f"{path} cannot be read: {_mend(error)}") from error
     except JournalError:
         connection.close()
         raise
+
+
+def _is_locked(error: Exception) -> bool:
+    """Whether another program keeps a journal to itself, such as SQLite's shell: nothing is wrong with it."""
+    return isinstance(error, sqlite3.Error) and getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
+
+
+def _mend(error: Exception) -> str:
+    """What is wrong, and what to do."""
+    what = "end the program that keeps it locked" if _is_locked(error) else "restore it from a copy"
+    return f"{one_line(str(error))}; {what}"
 
 
 @contextmanager

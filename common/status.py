@@ -83,6 +83,11 @@ class Population:
     fitness: tuple[float | None, ...]
 
     @property
+    def is_whole(self) -> bool:
+        """Whether its columns are equally long."""
+        return len(self.done) == len(self.wanted) == len(self.fitness)
+
+    @property
     def candidates(self) -> tuple[Candidate, ...]:
         """The same, a row for each candidate."""
         columns = zip(self.done, self.wanted, self.fitness, strict=True)
@@ -227,7 +232,10 @@ def read_status(document: dict[str, Any]) -> Status:
     `MalformedError` says what to install where it is not understood.
     """
     try:
-        return from_plain(Status, known(Status, document))
+        status = from_plain(Status, known(Status, document))
+        if not all(each.is_whole for each in (status.population, status.last_population) if each is not None):
+            raise MalformedError("columns of other lengths")
+        return status
     except MalformedError as error:
         run, schema = document.get("run", "?"), document.get("schema", "?")
         package = document.get("package") or "another version"
@@ -240,9 +248,17 @@ def read_status(document: dict[str, Any]) -> Status:
 def read_document(payload: bytes) -> dict[str, Any]:
     """The JSON object in an answer; `MalformedError` if it is none."""
     try:
-        document = json.loads(payload) if len(payload) <= MAX_MESSAGE else None
+        document = json.loads(payload, parse_int=_whole) if len(payload) <= MAX_MESSAGE else None
     except (ValueError, RecursionError):
         document = None
     if not isinstance(document, dict):
         raise MalformedError("what answers for the run is no status: install the same dreamfleet here and there")
     return document
+
+
+def _whole(digits: str) -> int:
+    """A number as every other message can hold it; more digits are no count, and no float can be made of them."""
+    number = int(digits)
+    if abs(number) >= 2**64:
+        raise ValueError(digits[:20])
+    return number

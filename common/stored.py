@@ -19,6 +19,7 @@ from dreamfleet.common.printable import plural
 MOST_STAGES = 32  # of a schedule: a status carries them too
 Population = Annotated[int, Between(2, 10**5)]
 Episodes = Annotated[int, Between(1, 10**4)]
+Drives = Annotated[int, Between(1, 2**63 - 1)]  # that a score was taken over: of none there is no error
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ class StoredEvaluation:
     """A finished evaluation of a generation's mean on validation tracks."""
 
     generation: int
-    episodes: int
+    episodes: Drives
     mean: float
     std: float
 
@@ -174,7 +175,7 @@ class StoredConfirmation:
     """
 
     generation: int
-    episodes: int
+    episodes: Drives
     mean: float
     std: float  # of the sample: `episodes - 1` in the denominator
     closed: int  # generations that were closed by then: the evaluations of these were chosen among

@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.events import EXTRA, event_file
-from dreamfleet.common.files import is_folder
+from dreamfleet.common.files import is_file, is_folder
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.saving import saving, told
 from dreamfleet.common.stored import StoredCandidate, StoredConfirmation, StoredEvaluation, StoredGeneration
@@ -38,7 +39,7 @@ def export_csv(run: RunFolder, folder: Path) -> list[Path]:
         with saving(path) as file:
             file.write(text.getvalue().encode())
 
-    return [_written(folder / f"{name}.csv", columns, rows, save) for name, columns, rows in _tables(run)]
+    return _all(run, folder, "csv", save)
 
 
 def export_parquet(run: RunFolder, folder: Path) -> list[Path]:
@@ -54,14 +55,14 @@ def export_parquet(run: RunFolder, folder: Path) -> list[Path]:
         with saving(path) as file:
             parquet.write_table(table, file)
 
-    return [_written(folder / f"{name}.parquet", columns, rows, save) for name, columns, rows in _tables(run)]
+    return _all(run, folder, "parquet", save)
 
 
 def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
     """An event file with curves over generations; `UsageError` where there are events, for they would add up."""
     if is_folder(folder) and any(folder.glob(EVENTS)):
         raise UsageError(f"{folder} holds TensorBoard's events already: delete them, or choose another --out")
-    with event_file(folder) as events:
+    with _whole(folder), event_file(folder) as events:
         events.add_text("settings", f"```\n{run.settings.to_json()}\n```")
         for each in run.history():
             events.add(each.number, fitness__mean=each.mean, fitness__std=each.std, fitness__best=each.best,
@@ -74,6 +75,17 @@ def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
     return sorted(folder.glob(EVENTS))
 
 
+@contextmanager
+def _whole(folder: Path) -> Iterator[None]:
+    """What was begun is no file of events, if it cannot be ended: it would stand in the way of the next attempt."""
+    try:
+        yield
+    except BaseException:
+        for each in folder.glob(EVENTS):
+            each.unlink(missing_ok=True)
+        raise
+
+
 def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
     """Name, columns and rows of each table that has any."""
     for name, (kind, read) in TABLES.items():
@@ -83,10 +95,18 @@ def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
             yield name, columns, rows
 
 
-def _written(
-    path: Path, columns: Sequence[str], rows: Sequence[Row], save: Callable[[Path, Sequence[str], Sequence[Row]], None]
-) -> Path:
-    with told(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    save(path, columns, rows)
-    return path
+def _all(
+    run: RunFolder, folder: Path, kind: str, save: Callable[[Path, Sequence[str], Sequence[Row]], None]
+) -> list[Path]:
+    """A file for each table that has a row; one of an earlier export that has none now is gone."""
+    with told(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, columns, rows in _tables(run):
+        written.append(folder / f"{name}.{kind}")
+        save(written[-1], columns, rows)
+    with told(folder):
+        for path in (folder / f"{name}.{kind}" for name in TABLES):
+            if path not in written and is_file(path):
+                path.unlink()
+    return written

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
@@ -13,7 +14,7 @@ from dreamfleet.common.metrics import CONTENT_TYPE, exposition
 from dreamfleet.common.network import address_of
 from dreamfleet.coordinator.status import Snapshot, status_of
 
-PATIENCE = 5.0  # seconds for a question: one client at a time is answered
+PATIENCE = 5.0  # seconds for a whole question and its answer: one client at a time is answered
 
 
 @contextmanager
@@ -48,6 +49,20 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
         timeout = PATIENCE
         server_version = "dreamfleet"
         sys_version = ""
+
+        def handle(self) -> None:
+            """One question; who says it a byte at a time would keep others out, and the coordinator from its end."""
+            late = threading.Timer(PATIENCE, self._drop)
+            late.daemon = True
+            late.start()
+            try:
+                super().handle()
+            finally:
+                late.cancel()
+
+        def _drop(self) -> None:
+            with suppress(OSError):  # it is gone
+                self.connection.shutdown(socket.SHUT_RDWR)
 
         def do_GET(self) -> None:  # the name is http.server's
             if self.path.partition("?")[0] != "/metrics":

@@ -42,13 +42,21 @@ def run(args: argparse.Namespace) -> int:
     with Client(reached(args)) as client:
         document = client.document(args.run_name)
         if args.watch:
-            watch = _print_lines if args.json else _show if sys.stdout.isatty() else _tell
+            watch = _print_lines if args.json else _show if _redraws() else _tell
             return watch(client, str(document.get("run")))
         if args.json:
             print(json.dumps(document, indent=2))
         else:
             _print_once(client, document)
     return 0
+
+
+def _redraws() -> bool:
+    """Whether a picture can be drawn over the last one: a terminal that is dumb would show nothing until the end."""
+    from rich.console import Console
+
+    console = Console()
+    return sys.stdout.isatty() and not console.is_dumb_terminal
 
 
 def _print_once(client: Client, document: dict[str, Any]) -> None:

@@ -156,7 +156,7 @@ class Watcher:
             "trouble": shortened(self._trouble, 1000),
             "only": self._only or "",
         }
-        statuses = tuple(self._followed[name].whole for name in sorted(live))
+        statuses = tuple(self._followed[name].whole for name in sorted(live) if name in shown)
         return Picture(shown, chosen, event("frame", absent), statuses)
 
 

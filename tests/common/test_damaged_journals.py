@@ -117,3 +117,28 @@ def test_a_journal_that_is_no_file_is_one_line(tmp_path, watched):
 def test_a_folder_whose_name_is_part_of_an_address_is_read(folder):
     strange = folder.rename(folder.with_name("50%20 #1 ?mode=rwc"))
     look(strange)
+
+
+def test_a_confirmed_score_of_no_drives_is_damaged(folder):
+    with sqlite3.connect(folder / "journal.sqlite") as journal:
+        told = '{"generation": 1, "episodes": 0, "mean": 1.0, "std": 1.0, "closed": 9}'
+        journal.execute("INSERT OR REPLACE INTO run VALUES ('confirmed', ?)", (told,))
+    journal.close()
+    with RunFolder(folder) as run, pytest.raises(JournalError, match="confirmed score is damaged"):
+        run.confirmation()
+
+
+def test_a_journal_that_another_program_keeps_locked_is_not_called_damaged(folder, monkeypatch):
+    other = sqlite3.connect(folder / "journal.sqlite", isolation_level=None)
+    other.execute("PRAGMA journal_mode = delete")
+    other.execute("BEGIN EXCLUSIVE")
+    connect = sqlite3.connect
+    monkeypatch.setattr(sqlite3, "connect", lambda *args, **more: connect(*args, timeout=0, **more))
+    with pytest.raises(JournalError, match="end the program that keeps it locked"):
+        RunFolder(folder)
+    other.execute("ROLLBACK")
+    with RunFolder(folder) as run:
+        other.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(JournalError, match="end the program that keeps it locked"):
+            run.history()
+    other.close()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.classes import Classes, ClassShare
 from dreamfleet.common.codec import MalformedError, encode_json
 from dreamfleet.common.status import Candidate, read_document, read_status
 from tests.support.samples import STATUS
@@ -55,6 +56,32 @@ def test_a_population_is_columns_on_the_wire_and_rows_to_a_reader():
     population = dataclasses.replace(STATUS.population, offset=4)
     assert population.candidates[1] == Candidate(7, 5, 1, 2, -3.25)
     assert population.candidates[2].fitness is None
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("evaluation", "episodes"), 0),
+        (("best", "episodes"), -1),
+        (("population", "done"), [1]),
+    ],
+)
+def test_what_nothing_can_be_computed_of_is_malformed(path, value):
+    document = json.loads(GOLDEN.read_bytes())
+    document[path[0]][path[1]] = value
+    with pytest.raises(MalformedError):
+        read_status(document)
+
+
+def test_a_number_of_more_digits_than_a_message_can_hold_is_malformed():
+    with pytest.raises(MalformedError):
+        read_document(b'{"limits": {"generations": 1%s}}' % (b"0" * 400))
+    assert read_document(b'{"limits": {"generations": 18446744073709551615}}')
+
+
+def test_classes_without_names_or_results_are_told():
+    assert Classes(total=1).told == "no result yet"
+    assert Classes(2, (ClassShare("a" * 16, 0, ()),), 0).told.startswith("mixed: 2 classes")
 
 
 if __name__ == "__main__" and not GOLDEN.exists():

@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,9 @@ import pytest
 from pyarrow import parquet
 
 from dreamfleet.common import cli
+from dreamfleet.common.processes import command
 from dreamfleet.common.runs import open_run
+from tests.support.disks import small_disk
 from tests.support.events import scalars
 
 RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
@@ -97,3 +100,40 @@ def test_the_receipt_says_what_a_paper_cites(runs, capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["receipt"]["generations"] == len(stored(runs)[0])
     assert told["controller"] in text
+
+
+def confirm(runs, text):
+    with sqlite3.connect(runs / "reality" / "journal.sqlite") as journal:
+        journal.execute("DELETE FROM run WHERE key = 'confirmed'")
+        if text:
+            journal.execute("INSERT INTO run VALUES ('confirmed', ?)", (text,))
+    journal.close()
+
+
+def test_no_table_of_an_earlier_export_stands_among_those_of_a_later_one(runs, tmp_path):
+    confirm(runs, '{"generation": 1, "episodes": 4, "mean": 1.0, "std": 1.0, "closed": 999}')
+    for kind in ("csv", "parquet"):
+        out = export(runs, tmp_path, f"--{kind}")
+        assert (out / f"confirmation.{kind}").exists()
+        (out / "notes.txt").write_text("of somebody's own")
+    confirm(runs, None)
+    for kind in ("csv", "parquet"):
+        out = export(runs, tmp_path, f"--{kind}")
+        assert not (out / f"confirmation.{kind}").exists()
+    assert (out / "notes.txt").exists()
+
+
+def test_events_onto_a_full_disk_end_with_one_line_and_leave_nothing(runs, tmp_path):
+    with small_disk(tmp_path / "disk", 1) as disk:
+        if disk is None:
+            pytest.skip("no disk can be mounted here")
+        out = disk.path / "out"
+        out.mkdir()
+        disk.fill()
+        words = ["runs", "export", "reality", "--tensorboard", "--out", str(out), "--runs-dir", str(runs)]
+        done = subprocess.run(command(*words), capture_output=True, text=True, timeout=60, check=False)
+        assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
+        assert "No space left on device" in done.stderr
+        disk.free()
+        assert not list(out.iterdir())
+        assert cli.main(words) == 0

@@ -203,3 +203,9 @@ def test_the_doctor_finds_this_installation_well(processes):
     assert code == 0, out
     assert "fingerprint" in out
     assert "native picture" in out
+
+
+@pytest.mark.parametrize("seconds", ["nan", "inf", "0", "-1"])
+def test_a_live_view_wants_seconds_that_end(processes, seconds):
+    asked = ("live", "--controller", "tiny", "--out", processes.folder / "drive.mp4", f"--seconds={seconds}")
+    complains(processes, *asked, says="--seconds above 0")

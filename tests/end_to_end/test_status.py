@@ -1,8 +1,10 @@
 """Watching a run from anywhere, to its end, and judging what it reports."""
 
 import json
+import os
 import re
 import signal
+import sys
 
 import pytest
 
@@ -10,6 +12,7 @@ from dreamfleet.common.client import Client
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import ConnectionFailedError, ControllerError
 from dreamfleet.common.runs import open_run
+from dreamfleet.common.verbs import status
 from tests.support import tasks
 
 pytestmark = pytest.mark.timeout(120)
@@ -138,3 +141,13 @@ def test_a_controller_from_here_and_one_from_a_live_run_exclude_each_other(proce
     for flags in ((), ("--controller", "tiny", "--run", "test"), ("--controller", "tiny", "--connect", "tcp/h:1")):
         code, _, err = processes.call("evaluate", *flags)
         assert (code, "give either --controller, or --run" in err) == (2, True), err
+
+
+@pytest.mark.parametrize(("terminal", "redraws"), [("dumb", False), ("unknown", False), ("xterm", True)])
+def test_a_terminal_that_cannot_draw_over_a_line_has_lines_as_a_pipe_has(monkeypatch, terminal, redraws):
+    monkeypatch.setenv("TERM", terminal)
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    controller, device = os.openpty()
+    with open(controller, "rb"), open(device, "w") as stdout:  # noqa: PTH123 - descriptors
+        monkeypatch.setattr(sys, "stdout", stdout)
+        assert status._redraws() == redraws

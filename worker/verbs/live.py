@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -84,7 +85,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    if not 1 <= args.fps <= FASTEST or args.seed < 0 or (args.seconds is not None and args.seconds <= 0):
+    some = args.seconds is None or (args.seconds > 0 and math.isfinite(args.seconds))
+    if not 1 <= args.fps <= FASTEST or args.seed < 0 or not some:
         raise UsageError(f"--fps must be 1 to {FASTEST}, --seconds above 0, --seed at least 0")
     if args.controller and args.run_name:
         raise UsageError("give either a live run to watch, or --controller, which needs none")

@@ -216,3 +216,15 @@ def test_numbers_that_json_does_not_have_stand_in_no_answer(runs):
         answer = client_of(runs).get(path)
         assert answer.status_code == 200
         json.loads(answer.text, parse_constant=refuse)
+
+
+def test_a_token_of_other_letters_opens_as_it_is_written(runs):
+    token = "größer-als-日本語"
+    client = client_of(runs, token=token)
+    for encoding in ("utf-8", "latin-1"):
+        sent = {"authorization": f"Bearer {token}".encode(encoding, "replace")}
+        assert client.get("/runs", headers=sent).status_code == (200 if encoding == "utf-8" else 401)
+    short = "größer-als-zwölf"
+    for encoding in ("utf-8", "latin-1"):
+        sent = {"authorization": f"Bearer {short}".encode(encoding)}
+        assert client_of(runs, token=short).get("/runs", headers=sent).status_code == 200
