@@ -64,6 +64,19 @@ class RunFolder:
         """Release the journal."""
         self._connection.close()
 
+    @contextmanager
+    def at_one_moment(self) -> Iterator[None]:
+        """All that is read within is of one moment, whatever a coordinator writes meanwhile."""
+        if self._connection.in_transaction:
+            yield
+            return
+        self._all("BEGIN")  # the moment is that of the first reading
+        try:
+            yield
+        finally:
+            with suppress(sqlite3.Error):
+                self._connection.rollback()
+
     @property
     def settings(self) -> RunSettings:
         """What is frozen with the run."""

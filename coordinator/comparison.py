@@ -47,6 +47,11 @@ class Side:
     @classmethod
     def of(cls, run: RunFolder) -> Side:
         """From its journal."""
+        with run.at_one_moment():
+            return cls._read(run)
+
+    @classmethod
+    def _read(cls, run: RunFolder) -> Side:
         evaluations, confirmed = run.evaluations(), run.confirmation()
         curve = LearningCurve.of(run) if evaluations else None
         looks = tuple(

@@ -31,7 +31,7 @@ def listed(runs_dir: Path) -> list[dict[str, Any]]:
 
 def one(runs_dir: Path, name: str) -> dict[str, Any]:
     """One run; `JournalError` or `UsageError` where there is no such run, or it cannot be read."""
-    with open_run(runs_dir, name) as run:
+    with open_run(runs_dir, name) as run, run.at_one_moment():
         settings, history = run.settings, run.history()
         if [each.number for each in history] != list(range(len(history))):
             raise JournalError(f"the journal of run {name} is damaged: generations are missing; restore it from a copy")

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     folder = args.out or Path(f"{args.run_name}-{args.kind}")
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is no folder: name one")
-    with open_run(args.runs_dir, args.run_name) as stored:
+    with open_run(args.runs_dir, args.run_name) as stored, stored.at_one_moment():
         written = kinds[args.kind](stored, folder)
     text = "\n".join(map(str, written)) if written else f"run {args.run_name} has no row yet: nothing was written"
     answer(args, text, run=args.run_name, files=written)

@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.out is not None:
         check_out(args.out)
-    with open_run(args.runs_dir, args.run_name) as stored:
+    with open_run(args.runs_dir, args.run_name) as stored, stored.at_one_moment():
         text = json.dumps(facts(stored), default=str) if args.json else printable_lines(markdown(stored))
     if args.out is None:
         print(text)

@@ -30,7 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the run."""
-    with open_run(args.runs_dir, args.run_name) as stored:
+    with open_run(args.runs_dir, args.run_name) as stored, stored.at_one_moment():
         settings, history, evaluations = stored.settings, stored.history(), stored.evaluations()
         confirmed = stored.confirmation()
         facts = {"run": stored.name, "run_uid": stored.uid, "created": stored.created, "ended": stored.ended,

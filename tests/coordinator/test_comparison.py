@@ -6,7 +6,7 @@ from contextlib import closing
 
 from dreamfleet.common import cli
 from dreamfleet.common.difference import Difference
-from dreamfleet.common.runs import CONFIRMED, open_run
+from dreamfleet.common.runs import CONFIRMED, RunFolder, open_run
 from dreamfleet.common.seeds import CONFIRMING, VALIDATION
 from dreamfleet.common.stored import StoredConfirmation
 from dreamfleet.coordinator.comparison import Side, at_equal_spending, difference, differing
@@ -84,3 +84,22 @@ def test_runs_without_scores_are_compared_by_their_settings(runs, capsys):
     assert "less" not in told
     assert cli.main(["runs", "compare", "reality", "--runs-dir", str(runs)]) == 2
     assert "two runs or more" in capsys.readouterr().err
+
+
+def test_a_run_that_closes_an_evaluation_meanwhile_is_read_as_of_one_moment(runs, monkeypatch):
+    read = RunFolder.evaluations
+    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite", isolation_level=None)) as journal:
+        journal.execute("PRAGMA journal_mode = wal")  # as a coordinator's
+        last = journal.execute("SELECT max(generation) FROM evaluation").fetchone()[0]
+        mean = journal.execute("SELECT mean FROM evaluation WHERE generation = ?", (last,)).fetchone()[0]
+        journal.execute("UPDATE evaluation SET mean = NULL WHERE generation = ?", (last,))
+
+        def and_then_one_more(run):
+            found = read(run)
+            journal.execute("UPDATE evaluation SET mean = ? WHERE generation = ?", (mean, last))
+            return found
+
+        monkeypatch.setattr(RunFolder, "evaluations", and_then_one_more)
+        (before,) = sides(runs, "dream")
+        (after,) = sides(runs, "dream")
+    assert len(after.looks) == len(before.looks) + 1
