@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Mapping
 from contextlib import aclosing
 from pathlib import Path
@@ -48,6 +49,7 @@ class _Answers:
         self._views = views
         self._runs_dir = runs_dir
         self._files = files
+        self._listing: asyncio.Task[list[dict[str, Any]]] | None = None
 
     def index(self, _request: Request) -> Response:
         return HTMLResponse(self._files.index)
@@ -82,8 +84,12 @@ class _Answers:
                 return Response(exposition(*picture.statuses), media_type=CONTENT_TYPE)
         return PlainTextResponse("this page is about to leave\n", 503)
 
-    def runs(self, _request: Request) -> Response:
-        return _json({"runs": past.listed(self._runs_dir), "folder": printable(str(self._runs_dir))})
+    async def runs(self, _request: Request) -> Response:
+        """Read once for all who ask meanwhile: thousands of journals take seconds, and would take every thread."""
+        if self._listing is None or self._listing.done():
+            self._listing = asyncio.create_task(asyncio.to_thread(past.listed, self._runs_dir))
+        rows = await asyncio.shield(self._listing)
+        return _json({"runs": rows, "folder": printable(str(self._runs_dir))})
 
     def run(self, request: Request) -> Response:
         try:

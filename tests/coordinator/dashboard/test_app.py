@@ -1,9 +1,11 @@
 """What the page's server answers, and to whom."""
 
+import asyncio
 import json
 import re
 import shutil
 import sqlite3
+import threading
 from contextlib import closing
 from pathlib import Path
 
@@ -11,9 +13,11 @@ import pytest
 from starlette.testclient import TestClient
 
 from dreamfleet.common.network import Network
-from dreamfleet.coordinator.dashboard.app import make_app
+from dreamfleet.coordinator.dashboard import past
+from dreamfleet.coordinator.dashboard.app import _Answers, make_app
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.dashboard.feed import Feed
+from dreamfleet.coordinator.dashboard.files import Files
 from dreamfleet.coordinator.dashboard.views import Views
 from dreamfleet.coordinator.dashboard.watching import Watcher
 
@@ -228,3 +232,25 @@ def test_a_token_of_other_letters_opens_as_it_is_written(runs):
     for encoding in ("utf-8", "latin-1"):
         sent = {"authorization": f"Bearer {short}".encode(encoding)}
         assert client_of(runs, token=short).get("/runs", headers=sent).status_code == 200
+
+
+def test_the_list_is_read_once_for_all_who_ask_meanwhile(runs, monkeypatch):
+    read, held = [], threading.Event()
+
+    def slowly(folder):
+        read.append(folder)
+        assert held.wait(10)
+        return []
+
+    monkeypatch.setattr(past, "listed", slowly)
+    feed = Feed(Watcher(Network(connect=("tcp/127.0.0.1:1",)), None, runs))
+    answers = _Answers(feed, Views((), runs, 1), runs, Files())
+
+    async def ask():
+        asked = [asyncio.create_task(answers.runs(None)) for _ in range(5)]
+        await asyncio.sleep(0)  # each has begun
+        held.set()
+        return await asyncio.gather(*asked)
+
+    assert [json.loads(each.body)["runs"] for each in asyncio.run(ask())] == [[]] * 5
+    assert len(read) == 1
