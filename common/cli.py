@@ -22,6 +22,7 @@ from dreamfleet.common.logs import begin_logging, last_word
 
 GROUP = "dreamfleet.verbs"
 INTERRUPTED = 130
+LAST_STREAM = 2  # the number of stderr
 DESCRIPTION = "Evolve World-Models controllers on whatever machines you have."
 EXIT_CODES = (
     "Exit codes: 0 done; 1 it failed, was refused, or the answer is no; 2 the command or a setting is wrong; 130 it "
@@ -61,6 +62,7 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; an expected error is one line on stderr and an exit code that is not 0."""
+    _open_closed_streams()
     begin_logging()
     words = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -82,6 +84,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         _forget_stdout()
         last_word("what this verb prints could not be written: no space left")
         return 1
+
+
+def _open_closed_streams() -> None:
+    """What `>&-` closed leads to nowhere: else the next file, such as a journal, would get what is printed."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= LAST_STREAM:
+        os.set_inheritable(number, True)
+    os.close(number)
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115 - for good
 
 
 def _forget_stdout() -> None:

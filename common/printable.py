@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 
 def printable(text: str) -> str:
@@ -24,6 +25,12 @@ def one_line(text: str) -> str:
 def plural(count: float, noun: str, nouns: str = "") -> str:
     """A number with its noun, of which there may be one: 1 seed, 1,000 seeds, 1.5 minutes, 2 batches."""
     return f"{count:{',' if isinstance(count, int) else 'g'}} {noun if count == 1 else nouns or f'{noun}s'}"
+
+
+def some(names: Sequence[str], most: int) -> str:
+    """The first `most` of the names, and how many more there are: a, b and 3 more."""
+    more = f" and {len(names) - most:,} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def setting(value: object) -> str:

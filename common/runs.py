@@ -7,6 +7,7 @@ import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from difflib import SequenceMatcher
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -22,7 +23,7 @@ from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files import check_regular, is_folder, is_there
 from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.messages import TaskSpec
-from dreamfleet.common.printable import one_line
+from dreamfleet.common.printable import one_line, some
 from dreamfleet.common.seeds import CHOOSING, CONFIRMING, VALIDATION
 from dreamfleet.common.stages import BegunStage, begun_stages
 from dreamfleet.common.stored import (
@@ -40,6 +41,7 @@ BUNDLE = "bundle.zip"
 CONTROLLER = "controller.npz"
 LOOKS = (0.01, 0.05)  # seconds until a lock is tried again: whoever asks whether a run is live has it for an instant
 ARCHIVE = "archive"
+MOST_TOLD = 8  # runs by name, where one is not there
 ROLLOUTS = "rollouts"
 CONFIRMED = "confirmed"  # the fact's name
 ENDING = "ending"  # the fact's name: the limit that was reached, while the last evaluations are waited for and after
@@ -314,8 +316,9 @@ def open_run(runs_dir: Path, name: str) -> RunFolder:
     """A run by name; `JournalError` names those that exist."""
     path = runs_dir / check_run_name(name)
     if not is_there(path / JOURNAL):
-        names = ", ".join(each.name for each in run_paths(runs_dir)) or "none yet"
-        raise JournalError(f"no run {name!r} in {runs_dir}; there are: {names}")
+        names = [each.name for each in run_paths(runs_dir)]
+        names.sort(key=lambda each: -SequenceMatcher(None, name, each).quick_ratio())  # the likeliest first
+        raise JournalError(f"no run {name!r} in {runs_dir}; there are: {some(names, MOST_TOLD) or 'none yet'}")
     return RunFolder(path)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, print_rows
+from dreamfleet.common.printable import some
 from dreamfleet.common.site import offer, reached
 
 if TYPE_CHECKING:
@@ -68,6 +69,5 @@ def _check_known(client: Client, run: str, worker: str) -> None:
     hosts = list(dict.fromkeys(each.partition("/")[0] for each in known))
     if worker in (*known, *hosts):
         return
-    more = f" and {len(hosts) - MOST_TOLD} more" if len(hosts) > MOST_TOLD else ""
-    there = f"known are {', '.join(hosts[:MOST_TOLD])}{more}" if hosts else "none has come"
+    there = f"known are {some(hosts, MOST_TOLD)}" if hosts else "none has come"
     raise UsageError(f"run {run} knows no worker {worker!r}: {there}")

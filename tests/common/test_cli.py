@@ -101,3 +101,13 @@ def test_the_help_of_a_fork_names_no_default_that_it_does_not_have(capsys):
     told = " ".join(capsys.readouterr().out.split())
     assert "candidates a generation (default RUN's own)" in told
     assert "(default 32)" not in told
+
+
+def test_closed_streams_end_no_verb_and_give_no_file_their_numbers(tmp_path):
+    program = (
+        "import os, sys; from dreamfleet.common.cli import main; assert sys.stdout is None; main(['runs', 'list']); "
+        "raise SystemExit(os.open('journal', os.O_CREAT | os.O_WRONLY))"
+    )
+    command = ["bash", "-c", '"$@" <&- >&- 2>&-', "-", sys.executable, "-c", program]
+    number = subprocess.run(command, cwd=tmp_path, check=False, timeout=60).returncode
+    assert number > cli.LAST_STREAM

@@ -142,6 +142,11 @@ def test_a_full_disk_is_a_clear_error(journal):
 def test_an_unknown_run_names_those_that_exist(folder):
     with pytest.raises(JournalError, match=r"no run 'day' in .*; there are: night"):
         open_run(folder.parent, "day")
+    for number in range(2000):
+        (folder.parent / f"day-{number}").mkdir()
+        (folder.parent / f"day-{number}" / "journal.sqlite").touch()
+    with pytest.raises(JournalError, match=r"there are: night, .* and 1,993 more"):
+        open_run(folder.parent, "nighte")
 
 
 def test_a_folder_is_held_by_one(folder):
