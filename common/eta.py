@@ -80,9 +80,10 @@ def summary(status: Status) -> str:
     opened, best = status.generation, status.confirmed or status.best
     score = "nothing evaluated yet" if best is None else f"best mean {with_error(best)}"
     workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
+    lost = f", {status.workers.lost} lost" if status.workers.lost else ""
     return (
         f"{status.state}, generation {opened.number} ({opened.episodes_done}/{opened.episodes} episodes), {score}, "
-        f"{status.throughput.steps_per_second:,.0f} steps/s, {workers} with {slots}, {eta_of(status).told}"
+        f"{status.throughput.steps_per_second:,.0f} steps/s, {workers} with {slots}{lost}, {eta_of(status).told}"
     )
 
 

@@ -96,8 +96,11 @@ def _fitness(status: Status) -> Iterator[Metric]:
 
 
 def _fleet(status: Status) -> Iterator[Metric]:
-    count = [({"which": "present"}, float(status.workers.present)), ({"which": "known"}, float(status.workers.known))]
-    yield Metric("dreamfleet_workers", "gauge", "Workers that are present, and that are known.", count)
+    workers = status.workers
+    count = [({"which": which}, each) for which, each in (("present", workers.present), ("known", workers.known),
+                                                          ("lost", workers.lost))]  # fmt: skip
+    told = "Workers that are present, that are known, and that vanished without a word in the last minutes."
+    yield Metric("dreamfleet_workers", "gauge", told, count)
     yield _gauge("slots", "Slots of the present workers.", status.slots)
     classes = status.classes
     rest = classes.results - sum(each.results for each in classes.largest)

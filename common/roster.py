@@ -18,7 +18,7 @@ PAD = 2  # columns of air between two columns
 SLOW = 1.5  # times the median of seconds a job: the slowest is marked from there on
 COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
     "worker": lambda each: each.worker,
-    "state": lambda each: each.state,
+    "state": lambda each: each.state if each.state == "present" else f"{each.state} for {duration(each.heard)}",
     "slots": lambda each: str(each.slots),
     "a job": lambda each: "-" if each.job_seconds is None else duration(each.job_seconds),
     "round trip": lambda each: "-" if each.round_trip is None else f"< {duration(each.round_trip)}",

@@ -118,7 +118,7 @@ class WorkerStatus:
 
 
 What = Literal[
-    "joined", "back", "silent", "left", "given", "seen", "sent again", "recalled", "copied", "reissued", "accepted",
+    "joined", "back", "silent", "lost", "left", "given", "seen", "sent again", "recalled", "copied", "reissued", "accepted",
     "duplicate", "obsolete", "refused",
 ]  # fmt: skip
 
@@ -138,7 +138,9 @@ class WorkerCount:
     """How many workers there are."""
 
     present: Count
-    known: Count
+    known: Count  # the lost ones too
+    # Vanished without a word in the last minutes, and not back. `None` from a coordinator that forgets them at once.
+    lost: Count | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)

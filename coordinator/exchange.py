@@ -158,6 +158,11 @@ class Exchange:
         return self._fleet.members.values()
 
     @property
+    def lost(self) -> Collection[Member]:
+        """Workers that vanished without a word in the last minutes and are not back."""
+        return [each for name, each in self._fleet.lost.items() if name not in self._fleet.members]
+
+    @property
     def counts(self) -> Counter[str]:
         """What became of jobs, results and batches."""
         return self._fleet.counts

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 from dreamfleet.common.messages import MOST_SLOTS, Beat, Kind, Result, Verdict, VerdictWord
 from dreamfleet.common.printable import plural
+from dreamfleet.common.status import What
 from dreamfleet.coordinator.choice import Choice
 from dreamfleet.coordinator.jobs import Work
 from dreamfleet.coordinator.member import Handful, Lease, Member, Sent
@@ -30,6 +31,8 @@ ANSWER_BEATS = 2  # after which a worker that was sent nothing hears that it is 
 FORGOTTEN = 600.0  # seconds of silence after which a worker must say hello again
 VISIT = 60.0  # the same for one that was welcomed and has not beaten yet: a guest
 MOST_GUESTS = 256
+MISSED = 600.0  # seconds for which who vanished without a word is told as lost, unless he is back
+MOST_LOST = 256  # of whom so many are told, those that vanished last
 MOST_RECORDS = 4096  # of hosts, those that joined last
 
 
@@ -54,6 +57,7 @@ class Fleet:
         self._now = 0.0  # of what is being handled
         self._records: dict[str, HostRecord] = {}  # by name of a host, the one that joined last at the end
         self._guests: dict[str, None] = {}  # identities, oldest first
+        self.lost: dict[str, Member] = {}  # who vanished without a word, the last one at the end; told, no more
         self.jobs = WantedJobs(evaluation_share)
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
@@ -108,7 +112,8 @@ class Fleet:
         self._hear(member, now)
         if identity in self._guests:  # until it has beaten it may be anybody, and strangers would fill the story
             del self._guests[identity]
-            self.story.add(now, "joined", identity)
+            self.story.add(now, "back" if identity in self.lost else "joined", identity)
+            self._find(identity)
         if beat.numbering != member.numbering:
             # It was late, or its worker has not heard of the welcome: what it had queued, it will then forget.
             beat = replace(beat, seen=0, queued=())
@@ -196,6 +201,7 @@ class Fleet:
         """Let time pass: departures, silences, batches to send again."""
         gap = now - self._ticked if self._ticked is not None else 0.0
         self._ticked = self._now = now
+        self.lost = {name: each for name, each in self.lost.items() if now - each.heard <= MISSED}
         for member in list(self.members.values()):
             if gap > CLOCK_GAP:
                 self._extend(member, gap)
@@ -203,6 +209,7 @@ class Fleet:
                 if now - max(member.lost, member.heard) >= DEPARTURE_GRACE:
                     self._lose(member, now, "is gone without a word" if member.capacity else "left")
                     self._forget(member)
+                    self._miss(member)
             elif now - member.heard > (FORGOTTEN if member.known else VISIT):
                 self._forget(member)
             elif not member.silent and now - member.heard > SILENT_BEATS * self._beat:
@@ -338,7 +345,8 @@ class Fleet:
             return  # nothing was given to it, and no log should grow with what strangers call themselves
         freed = f"{plural(len(member.leases), 'job')} {'is' if len(member.leases) == 1 else 'are'} free again"
         self.notes.append(f"worker {member.identity} {what}: {freed}")
-        self.story.add(now, "left" if member.lost is not None else "silent", member.identity)
+        gone: What = "lost" if member.capacity else "left"
+        self.story.add(now, "silent" if member.lost is None else gone, member.identity)
         if member.leases:
             last = self._records.get(member.identity.partition("/")[0], member.record)
             last.die(now - member.born)
@@ -378,6 +386,19 @@ class Fleet:
         self._release(member)
         self._guests.pop(member.identity, None)
         del self.members[member.identity]
+
+    def _miss(self, member: Member) -> None:
+        """Its token vanished. One that left had said that it takes no more; of any other it is told that it is lost."""
+        if member.known and member.capacity:
+            self.lost[member.identity] = member
+            if len(self.lost) > MOST_LOST:
+                del self.lost[next(iter(self.lost))]
+
+    def _find(self, identity: str) -> None:
+        """It is back, or another life of a lost worker of its host is there in its place."""
+        host = identity.partition("/")[0]
+        others = (name for name in self.lost if name.partition("/")[0] == host)
+        self.lost.pop(identity if identity in self.lost else next(others, ""), None)
 
     def _release(self, member: Member) -> None:
         for digest in list(member.leases):

@@ -57,7 +57,7 @@ def take_snapshot(
     run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float, expires: float | None = None
 ) -> Snapshot:
     """The run as it is at `now`, seconds of the monotonic clock; `uptime` in seconds, `expires` since 1970."""
-    workers = tuple(_worker(member, now) for member in run.exchange.members)
+    workers = tuple(_worker(member, now) for member in (*run.exchange.members, *run.exchange.lost))
     standing = run.generation.standing()
     status = _status(run, name, standing, now)
     status = replace(status, uptime=round(uptime, 1), dropped=dict(dropped), expires=expires)
@@ -92,7 +92,9 @@ def _status(run: Run, name: str, standing: Standing, now: float) -> Status:
         evaluations=len(evaluations),
         evaluating=Progress(*evaluations.progress),
         collecting=Progress(*run.slack.collections.progress),
-        workers=WorkerCount(len(present), len(run.exchange.members)),
+        workers=WorkerCount(
+            len(present), len(run.exchange.members) + len(run.exchange.lost), len(run.exchange.lost)
+        ),
         worker_list=(),
         slots=sum(member.slots for member in present),
         fingerprint=run.exchange.fingerprint,
@@ -193,7 +195,7 @@ def _worker(member: Member, now: float) -> WorkerStatus:
         slots=member.slots,
         leases=len(member.leases),
         finished=member.finished,
-        steps_per_second=round(member.steps_per_second, 1),
+        steps_per_second=round(member.steps_per_second, 1) if member.present else 0.0,
         load=round(member.load, 2),
         drawn_by=member.drawn_by,
         heard=round(now - member.heard, 1),

@@ -16,7 +16,7 @@ from dreamfleet.common.site import offer, reached
 if TYPE_CHECKING:
     from dreamfleet.common.client import Client
 
-SUMMARY = "tell what happened to a live run's workers and jobs of late: given, seen, silent, reissued, accepted, ..."
+SUMMARY = "tell what happened to a live run's workers and jobs of late: given, seen, lost, reissued, accepted, ..."
 EXTRAS = ()
 MOST_TOLD = 8  # workers by name
 LAST = 40  # events that people are shown unless they say otherwise

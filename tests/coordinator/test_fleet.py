@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.messages import TAG_BYTES, Beat, Result, Running
-from dreamfleet.coordinator.fleet import DEPARTURE_GRACE, FORGOTTEN, MOST_GUESTS, MOST_SLOTS, SILENT_BEATS, VISIT
+from dreamfleet.coordinator.fleet import (
+    DEPARTURE_GRACE,
+    FORGOTTEN,
+    MISSED,
+    MOST_GUESTS,
+    MOST_LOST,
+    MOST_SLOTS,
+    SILENT_BEATS,
+    VISIT,
+)
 from dreamfleet.coordinator.fleet import Fleet as _Fleet
 from dreamfleet.coordinator.jobs import make_work, travelling
 from dreamfleet.coordinator.tail import HELD, HELD_TIMES, UPLOAD_SECONDS
@@ -136,6 +145,41 @@ def test_a_departed_workers_jobs_are_issued_again_after_the_grace():
     fleet.tick(1.0 + DEPARTURE_GRACE)
     assert digests(fleet.dispatch(1.1), B) == [digest]
     assert A not in fleet.members
+
+
+def test_who_vanishes_without_a_word_is_told_as_lost_until_he_is_back_or_for_minutes():
+    fleet = fleet_of(A, B)
+
+    def vanish(name, now):
+        fleet.depart(name, now)
+        fleet.tick(now + 2 * DEPARTURE_GRACE)
+
+    vanish(A, 1.0)
+    fleet.beat(B, beat(0), 2.0)  # drained: it says that it leaves
+    vanish(B, 2.0)
+    assert list(fleet.lost) == [A]
+    assert [each.what for each in fleet.story.view().latest()][:2] == ["left", "lost"]
+    fleet.welcome(A, 1, "f", 3.0)
+    assert list(fleet.lost) == [A]  # anybody may say hello
+    fleet.beat(A, beat(), 3.0)
+    assert (fleet.lost, next(fleet.story.view().latest()).what) == ({}, "back")
+    vanish(A, 4.0)
+    another_life = "a/00000009"
+    fleet.welcome(another_life, 1, "f", 5.0)
+    fleet.beat(another_life, beat(), 5.0)
+    assert not fleet.lost
+    vanish(another_life, 6.0)
+    fleet.tick(6.0 + MISSED)
+    assert not fleet.lost
+
+
+def test_so_many_lost_workers_are_told_and_no_more():
+    fleet = fleet_of(*(f"h{number}/0" for number in range(MOST_LOST + 3)))
+    for name in list(fleet.members):
+        fleet.depart(name, 1.0)
+    fleet.tick(1.0 + 2 * DEPARTURE_GRACE)
+    assert len(fleet.lost) == MOST_LOST
+    assert "h0/0" not in fleet.lost
 
 
 def test_a_silent_workers_jobs_are_issued_again_and_its_voice_brings_it_back():

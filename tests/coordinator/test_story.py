@@ -3,6 +3,8 @@
 import pytest
 
 from dreamfleet.common.messages import Result
+from dreamfleet.common.metrics import exposition
+from dreamfleet.common.status import WorkerCount, read_status
 from dreamfleet.coordinator.fleet import DEPARTURE_GRACE, SILENT_BEATS
 from dreamfleet.coordinator.story import BLOCK, BLOCKS, Story
 from tests.coordinator.test_run import A, B, Bench
@@ -59,11 +61,15 @@ def test_jobs_of_a_silent_worker_are_told_as_given_out_again(bench):
     assert told(bench, worker="a")[-1][:2] == ("back", A)
 
 
-def test_a_worker_that_leaves_is_told_and_a_stranger_is_not(bench):
+def test_a_worker_that_vanishes_is_told_and_a_stranger_is_not(bench):
     bench.run.exchange.depart(B, bench.now)
     bench.now += 2 * DEPARTURE_GRACE
     bench.run.exchange.tick(bench.now)
-    assert ("left", B, "") in told(bench)
+    assert ("lost", B, "") in told(bench)
+    status = read_status(answered(snapshot_of(bench)))
+    assert (status.workers, status.worker_list[-1].worker) == (WorkerCount(1, 2, 1), B)
+    assert (status.worker_list[-1].state, status.worker_list[-1].leases) == ("lost", 0)
+    assert 'dreamfleet_workers{run="night",which="lost"} 1.0' in exposition(status)
     before = len(told(bench))
     bench.deliver("stranger/00000009", Result(b"x" * 32, 1.0, 10, 0.1, None, None))
     assert len(told(bench)) == before
