@@ -27,7 +27,7 @@ def test_a_fleets_log_is_json_where_it_is_asked_for_and_tells_how_to_start_a_wor
     closed = json.loads(coordinator.wait_for("generation 0: mean"))
     assert (closed["event"], closed["number"], closed["level"]) == ("generation", 0, "info")
     coordinator.popen.kill()
-    assert "this worker waits for that run alone" in worker.wait_for("the coordinator of run test is gone")
+    assert "this worker waits for that run alone" in worker.wait_for("the coordinator of run test is out of sight")
     worker.popen.terminate()
     assert worker.finish()[0] == 0
 
@@ -49,7 +49,7 @@ def test_what_ends_as_it_should_is_not_told_as_a_loss(processes, random_bundle):
     for verb, said in (("pause", "paused: paused by hand"), ("resume", "resumed"), ("stop", "")):
         assert processes.call(verb, "test", "--connect", processes.endpoint)[0] == 0
         coordinator.wait_for(said)
-    assert "has left, as it does when a run ends" in own.wait_for("the coordinator of run test")
+    assert "this worker leaves too" in own.wait_for("the coordinator of run test")
     assert own.finish()[0] == 0
 
 
@@ -68,7 +68,7 @@ def test_the_story_of_a_killed_workers_jobs_is_told_while_the_run_lives(processe
         assert code == 0, err
         return json.loads(out)
 
-    while "left" not in (whats := [each["what"] for each in story("--worker", "host-a")]):
+    while "lost" not in (whats := [each["what"] for each in story("--worker", "host-a")]):
         pass  # a snapshot is a fifth of a second old
     assert whats[0] == "joined"
     assert {"given", "accepted", "reissued"} <= set(whats)

@@ -155,14 +155,16 @@ class JoinedRun:
         if event.kind == zenoh.SampleKind.DELETE:
             self._membership.vanish(nonce, monotonic())
             then = (
-                f"has left, as it does when a run ends; this worker does too if none is back within {GONE:g} s"
+                f"this worker leaves too if it is not back within {GONE:g} s"
                 if self._membership.leaves_alone
-                else "is gone; this worker waits for that run alone (--any: the next one)"
+                else "this worker waits for that run alone (--any: the next one)"
             )
-            log.info("the coordinator of run %s %s", self._admission.run, then,
+            log.info("the coordinator of run %s is out of sight: it left, or the connection was cut; %s",
+                     self._admission.run, then,
                      extra={"facts": {"event": "coordinator gone", "run": self._admission.run}})  # fmt: skip
-        else:
-            self._membership.appear(nonce)
+        elif self._membership.appear(nonce):  # of another life the new welcome is told
+            log.info("the coordinator of run %s is in sight again; this worker goes on", self._admission.run,
+                     extra={"facts": {"event": "coordinator back", "run": self._admission.run}})  # fmt: skip
 
     def _take_batch(self, payload: bytes) -> None:
         batch = self._line.inbox.decode(JobBatch, payload)

@@ -83,10 +83,12 @@ class Membership:
         """The joined run ends, and its workers with it."""
         self._disbanded = True
 
-    def appear(self, nonce: str) -> None:
-        """A coordinator's token of the joined run came into sight."""
+    def appear(self, nonce: str) -> bool:
+        """A coordinator's token of the joined run came into sight; whether it is the joined life's, out of sight before."""
+        back = self._parted and nonce == self._nonce and nonce not in self._coordinators
         self._coordinators.add(nonce)
         self._alone_since = None
+        return back
 
     def vanish(self, nonce: str, now: float) -> None:
         """A coordinator's token went out of sight."""

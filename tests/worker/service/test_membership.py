@@ -56,7 +56,8 @@ def test_a_coordinator_that_was_out_of_sight_is_asked_at_once_and_only_when_it_i
     member = joined()
     member.vanish("first", 1.0)
     assert not member.must_rejoin(1.0, BUSY)
-    member.appear("first")
+    assert member.appear("first")
+    assert not member.appear("first")
     assert member.must_rejoin(1.0, BUSY)
     member.rejoin("first", 1.1)
     assert not member.must_rejoin(1.1, BUSY)
@@ -65,7 +66,7 @@ def test_a_coordinator_that_was_out_of_sight_is_asked_at_once_and_only_when_it_i
 def test_another_life_of_the_coordinator_is_asked_and_then_obeyed():
     member = joined()
     member.vanish("first", 1.0)
-    member.appear("second")
+    assert not member.appear("second")
     assert member.must_rejoin(1.0, BUSY)
     member.rejoin("second", 1.1)
     assert not member.must_rejoin(1.1, BUSY)
