@@ -35,13 +35,14 @@ class Bound:
 
 @dataclass(frozen=True)
 class Eta:
-    """What is known of a run's end. Its last evaluations and its confirmation come after it."""
+    """What is known of a run's end: its limits, and the last evaluations and the confirmation that come after them."""
 
     bounds: tuple[Bound, ...]  # limits that are counted, the nearest first
     others: tuple[str, ...]  # limits that nobody can foretell, in words
     pace: float | None  # seconds a generation; `None` before the first is closed
-    seconds: float | None  # until the first limit; `None` while nobody works, or where nothing tells
-    then: str = "at its limit"  # what is told where it is reached
+    limit: float | None  # seconds until the first limit; `None` while nobody works, or where nothing tells
+    seconds: float | None  # until the run's end; `None` too where nothing tells how long evaluations take
+    closing: int = 0  # episodes of evaluations that the end takes
 
     @property
     def told(self) -> str:
@@ -51,20 +52,26 @@ class Eta:
         if self.pace is not None:
             parts.append(f"{duration(self.pace)} a generation")
         if self.seconds is not None:
-            parts.append(f"about {duration(self.seconds)} to go" if self.seconds >= 1 else self.then)
+            parts.append(f"about {duration(self.seconds)} to go" if self.seconds >= 1 else "about to end")
+        elif self.limit is not None:
+            parts += [f"about {duration(self.limit)} to its limit"] if self.limit >= 1 else []
+            parts.append(f"then {plural(self.closing, 'episode')} of evaluation")
         return ", ".join(parts)
 
 
 def eta_of(status: Status) -> Eta:
-    """From the limits, what was done, and the pace of the generations that were closed last."""
+    """From the limits, what was done, the pace of the last generations, and the speed of the workers that are there."""
     recent = status.recent[-PACED_BY:]
     pace = median(each.seconds for each in recent) if recent else None
-    bounds = tuple(_bounds(status, pace))
-    if pace is not None:
+    coming = _coming(status, pace)
+    bounds = tuple(_bounds(status, pace, coming))
+    if coming is not None:
         bounds = tuple(sorted(bounds, key=lambda each: math.inf if each.seconds is None else each.seconds))
-    known = [each.seconds for each in bounds if each.seconds is not None]
-    seconds = min(known) if known and status.state in WORKING else None
-    return Eta(bounds, tuple(_others(status)), pace, seconds, "confirming" if status.confirming.episodes else Eta.then)
+    known = [0.0] if _reached(status) else [each.seconds for each in bounds if each.seconds is not None]
+    limit = min(known) if known and status.state in WORKING else None
+    closing = _closing_seconds(status)
+    seconds = None if limit is None or closing is None else limit + closing
+    return Eta(bounds, tuple(_others(status)), pace, limit, seconds, _closing(status))
 
 
 def sentence(status: Status) -> str:
@@ -103,21 +110,49 @@ def duration(seconds: float) -> str:
     return f"{days:,} d {hours} h" if hours else f"{days:,} d"
 
 
-def _bounds(status: Status, pace: float | None) -> Iterator[Bound]:
+def _coming(status: Status, pace: float | None) -> float | None:
+    """Seconds that a generation to come takes: as the last ones, or longer where fewer workers are there."""
+    rate = status.throughput.episodes_per_second
+    needed = status.generation.episodes / rate if rate else None
+    return max((each for each in (pace, needed) if each is not None), default=None)
+
+
+def _rest(status: Status, pace: float | None) -> float | None:
+    """Seconds that the open generation yet takes, likewise."""
+    opened, rate = status.generation, status.throughput.episodes_per_second
+    left = None if pace is None else max(pace - opened.seconds, 0.0)
+    needed = max(opened.episodes - opened.episodes_done, 0) / rate if rate else None
+    return max((each for each in (left, needed) if each is not None), default=None)
+
+
+def _closing(status: Status) -> int:
+    """Episodes of evaluations that the end takes; of a coordinator that does not say it, those that are in progress."""
+    parts = (status.evaluating, status.confirming) if _reached(status) else ()
+    return max(status.closing, sum(each.episodes - each.episodes_done for each in parts))
+
+
+def _closing_seconds(status: Status) -> float | None:
+    """Seconds of the evaluations and the confirmation that end the run; `None` before one shows how long they take."""
+    rate = status.throughput.evaluation_episodes_per_second
+    closing = _closing(status)
+    return closing / rate if rate else None if closing else 0.0
+
+
+def _bounds(status: Status, pace: float | None, coming: float | None) -> Iterator[Bound]:
     """Each counted limit. A run ends as a generation closes: so the open one is waited for at least."""
     limits, spent, reached = status.limits, status.throughput, _reached(status)
     gone = 0.0 if reached else status.generation.seconds
-    rest = None if pace is None else 0.0 if reached else max(pace - gone, 0.0)
+    rest = 0.0 if reached else _rest(status, pace)
     seconds: float | None
     if generations := _limit(limits, "generations"):
         closed = status.generations
         left = max(generations - closed, 0)
-        seconds = None if pace is None or rest is None else (left - 1) * pace + rest if left else 0.0
+        seconds = None if coming is None or rest is None else (left - 1) * coming + rest if left else 0.0
         yield Bound(
             "generations", closed, generations, seconds, f"{closed:,} of {plural(int(generations), 'generation')}"
         )
     if steps := _limit(limits, "steps"):
-        done, rate = spent.environment_steps, _rate(status)
+        done, rate = spent.environment_steps, _rate(status) * (pace / coming if pace and coming else 1.0)
         seconds = None if not rate or rest is None else max((steps - done) / rate, rest) if done < steps else rest
         yield Bound("steps", done, steps, seconds, f"{counted(done)} of {counted(int(steps))} steps")
     if (minutes := _limit(limits, "minutes")) and spent.seconds is not None:
@@ -130,7 +165,8 @@ def _reached(status: Status) -> bool:
     """Whether nobody scores the open generation, which is there for a later life with wider limits."""
     generations, minutes = _limit(status.limits, "generations"), _limit(status.limits, "minutes")
     by_time = bool(minutes) and (status.throughput.seconds or 0.0) >= 60 * minutes
-    return by_time or 0 < generations <= status.generations or status.confirming.episodes > 0
+    by_number = 0 < generations <= status.generations
+    return status.ending or by_time or by_number or status.confirming.episodes > 0  # `ending`: not of earlier versions
 
 
 def _rate(status: Status) -> float:
@@ -193,7 +229,7 @@ def _paused(status: Status) -> str:
 
 
 def _ended(status: Status) -> str:
-    return f"finished: {status.why or 'stopped'}; {told(status.confirmed or status.best)}"
+    return f"ended: {status.why or 'stopped'}; {told(status.confirmed or status.best)}"
 
 
 def _left(status: Status) -> str:

@@ -78,7 +78,7 @@ def _progress(status: Status) -> Iterator[Metric]:
     yield _gauge("steps_per_second", "Environment steps a second of the present workers.", spent.steps_per_second)
     eta = eta_of(status)
     yield _gauge("pace_seconds", "Seconds a generation, the median of the last ones.", eta.pace)
-    yield _gauge("eta_seconds", "Seconds until the nearest limit at this pace.", eta.seconds)
+    yield _gauge("eta_seconds", "Seconds until the run ends, its confirmation among them.", eta.seconds)
     yield _gauge("uptime_seconds", "Seconds since its coordinator began.", status.uptime)
 
 

@@ -7,6 +7,7 @@ import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from datetime import datetime
 from difflib import SequenceMatcher
 from pathlib import Path
 from types import NoneType
@@ -44,6 +45,7 @@ ARCHIVE = "archive"
 MOST_TOLD = 8  # runs by name, where one is not there
 ROLLOUTS = "rollouts"
 CONFIRMED = "confirmed"  # the fact's name
+ENDED_AT = "ended_at"  # the fact's name: when the run ended
 ENDING = "ending"  # the fact's name: the limit that was reached, while the last evaluations are waited for and after
 
 
@@ -114,6 +116,18 @@ class RunFolder:
     def ended(self) -> str | None:
         """Why the run ended, or `None` if it did not."""
         return self._fact("ended")
+
+    @property
+    def ended_at(self) -> str | None:
+        """When it ended, ISO 8601, UTC; `None` if it did not, or did before this was written."""
+        return self._fact(ENDED_AT) if self.ended else None
+
+    @property
+    def lasted(self) -> float | None:
+        """Seconds from its beginning to its end, its pauses among them; `None` as for `ended_at`."""
+        if (ended_at := self.ended_at) is None:
+            return None
+        return (datetime.fromisoformat(ended_at) - datetime.fromisoformat(self.created)).total_seconds()
 
     @property
     def classes(self) -> Classes:

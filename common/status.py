@@ -118,8 +118,8 @@ class WorkerStatus:
 
 
 What = Literal[
-    "joined", "back", "silent", "lost", "left", "given", "seen", "sent again", "recalled", "copied", "reissued", "accepted",
-    "duplicate", "obsolete", "refused",
+    "joined", "back", "silent", "lost", "left", "given", "seen", "sent again", "recalled", "copied", "reissued",
+    "accepted", "duplicate", "obsolete", "refused",
 ]  # fmt: skip
 
 
@@ -151,6 +151,9 @@ class Throughput:
     environment_steps: Count
     # Of closed generations: what a limit of minutes counts. `None` from a coordinator of before this.
     seconds: Seconds | None = field(default=None, metadata=OPTIONAL)
+    # At the present workers' speed, if they drove nothing else; `None` before it is known.
+    episodes_per_second: float | None = field(default=None, metadata=OPTIONAL)  # of candidates
+    evaluation_episodes_per_second: float | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
@@ -221,6 +224,10 @@ class Status:
     classes: Classes = field(default=Classes(), metadata=OPTIONAL)  # of the hosts that scored, by accepted results
     # When the coordinator's join file ends, in seconds since 1970; `None` where it has none.
     expires: float | None = field(default=None, metadata=OPTIONAL)
+
+    ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: evaluations are all that is waited for
+    # Episodes of means that the run's end yet takes: evaluations in progress, the last one, the confirmation.
+    closing: Count = field(default=0, metadata=OPTIONAL)
 
     @property
     def over(self) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from dreamfleet.common.controller import Controller
+from dreamfleet.common.eta import duration
 from dreamfleet.common.fields import written
 from dreamfleet.common.receipt import Receipt, receipt_of, settings_in
 from dreamfleet.common.runs import RunFolder
@@ -20,6 +21,7 @@ def facts(run: RunFolder) -> dict[str, Any]:
     receipt, settings = receipt_of(controller), settings_in(controller)
     return {
         "run": run.name, "run_uid": run.uid, "created": run.created, "ended": run.ended,
+        "ended_at": run.ended_at, "lasted_seconds": run.lasted,
         "controller": controller.sha256, "bundle": settings.task.bundle or None, "score": _score(run),
         "settings": written(settings), "receipt": written(receipt), "commands": _commands(run),
     }  # fmt: skip
@@ -42,7 +44,8 @@ def markdown(run: RunFolder) -> str:
 
 def _rows(run: RunFolder, controller: Controller, receipt: Receipt, settings: RunSettings) -> Iterator[tuple[str, str]]:
     spec = settings.task
-    yield "run", f"`{run.uid}`, begun {run.created}, {f'ended after {run.ended}' if run.ended else 'open'}"
+    at = "" if run.lasted is None else f" at {run.ended_at}, {duration(run.lasted)} after it began"
+    yield "run", f"`{run.uid}`, begun {run.created}, {f'ended after {run.ended}{at}' if run.ended else 'open'}"
     yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
     yield "score", _score(run)

@@ -65,6 +65,12 @@ class Confirmation:
         return len(self._scores), len(self._digests)
 
     @property
+    def left(self) -> int:
+        """Episodes until there is an outcome."""
+        done, wanted = self.progress
+        return wanted - done + episodes_of(_better_half(self._standing), self._episodes)
+
+    @property
     def round(self) -> str:
         """The open round in words."""
         seeds = len(self._digests) // len(self._standing)
@@ -118,8 +124,20 @@ class Confirmation:
             return
         judged = [each.after(row.tolist()) for each, row in zip(self._standing, scores, strict=True)]
         judged.sort(key=lambda each: (-each.mean, each.generation))
-        self._standing = judged[: -(-len(judged) // 2)]
+        self._standing = judged[: _better_half(judged)]
 
     def _outcome(self, scores: np.ndarray[tuple[int], np.dtype[np.float64]]) -> StoredConfirmation:
         std = float(scores.std(ddof=1)) if len(scores) > 1 else 0.0
         return StoredConfirmation(self._standing[0].generation, len(scores), float(scores.mean()), std, self._closed)
+
+
+def episodes_of(finalists: int, episodes: int) -> int:
+    """All that a confirmation of so many finalists drives, if its rounds are of about `episodes`."""
+    if finalists < 2:
+        return finalists * episodes
+    return finalists * max(1, episodes // finalists) + episodes_of(-(-finalists // 2), episodes)
+
+
+def _better_half(standing: Sequence[Finalist]) -> int:
+    """How many go on; none where one is left."""
+    return -(-len(standing) // 2) if len(standing) > 1 else 0

@@ -158,8 +158,8 @@ class Fleet:
             member.leases.pop(result.digest, None)
             member.verdicts.append(Verdict(result.digest, verdict))
             member.finished += verdict == "accepted"
-            if work is not None and work.job.kind == "score":
-                member.record.took(result.seconds)
+            if work is not None:
+                member.record.took(work.job.kind, result.seconds)
         if verdict == "accepted":
             self._tail.learn(result.steps)
         self.counts["accepted_steps" if verdict == "accepted" else "discarded_steps"] += result.steps

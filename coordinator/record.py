@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from dreamfleet.common.messages import Kind
+
 UNKNOWN_LINK = 32_000.0  # bytes a second that a link is thought to carry before it has shown what it does
 FORGOTTEN = 0.95  # of the best rate that a link has shown remains with each new one
 RISING, FALLING = 0.5, 0.2  # weight of a slower and of a faster turnaround
@@ -49,6 +51,7 @@ class HostRecord:
     life: float = math.inf  # seconds between them
     steps: float = 0.0  # environment steps a second of one of its slots
     job: float | None = None  # seconds that a candidate's job takes one of its slots
+    evaluation: float | None = None  # the same of an evaluation's
     trip: float | None = None  # seconds until a batch was known to have arrived, at best
 
     def inherit(self) -> HostRecord:
@@ -112,9 +115,12 @@ class HostRecord:
         """Whether it may well be lost before it brings so many back."""
         return self.deaths >= DEATHS and self.expected(jobs) * LIFETIMES > max(self.life, age)
 
-    def took(self, seconds: float) -> None:
-        """A candidate's job took a slot so long."""
-        self.job = seconds if self.job is None else self.job + FALLING * (seconds - self.job)
+    def took(self, kind: Kind, seconds: float) -> None:
+        """A job of this kind took a slot so long."""
+        if kind == "score":
+            self.job = _smoothed(self.job, seconds)
+        elif kind == "evaluate":
+            self.evaluation = _smoothed(self.evaluation, seconds)
 
     def confirmed(self, seconds: float) -> None:
         """A batch was known to have arrived so long after it was sent."""
@@ -131,3 +137,7 @@ class HostRecord:
 
 def _size(jobs: int) -> int:
     return max(jobs - 1, 0).bit_length()
+
+
+def _smoothed(before: float | None, seconds: float) -> float:
+    return seconds if before is None else before + FALLING * (seconds - before)

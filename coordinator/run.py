@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 
 from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import ENDING
+from dreamfleet.common.runs import ENDED_AT, ENDING
 from dreamfleet.common.stages import longest_horizon
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.terms import Agenda, Terms
@@ -45,6 +46,7 @@ class Run:
         self.ended: str | None = None
         self.paused: str | None = None
         self.uid = journal.fact("uid") or ""
+        self.created = journal.fact("created") or ""  # ISO 8601, UTC
         self.incarnation = journal.begin_incarnation()
         self._journal = journal
         self._untold: list[StoredGeneration] = []
@@ -95,6 +97,11 @@ class Run:
     def confirmed(self) -> StoredConfirmation | None:
         """The confirmed score of what is reported; `None` where what is reported is not confirmed."""
         return self.slack.confirmed
+
+    @property
+    def ending(self) -> bool:
+        """Whether a limit is reached: evaluations and the confirmation are all that is waited for."""
+        return self._ending is not None
 
     @property
     def controller_path(self) -> Path | None:
@@ -247,5 +254,7 @@ class Run:
 
     def _end(self) -> None:
         self.ended = self._ending or "stopped"
+        if self._journal.fact("ended") is None:  # else it had ended before, and nothing was left to do
+            self._journal.set_fact(ENDED_AT, datetime.now(UTC).isoformat(timespec="seconds"))
         self._journal.set_fact("ended", self.ended)
         self.slack.report.finish()

@@ -9,7 +9,7 @@ from dreamfleet.common.runs import CONFIRMED, CONTROLLER
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.common.terms import Agenda
 from dreamfleet.coordinator.collection import Collection, Collections
-from dreamfleet.coordinator.confirmation import FINALISTS, Confirmation
+from dreamfleet.coordinator.confirmation import FINALISTS, Confirmation, episodes_of
 from dreamfleet.coordinator.evaluation import Evaluation, Evaluations
 from dreamfleet.coordinator.history import History
 from dreamfleet.coordinator.jobs import Work
@@ -54,6 +54,21 @@ class Slack:
     def confirming(self) -> tuple[int, int]:
         """Episodes of the confirmation's open round: done, wanted."""
         return (0, 0) if self._confirmation is None else self._confirmation.progress
+
+    def closing(self, *, ending: bool) -> int:
+        """Episodes of means that are waited for when a limit is reached, as `ending` says it is: as far as is known.
+
+        Those of evaluations in progress, of the last one, and of the confirmation.
+        """
+        settings, (done, wanted) = self._settings, self.evaluations.progress
+        if self._confirmation is not None:
+            return wanted - done + self._confirmation.left
+        if ending and self._confirmed is not None and self._confirmed.closed == len(self._history):
+            return wanted - done
+        last = not ending and settings.evaluate_every > 0
+        finalists = min(len(self.evaluations) + self.evaluations.in_progress + last, FINALISTS)
+        confirming = episodes_of(finalists, settings.confirm_episodes)
+        return wanted - done + last * settings.evaluation_episodes + confirming
 
     @property
     def round(self) -> str:

@@ -29,6 +29,7 @@ from dreamfleet.coordinator.failure import Failure, shorten
 from dreamfleet.coordinator.generation import Standing
 from dreamfleet.coordinator.history import HistoryView
 from dreamfleet.coordinator.member import Member
+from dreamfleet.coordinator.pace import episodes_per_second
 from dreamfleet.coordinator.report import Reported
 from dreamfleet.coordinator.run import Run
 from dreamfleet.coordinator.story import StoryView
@@ -92,9 +93,7 @@ def _status(run: Run, name: str, standing: Standing, now: float) -> Status:
         evaluations=len(evaluations),
         evaluating=Progress(*evaluations.progress),
         collecting=Progress(*run.slack.collections.progress),
-        workers=WorkerCount(
-            len(present), len(run.exchange.members) + len(run.exchange.lost), len(run.exchange.lost)
-        ),
+        workers=WorkerCount(len(present), len(run.exchange.members) + len(run.exchange.lost), len(run.exchange.lost)),
         worker_list=(),
         slots=sum(member.slots for member in present),
         fingerprint=run.exchange.fingerprint,
@@ -106,6 +105,8 @@ def _status(run: Run, name: str, standing: Standing, now: float) -> Status:
         refused=_refused(run),
         confirmed=run.confirmed,
         confirming=Progress(*run.slack.confirming),
+        ending=run.ending,
+        closing=0 if run.ended is not None else run.slack.closing(ending=run.ending),
         strict=run.exchange.strict,
         classes=run.exchange.classes,
     )
@@ -153,7 +154,17 @@ def _headless(standing: Standing) -> Population:
 def _throughput(run: Run, present: Sequence[Member]) -> Throughput:
     rate = sum(member.steps_per_second for member in present)
     steps = saturated(run.history.steps + run.generation.steps)
-    return Throughput(round(rate, 1), steps, min(round(run.history.seconds, 1), MOST_SECONDS))
+    return Throughput(
+        steps_per_second=round(rate, 1),
+        environment_steps=steps,
+        seconds=min(round(run.history.seconds, 1), MOST_SECONDS),
+        episodes_per_second=_rounded(episodes_per_second(present, lambda record: record.job)),
+        evaluation_episodes_per_second=_rounded(episodes_per_second(present, lambda record: record.evaluation)),
+    )
+
+
+def _rounded(rate: float | None) -> float | None:
+    return None if rate is None else round(rate, 4)
 
 
 def _refused(run: Run) -> dict[str, str]:

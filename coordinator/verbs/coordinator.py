@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.config import Table, add_flags, given, load
@@ -224,6 +225,7 @@ def _end_on_signals() -> None:
 def _report(
     args: argparse.Namespace, run: Run, request: RunRequest, outcome: Outcome, *, nothing_new: bool
 ) -> None:  # fmt: skip
+    from dreamfleet.common.eta import duration
     from dreamfleet.common.runs import CONTROLLER
     from dreamfleet.common.stored import told
 
@@ -240,7 +242,9 @@ def _report(
     else:
         where = f"; controller: {controller}" if controller else "; it has no controller yet"
         more = f"; it goes on with wider limits, such as: {again} --generations 0 --minutes 30" if nothing_new else ""
-        text = f"run {request.name} ended after {run.ended}{score}{where}{outcome.text or more}"
+        lasted = (datetime.now(UTC) - datetime.fromisoformat(run.created)).total_seconds()
+        ended = f"ended after {run.ended} (begun {duration(lasted)} ago)"
+        text = f"run {request.name} {ended}{score}{where}{outcome.text or more}"
     if run.ended is None and not args.json:
         print(text, file=sys.stderr)
     else:

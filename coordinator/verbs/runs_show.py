@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
+from dreamfleet.common.eta import duration
 from dreamfleet.common.listing import add_json, print_rows
 from dreamfleet.common.printable import setting
 from dreamfleet.common.runs import open_run
@@ -32,9 +33,9 @@ def run(args: argparse.Namespace) -> int:
     """Print the run."""
     with open_run(args.runs_dir, args.run_name) as stored, stored.at_one_moment():
         settings, history, evaluations = stored.settings, stored.history(), stored.evaluations()
-        confirmed = stored.confirmation()
+        confirmed, lasted = stored.confirmation(), stored.lasted
         facts = {"run": stored.name, "run_uid": stored.uid, "created": stored.created, "ended": stored.ended,
-                 "fingerprint": stored.fingerprint}  # fmt: skip
+                 "ended_at": stored.ended_at, "lasted_seconds": lasted, "fingerprint": stored.fingerprint}  # fmt: skip
         classes = stored.classes
     begun = begun_stages(settings, history, evaluations) if settings.stages else ()
     if args.json:
@@ -45,6 +46,9 @@ def run(args: argparse.Namespace) -> int:
         rows["classes"] = asdict(classes)
         print(json.dumps({**facts, "settings": asdict(settings), "confirmed": reported, **rows}, indent=2))
         return 0
+    del facts["lasted_seconds"]
+    if lasted is not None:
+        facts["ended_at"] = f"{facts['ended_at']}, {duration(lasted)} after it began"
     facts["hosts"] = classes.told
     facts |= {f"class {name}": hosts for name, hosts in classes.rows}
     facts["reported"] = told(confirmed or best_of(evaluations))

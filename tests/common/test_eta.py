@@ -46,10 +46,42 @@ def test_of_several_limits_the_nearest_stands_first_and_counts():
     assert eta.seconds == eta.bounds[0].seconds
 
 
-@pytest.mark.parametrize(("confirming", "then"), [(Progress(0, 0), "at its limit"), (Progress(3, 16), "confirming")])
-def test_what_comes_after_the_limit_does_not_count_on(confirming, then):
-    eta = eta_of(status({"minutes": 1.0}, seconds=66.0, gone=40.0, state="evaluating", confirming=confirming))
+def with_speed(told, candidates=None, evaluations=None):
+    throughput = dataclasses.replace(
+        told.throughput, episodes_per_second=candidates, evaluation_episodes_per_second=evaluations
+    )
+    return dataclasses.replace(told, throughput=throughput)
+
+
+@pytest.mark.parametrize(("rate", "then"), [(None, "then 90 episodes of evaluation"), (0.5, "about 3 min to go")])
+def test_evaluations_and_confirmation_after_the_limit_count(rate, then):
+    ending = status({"minutes": 1.0}, seconds=66.0, gone=40.0, state="evaluating", ending=True, closing=90)
+    eta = eta_of(with_speed(ending, evaluations=rate))
     assert eta.told == f"1.1 of 1 minute, 4.6 s a generation, {then}"
+    before = status({"minutes": 2.0}, seconds=60.0, closing=90)
+    eta = eta_of(with_speed(before, evaluations=rate))
+    assert (eta.limit, eta.seconds) == (60.0, None if rate is None else 240.0)
+    assert ("about 1 min to its limit, then 90" in eta.told) == (rate is None)
+
+
+def test_a_limit_that_an_evaluation_reached_is_over_too():
+    eta = eta_of(with_speed(status({"target": 900.0}, state="evaluating", ending=True, closing=90), evaluations=9.0))
+    assert eta.seconds == 10.0
+
+
+def test_a_coordinator_from_before_says_what_is_in_progress():
+    eta = eta_of(status({"minutes": 1.0}, seconds=66.0, state="evaluating", confirming=Progress(3, 16)))
+    assert eta.told.endswith("then 13 episodes of evaluation")
+    assert eta_of(status({"minutes": 1.0}, seconds=66.0)).told.endswith("about to end")
+
+
+def test_where_workers_were_lost_generations_are_foretold_by_the_speed_of_those_that_are_left():
+    slowed = with_speed(status({"generations": 10}, gone=99.0), candidates=0.5)  # 5 of 8 episodes are left
+    assert eta_of(slowed).seconds == 10 + 16 + 16
+    steps = with_speed(status({"steps": 576_000}, paces=(8.0, 8.0)), candidates=0.5)
+    assert eta_of(steps).seconds == pytest.approx(2 * 16.0)
+    first = with_speed(status({"generations": 8}, paces=()), candidates=0.5)
+    assert eta_of(first).seconds == 10.0
 
 
 def test_a_target_is_told_and_not_foretold():
@@ -62,7 +94,7 @@ def test_a_target_is_told_and_not_foretold():
 
 def test_without_limits_or_generations_nothing_is_made_up():
     assert eta_of(status(paces=())).told == "no limit: it runs until it is stopped"
-    assert eta_of(status({"generations": 5}, paces=())).seconds is None
+    assert eta_of(status({"generations": 9}, paces=())).seconds is None
     assert eta_of(status({"minutes": 30.0})).bounds == ()  # an earlier coordinator does not say how long
 
 
@@ -103,7 +135,7 @@ def test_limits_of_another_version_are_passed_over(strange):
         ),
         (
             {"state": "ended", "why": "30 minutes", "best": None},
-            "finished: 30 minutes; the last mean; it was not evaluated",
+            "ended: 30 minutes; the last mean; it was not evaluated",
         ),
         ({"state": "of a later version"}, "of a later version"),
     ],

@@ -14,7 +14,7 @@ from dreamfleet.common.runs import CONTROLLER, RunFolder
 from dreamfleet.common.seeds import CHOOSING, CONFIRMING, VALIDATION
 from dreamfleet.common.stored import StoredEvaluation
 from dreamfleet.coordinator.config import LimitsConfig
-from dreamfleet.coordinator.confirmation import FINALISTS, Confirmation, Finalist
+from dreamfleet.coordinator.confirmation import FINALISTS, Confirmation, Finalist, episodes_of
 from tests.coordinator.test_run import SETTINGS, Bench
 from tests.support.samples import SPEC
 
@@ -112,6 +112,17 @@ def test_the_best_few_drive_on_and_half_of_them_further(make):
     assert lengths == [6, 6, 2, 2, 0, 0], "four drive 2 tracks, two drive 4 more"
     assert {generation for generation, tracks in rounds.items() if tracks} == {e.generation for e in ranked[:FINALISTS]}
     assert sorted(rounds[confirmed.generation])[:6] == list(range(CHOOSING, CHOOSING + 6))
+
+
+def test_the_episodes_that_the_end_takes_are_foretold(make):
+    night = make()
+    while not night.run.ending:
+        night.step()
+    foretold, before = night.run.slack.closing(ending=True), {job.digest for job in night.judged}
+    night.end()
+    assert len({job.digest for job in night.judged} - before) == foretold > 3 * JUDGED.confirm_episodes - 1
+    assert night.run.slack.closing(ending=True) == 0
+    assert [episodes_of(finalists, 16) for finalists in range(5)] == [0, 16, 32, 47, 48]
 
 
 def test_the_luckiest_evaluation_is_found_out():

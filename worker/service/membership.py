@@ -84,7 +84,7 @@ class Membership:
         self._disbanded = True
 
     def appear(self, nonce: str) -> bool:
-        """A coordinator's token of the joined run came into sight; whether it is the joined life's, out of sight before."""
+        """A coordinator's token of the joined run came into sight; whether it is the joined life's that is back."""
         back = self._parted and nonce == self._nonce and nonce not in self._coordinators
         self._coordinators.add(nonce)
         self._alone_since = None
