@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from time import monotonic, sleep
 
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.metrics import CONTENT_TYPE, exposition
@@ -15,11 +16,17 @@ from dreamfleet.common.network import address_of
 from dreamfleet.coordinator.status import Snapshot, status_of
 
 PATIENCE = 5.0  # seconds for a whole question and its answer: one client at a time is answered
+POLL = 0.1  # seconds
+LONGEST = 90.0  # seconds that an ended run waits for whoever scrapes to hear of its end
 
 
 @contextmanager
-def metrics_served(where: str, snapshot: Callable[[], Snapshot]) -> Iterator[None]:
-    """Answer at the address that `where` names; nowhere if it is empty. `ConnectionFailedError` where it is taken."""
+def metrics_served(where: str, snapshot: Callable[[], Snapshot], stopped: Callable[[], bool]) -> Iterator[None]:
+    """Answer at the address that `where` names; nowhere if it is empty. `ConnectionFailedError` where it is taken.
+
+    Who has scraped a run that has ended meanwhile may do so once more before the port is closed, if he comes as soon as
+    before and nobody has `stopped` the coordinator: else nobody would hear of the end and of the confirmed score.
+    """
     if not where:
         yield
         return
@@ -33,13 +40,39 @@ def metrics_served(where: str, snapshot: Callable[[], Snapshot]) -> Iterator[Non
     thread.start()
     try:
         yield
+        if snapshot().status.state == "ended":
+            since = monotonic()
+            while server.scrapes.awaited(since, monotonic()) and not stopped():
+                sleep(POLL)
     finally:
         server.shutdown()
         thread.join()
         server.server_close()
 
 
+class Scrapes:
+    """When somebody asked, and of which state he was told."""
+
+    def __init__(self) -> None:
+        self._at: float | None = None
+        self._interval = 0.0  # seconds between the last two times
+        self._state = ""
+
+    def tell(self, state: str, now: float) -> None:
+        """Somebody is told of a run of this state."""
+        self._interval = 0.0 if self._at is None else now - self._at
+        self._at, self._state = now, state
+
+    def awaited(self, since: float, now: float) -> bool:
+        """Whether somebody who asks again and again has yet to hear of a run that ended at `since`."""
+        return self._state != "ended" and now - since < min(2 * self._interval, LONGEST)
+
+
 class _Server(HTTPServer):
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+        super().__init__(address, handler)
+        self.scrapes = Scrapes()
+
     def handle_error(self, *_: object) -> None:
         """A client that leaves, or says nothing, is no news."""
 
@@ -68,12 +101,15 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
             if self.path.partition("?")[0] != "/metrics":
                 self.send_error(HTTPStatus.NOT_FOUND, "there is /metrics")
                 return
-            body = exposition(status_of(snapshot())).encode()
+            status = status_of(snapshot())
+            body = exposition(status).encode()
             self.send_response(HTTPStatus.OK)
             self.send_header("Content-Type", CONTENT_TYPE)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
             self.wfile.write(body)
+            if isinstance(self.server, _Server):
+                self.server.scrapes.tell(status.state, monotonic())
 
         def log_message(self, *_: object) -> None:
             """Every scrape would be a line."""

@@ -95,7 +95,7 @@ class Service:
 
     def serve(self, run_maker: Callable[[], Run], on_ready: Callable[[Run], None] = lambda _run: None) -> Run:
         """Claim the name on the wire, make the run, serve it; the run as it was when the service left."""
-        with open_session(self._network) as session, ExitStack() as stack:
+        with ExitStack() as last, open_session(self._network) as session, ExitStack() as stack:
             self._claim = Claim(session, self._name, self._nonce, stack)
             self._claim.take()
             self._run = run_maker()
@@ -103,7 +103,7 @@ class Service:
             self._exchange = self._run.exchange
             self._started = self._alone_since = self._summed_up = monotonic()
             self._snapshot = self._take_snapshot()
-            stack.enter_context(metrics_served(self._metrics_port, lambda: self._snapshot))
+            last.enter_context(metrics_served(self._metrics_port, lambda: self._snapshot, lambda: self._stopping))
             declared = self._declare(session)
             begun = {"run": self._name, "run_uid": self._run.uid, "incarnation": self._run.incarnation}
             log.info("run %s, incarnation %d, generation %d", self._name, self._run.incarnation,
@@ -330,7 +330,7 @@ class Service:
 
     def _control(self, query: zenoh.Query) -> None:
         verbs: dict[str, Callable[[], None]] = {
-            "pause": lambda: self._run.pause("paused by hand"),
+            "pause": lambda: self._run.pause("by hand"),
             "resume": self._resume,
             "drain": self._drain_run,
             "stop": self.stop,

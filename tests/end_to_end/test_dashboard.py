@@ -138,7 +138,7 @@ def test_a_run_that_is_paused_says_why_and_one_that_is_left_how_to_go_on(page, p
     wait(page, "waiting")
     assert processes.call("pause", "test", "--connect", processes.endpoint)[0] == 0
     wait(page, "paused")
-    wait(page, "paused by hand", "sentence")
+    wait(page, "paused: by hand", "sentence")
     coordinator.popen.send_signal(signal.SIGTERM)
     wait(page, "left open")
     wait(page, "--resume test", "sentence")

@@ -46,7 +46,7 @@ def test_what_ends_as_it_should_is_not_told_as_a_loss(processes, random_bundle):
     assert "left: " in coordinator.wait_for("worker drained/")
     code, out, err = processes.call("status", "test", "--connect", processes.endpoint)
     assert (code, "╭─ test · running" in out) == (0, True), err
-    for verb, said in (("pause", "paused: paused by hand"), ("resume", "resumed"), ("stop", "")):
+    for verb, said in (("pause", "paused: by hand"), ("resume", "resumed"), ("stop", "")):
         assert processes.call(verb, "test", "--connect", processes.endpoint)[0] == 0
         coordinator.wait_for(said)
     assert "this worker leaves too" in own.wait_for("the coordinator of run test")
