@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import queue
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from time import monotonic
 from types import TracebackType
@@ -43,6 +43,7 @@ class Client:
         if not network.connect:
             raise UsageError("a client needs an address: tcp/HOST:PORT")
         self._where = ", ".join(network.connect)
+        self._secured = network.credentials is not None
         #: with which flags a worker is started that joins a run here; in a fleet with join files it brings its own
         self.worker_flags = "--join FILE" if network.credentials else f"--connect {' '.join(network.connect)}"
         self.session = open_session(network)  # also for what asks in other words, as for a bundle
@@ -75,7 +76,7 @@ class Client:
             names = ", ".join(sorted(str(document.get("run")) for document in documents))
             raise UsageError(f"several runs are live: name one of {names}")
         if not documents:
-            raise self._nobody(f"run {run!r}" if run else "any run")
+            raise self._nobody(run)
         return documents[0]
 
     def watch(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[Status]:
@@ -117,17 +118,21 @@ class Client:
         """All workers that the coordinator of `run` knows."""
         return [from_plain(WorkerStatus, known(WorkerStatus, row)) for row in self.pages("workers", run)]
 
-    def history(self, run: str) -> list[StoredGeneration]:
-        """All closed generations of `run`, oldest first."""
-        return [from_plain(StoredGeneration, known(StoredGeneration, row)) for row in self.pages("history", run)]
+    def history(self, run: str, offset: int = 0) -> list[StoredGeneration]:
+        """All closed generations of `run` but the first `offset`, oldest first."""
+        rows = self.pages("history", run, offset)
+        return [from_plain(StoredGeneration, known(StoredGeneration, row)) for row in rows]
 
-    def story(self, run: str | None = None, worker: str = "", job: str = "") -> tuple[list[Event], int]:
+    def story(
+        self, run: str | None = None, worker: str = "", job: str = "", kinds: Collection[str] = ()
+    ) -> tuple[list[Event], int]:
         """What happened of late, oldest first, and how many such events are kept: more than one answer may hold.
 
-        `worker` is a worker, or the host's name in its name; `job` a candidate as generation/index; else all.
+        `worker` is a worker, or the host's name in its name; `job` a candidate as generation/index; `kinds` are words
+        of `status.What`; else all.
         """
         try:
-            document = self.document(run, "story", f"worker={worker};job={job}")
+            document = self.document(run, "story", f"worker={worker};job={job};what={','.join(kinds)}")
         except ConnectionFailedError:
             document = self.document(run)  # one from before this part answers for its status alone
         rows = document.get("story")
@@ -194,7 +199,7 @@ class Client:
                 if not answer.accepted:
                     raise RefusedError(answer.why)
                 return answer.again
-        raise self._nobody(f"run {run!r}")
+        raise self._nobody(run)
 
     def _controller_part(self, run: str, offset: int) -> dict[str, Any]:
         about = self.document(run, "best", f"offset={offset}").get("controller")
@@ -204,9 +209,14 @@ class Client:
             raise MalformedError(f"run {run} gives a controller that this version cannot read: update dreamfleet")
         return about
 
-    def _nobody(self, whose: str) -> ConnectionFailedError:
+    def _nobody(self, run: str | None) -> ConnectionFailedError:
+        whose, again = "any run", "--run NAME` begins one"
+        if run:
+            whose, again = f"run {run!r}", f"--resume {run}` goes on with one that was stopped or killed"
+        right = ", or the join file lacks the right to ask" if self._secured else ""
         return ConnectionFailedError(
-            f"no coordinator of {whose} answers through {self._where}: it is not running, or you lack the right to ask"
+            f"no coordinator of {whose} answers through {self._where}: it is not running{right}; "
+            f"`dreamfleet coordinator {again}"
         )
 
     def _ask(self, selector: str) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 
 from rich.cells import cell_len, chop_cells
 from rich.console import Console, ConsoleOptions, Group, RenderResult
@@ -247,21 +247,31 @@ def _candidates(status: Status, population: Population, width: int, lines: int) 
 
 
 def _curve(history: Sequence[StoredGeneration], width: int, lines: int) -> list[Text]:
-    """The mean fitness of the last generations: a line of bars, or, with more lines, a plot under a caption."""
+    """The mean fitness of all generations: a line of bars, or, with more lines, a plot under a caption.
+
+    Where there are more than columns a bar is the mean of several.
+    """
     caption = "mean fitness by generation"
     margin = max(len(f"{each.mean:.0f}") for each in history) + 1
     room = width - margin - (len(caption) + 1 + margin if lines == 1 else 0)
-    shown = [(each.number, each.mean) for each in history[-max(room, 1) :]]
-    means = [mean for _, mean in shown]
+    means = _compressed([each.mean for each in history], max(room, 1))
     low, high = f"{min(means):.0f}", f"{max(means):.0f}"
     if lines == 1:
         return [Text.assemble((f"{caption} ", "dim"), f"{low} ", (bars(means, 1)[0], "green"), f" {high}")]
-    wide = max(1, room // len(shown))
+    wide = max(1, room // len(means))
     rows = bars([mean for mean in means for _ in range(wide)], lines - 1)
     marks = [high] if len(rows) == 1 else [high, *[""] * (len(rows) - 2), low]
     drawn = [Text.assemble((f"{mark:>{margin - 1}} ", "dim"), (row, "green"))
              for mark, row in zip(marks, rows, strict=True)]  # fmt: skip
-    return [Text(f"{caption}, {shown[0][0]} to {shown[-1][0]}", style="dim"), *drawn]
+    each = "" if len(means) == len(history) else f", {round(len(history) / len(means))} to a bar"
+    return [Text(f"{caption}, {history[0].number} to {history[-1].number}{each}"[:width], style="dim"), *drawn]
+
+
+def _compressed(values: Sequence[float], most: int) -> list[float]:
+    """At most so many: the means of neighbours, as equally many of them as can be."""
+    count = min(len(values), most)
+    edges = [len(values) * each // count for each in range(count + 1)]
+    return [sum(each / (last - first) for each in values[first:last]) for first, last in pairwise(edges)]
 
 
 def _workers(status: Status, width: int, worker_flags: str) -> Block:

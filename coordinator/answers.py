@@ -49,7 +49,7 @@ def answer(snapshot: Snapshot, part: str, parameters: Parameters) -> bytes:
         "evaluations": lambda: _evaluations(snapshot, offset, limit),
         "candidates": lambda: _candidates(snapshot, parameters.get("generation"), offset, limit),
         "best": lambda: _best(snapshot, offset),
-        "story": lambda: _story(snapshot, parameters.get("worker") or "", parameters.get("job") or ""),
+        "story": lambda: _story(snapshot, parameters),
     }
     head = {"schema": SCHEMA, "run": snapshot.status.run, "run_uid": snapshot.status.run_uid}
     return json.dumps({**head, **documents[part]()}, allow_nan=False).encode()
@@ -105,11 +105,12 @@ def _candidates(snapshot: Snapshot, generation: str | None, offset: int, limit: 
     return asdict(_population(chosen, offset, min(limit, CANDIDATES), PAGE_BYTES))
 
 
-def _story(snapshot: Snapshot, worker: str, job: str) -> dict[str, Any]:
-    """The last events of a worker, of a candidate's jobs (`generation/index`), or of all; the newest last."""
-    generation, slash, index = job.partition("/")
+def _story(snapshot: Snapshot, parameters: Parameters) -> dict[str, Any]:
+    """The last events of a worker, of a candidate's jobs (`generation/index`), of kinds, or all; the newest last."""
+    worker, what = parameters.get("worker") or "", parameters.get("what") or ""
+    generation, slash, index = (parameters.get("job") or "").partition("/")
     chosen = (_number(generation, -1), _number(index, -1)) if slash else None
-    found = list(snapshot.story.latest(worker, chosen))
+    found = list(snapshot.story.latest(worker, chosen, what.split(",") if what else ()))
     plain = (asdict(_event(each, snapshot.now)) for each in found)
     rows = _fitting(plain, PAGE_BYTES, lambda row: len(json.dumps(row)) + 2)
     return {"total": len(found), "story": rows[::-1]}

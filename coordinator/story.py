@@ -6,7 +6,7 @@ Kept in blocks that only grow, so that a view of it costs the same however much 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import NamedTuple
 
 from dreamfleet.common.messages import Job
@@ -32,11 +32,15 @@ class StoryView:
         self._blocks = blocks
         self._last = last  # events of the last block, which may grow
 
-    def latest(self, worker: str = "", job: tuple[int, int] | None = None) -> Iterator[Happening]:
-        """Events from the newest to the oldest: of a worker or a host by name, of a candidate, or all."""
+    def latest(
+        self, worker: str = "", job: tuple[int, int] | None = None, kinds: Collection[str] = ()
+    ) -> Iterator[Happening]:
+        """Events from the newest to the oldest: of a worker or a host by name, of a candidate, of `kinds`, or all."""
         for number, block in enumerate(reversed(self._blocks)):
             for each in reversed(block if number else block[: self._last]):
                 if worker and worker not in (each.worker, each.worker.partition("/")[0]):
+                    continue
+                if kinds and each.what not in kinds:
                     continue
                 if job is None or (each.job is not None and each.job[1:3] == job):
                     yield each

@@ -5,18 +5,24 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from time import sleep
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.listing import print_rows
 from dreamfleet.common.site import offer, offer_run, reached
 
 if TYPE_CHECKING:
     from dreamfleet.common.client import Client
+    from dreamfleet.common.network import Network
     from dreamfleet.common.status import Status
+    from dreamfleet.common.stored import StoredGeneration
     from dreamfleet.common.table import RunPanel
 
+T = TypeVar("T")
 SUMMARY = "show how a run is: generation, population, best, workers, throughput, waste"
 EXTRAS = ()
 REFRESH = 0.5  # seconds
@@ -31,23 +37,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--watch", action="store_true",
-        help="stay and refresh until the coordinator leaves or Ctrl-C; in a file or a pipe a line at each change",
+        help="stay and refresh until the coordinator leaves or Ctrl-C, and wait for one that does not answer; in a "
+        "file or a pipe a line at each change",
     )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the status."""
+    """Print the status; of several live runs, of which none is named, a line each."""
     from dreamfleet.common.client import Client
 
+    if args.watch:
+        return _watch(reached(args), args.run_name, as_json=args.json)
     with Client(reached(args)) as client:
-        document = client.document(args.run_name)
-        if args.watch:
-            watch = _print_lines if args.json else _show if _redraws() else _tell
-            return watch(client, str(document.get("run")))
+        documents = [client.document(args.run_name)] if args.run_name or args.json else client.statuses()
         if args.json:
-            print(json.dumps(document, indent=2))
+            print(json.dumps(documents[0], indent=2))
+        elif len(documents) > 1:
+            _print_several(documents)
         else:
-            _print_once(client, document)
+            _print_once(client, documents[0] if documents else client.document())
     return 0
 
 
@@ -59,16 +67,72 @@ def _redraws() -> bool:
     return sys.stdout.isatty() and not console.is_dumb_terminal
 
 
+def _print_several(documents: Sequence[dict[str, Any]]) -> None:
+    from dreamfleet.common.eta import eta_of
+    from dreamfleet.common.printable import plural
+    from dreamfleet.common.status import read_status
+    from dreamfleet.common.stored import with_error
+
+    statuses = sorted(map(read_status, documents), key=lambda each: each.run)
+    rows = [
+        {
+            "run": each.run,
+            "state": each.state,
+            "generation": each.generation.number,
+            "best": None if (best := each.confirmed or each.best) is None else with_error(best),
+            "workers": f"{each.workers.present}" + (f", {each.workers.lost} lost" if each.workers.lost else ""),
+            "steps/s": f"{each.throughput.steps_per_second:,.0f}",
+            "to go": eta_of(each).told,
+        }
+        for each in statuses
+    ]
+    print_rows(rows, right=("generation", "steps/s"), least_first=("steps/s", "workers", "best"))
+    print(f"{plural(len(rows), 'live run')}; `dreamfleet status {statuses[0].run}` tells more", file=sys.stderr)
+
+
 def _print_once(client: Client, document: dict[str, Any]) -> None:
     from rich.console import Console
 
     from dreamfleet.common.status import read_status
 
-    Console().print(_panel(client, read_status(document)))
+    Console().print(_Picture(client).of(read_status(document)))
+
+
+def _watch(network: Network, name: str | None, *, as_json: bool) -> int:
+    """Until the coordinator leaves; one that does not answer (yet, or any more) is waited for."""
+    from dreamfleet.common.client import Client
+
+    show = _print_lines if as_json else _show if _redraws() else _tell
+    with _patiently(lambda: Client(network)) as client:
+        return show(client, name or str(_patiently(client.document)["run"]))
+
+
+def _patiently(ask: Callable[[], T]) -> T:
+    """What `ask` answers, once it does; that it does not is said once."""
+    told = False
+    while True:
+        try:
+            return ask()
+        except ConnectionFailedError as error:
+            if not told:
+                print(f"{error}; waiting for it (Ctrl-C ends)", file=sys.stderr, flush=True)
+            told = True
+            sleep(REFRESH)
+
+
+def _followed(client: Client, name: str) -> Iterator[dict[str, Any]]:
+    """The status again and again, until the coordinator leaves."""
+    while True:
+        try:
+            yield from client.watch_documents(name, REFRESH)
+        except ConnectionFailedError:
+            _patiently(lambda: client.document(name))
+        else:
+            return
 
 
 def _print_lines(client: Client, name: str) -> int:
-    for document in client.watch_documents(name, REFRESH):
+    for document in _followed(client, name):
         print(json.dumps(document), flush=True)
     return 0
 
@@ -76,9 +140,12 @@ def _print_lines(client: Client, name: str) -> int:
 def _show(client: Client, name: str) -> int:
     from rich.live import Live
 
+    from dreamfleet.common.status import read_status
+
+    picture = _Picture(client, fitted=True)
     with Live(refresh_per_second=4, vertical_overflow="crop") as live:
-        for status in client.watch(name, REFRESH):
-            live.update(_panel(client, status, fitted=True), refresh=True)
+        for document in _followed(client, name):
+            live.update(picture.of(read_status(document)), refresh=True)
     return 0
 
 
@@ -88,21 +155,46 @@ def _tell(client: Client, name: str) -> int:
 
     from dreamfleet.common.eta import summary
     from dreamfleet.common.printable import one_line
+    from dreamfleet.common.status import read_status
 
     told = None
-    for status in client.watch(name, REFRESH):
+    for status in map(read_status, _followed(client, name)):
         now = status.state, status.generation.number, status.evaluations, status.workers.present
         if now != told:
             print(one_line(f"{status.run}: {summary(status)}"), flush=True)
         told = now
-    Console().print(_panel(client, status))
+    Console().print(_Picture(client).of(status))
     return 0
 
 
-def _panel(client: Client, status: Status, *, fitted: bool = False) -> RunPanel:
-    from dreamfleet.common.table import RunPanel
+class _Picture:
+    """Draws one status after another, with all workers and all closed generations, of which each is asked for once."""
 
-    return RunPanel(_with_all_workers(client, status), client.worker_flags, fitted=fitted)
+    def __init__(self, client: Client, *, fitted: bool = False) -> None:
+        self._client = client
+        self._fitted = fitted
+        self._run_uid = ""
+        self._history: list[StoredGeneration] = []
+
+    def of(self, status: Status) -> RunPanel:
+        """The picture of this one."""
+        from dreamfleet.common.table import RunPanel
+
+        whole = replace(_with_all_workers(self._client, status), recent=tuple(self._all(status)))
+        return RunPanel(whole, self._client.worker_flags, fitted=self._fitted)
+
+    def _all(self, status: Status) -> list[StoredGeneration]:
+        if status.run_uid != self._run_uid:
+            self._run_uid, self._history = status.run_uid, []
+        if not status.over and status.recent and status.recent[0].number > self._next:
+            with suppress(ConnectionFailedError):
+                self._history += self._client.history(status.run, len(self._history))
+        self._history += [each for each in status.recent if each.number >= self._next]
+        return self._history
+
+    @property
+    def _next(self) -> int:
+        return self._history[-1].number + 1 if self._history else 0
 
 
 def _with_all_workers(client: Client, status: Status) -> Status:

@@ -6,7 +6,7 @@ import argparse
 import json
 import re
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, print_rows
@@ -29,6 +29,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--worker", metavar="W", help="of this worker, or of all lives of this host's worker")
     which.add_argument("--job", metavar="G/I", help="of this candidate's jobs: generation/index, such as 3/0")
     parser.add_argument(
+        "--what", nargs="+", metavar="WORD", default=(),
+        help="only what is told by these words, such as: joined back silent lost left reissued",
+    )  # fmt: skip
+    parser.add_argument(
         "--last", type=int, metavar="N", help=f"so many events at most (default {LAST}; with --json all that are told)"
     )
     offer(parser, "connect")
@@ -38,6 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the events, the newest last; how many more there are goes to stderr."""
     from dreamfleet.common.client import Client
+    from dreamfleet.common.status import What
 
     if args.job is not None and not re.fullmatch(r"\d{1,12}/\d{1,12}", args.job):
         raise UsageError(f"--job {args.job!r}: write generation/index, such as 3/0")
@@ -45,9 +50,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--worker {args.worker!r}: give a name as `dreamfleet status` shows it")
     if args.last is not None and args.last < 1:
         raise UsageError("--last must be at least 1")
+    if strange := [each for each in args.what if each not in (words := get_args(What))]:
+        raise UsageError(f"--what {strange[0]!r}: there are {', '.join(words)}")
     with Client(reached(args)) as client:
-        events, total = client.story(args.run_name, args.worker or "", args.job or "")
-        if args.worker is not None and not events:
+        events, total = client.story(args.run_name, args.worker or "", args.job or "", args.what)
+        if args.worker is not None and not events and not args.what:
             _check_known(client, args.run_name or client.status().run, args.worker)
     events = events[-(args.last or (len(events) if args.json else LAST)) :]
     if args.json:
@@ -58,7 +65,10 @@ def run(args: argparse.Namespace) -> int:
     if not events:
         print("nothing of that is kept: it is too long ago, or not yet", file=sys.stderr)
     elif total > len(events):
-        print(f"the last {len(events)} of {total} events that are kept; --last tells more", file=sys.stderr)
+        print(
+            f"the last {len(events)} of {total} events that are kept; --last tells more, --what chooses",
+            file=sys.stderr,
+        )
     return 0
 
 

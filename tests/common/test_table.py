@@ -132,7 +132,7 @@ def test_a_curve_is_as_high_as_it_may_be():
 
 def test_an_ended_run_shows_its_last_generations_candidates():
     text = drawn(dataclasses.replace(STATUS, state="ended", why="7 generations"), 100)
-    assert "finished: 7 generations" in text
+    assert "ended: 7 generations" in text
     assert "generation 6     8/8 episodes, so far -12 to 140" in text
 
 
@@ -189,3 +189,14 @@ def test_a_sparkline_of_any_numbers(means):
 def test_a_failure_that_names_no_worker_is_shown():
     failure = dataclasses.replace(STATUS.failures[0], errors={})
     assert "no reason was given" in drawn(dataclasses.replace(STATUS, why="", failures=(failure,)), 100)
+
+
+@pytest.mark.parametrize("columns", [60, 80])
+def test_the_whole_run_is_in_the_curve_however_long_it_is(columns):
+    history = [dataclasses.replace(STATUS.recent[0], number=number, mean=float(number)) for number in range(4000)]
+    rows = drawn(dataclasses.replace(STATUS, recent=tuple(history)), columns).splitlines()
+    (caption,) = (row for row, text in enumerate(rows) if "mean fitness by generation, 0 to 3999" in text)
+    lowest = rows[caption + 7].strip("│ ").split()[-1]  # the line at the bottom: risen to its height in the first bars
+    assert lowest.startswith("▁")
+    assert lowest.endswith("█")
+    assert columns - 15 < len(lowest) < columns

@@ -28,8 +28,9 @@ def lines(out):
 
 
 def test_a_watcher_prints_a_line_each_time_and_at_last_how_the_run_ended(processes, settings):
-    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 2)
     watcher = processes.start("status", "--connect", processes.endpoint, "--watch", "--json")
+    watcher.wait_for("waiting for it")
+    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 2)
     processes.worker("--task", tasks.SLOW_TOY)
     assert coordinator.finish()[0] == 0
     code, out = watcher.finish()
@@ -52,7 +53,7 @@ def test_the_last_panel_shows_the_final_state(processes, settings):
     assert "2 generations" in out
     # In a pipe a line at each change goes before it.
     assert re.match(r"test: (waiting for workers|running), generation \d \(\d/8 episodes\), ", out)
-    assert "\ntest: finished: 2 generations; " in out
+    assert "\ntest: ended: 2 generations; " in out
 
 
 def test_a_watcher_of_a_run_that_is_stopped_is_told_that_it_was_left_open(processes, settings):

@@ -75,4 +75,4 @@ def test_a_watcher_sees_the_whole_run_in_24_lines_and_at_last_its_end(processes,
     assert coordinator.finish()[0] == 0
     last = terminal.wait_for("over")
     assert last[0].startswith("╭─ test · ended")
-    assert "finished: 4 generations" in last[1]
+    assert "ended: 4 generations" in last[1]
