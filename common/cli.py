@@ -172,7 +172,8 @@ def _listing(prog: str, names: Iterable[str], points: Mapping[str, EntryPoint]) 
         if name in points:
             verbs.add_parser(spoken, help=_summary(points[name]).replace("%", "%%"))
         else:
-            verbs.add_parser(spoken, help=f"{spoken} ...: see `dreamfleet {spoken} --help`")
+            within = sorted(each.partition(".")[2] for each in points if each.startswith(f"{spoken}."))
+            verbs.add_parser(spoken, help=f"{', '.join(within)}: `dreamfleet {spoken} --help` tells each")
     return parser
 
 
