@@ -64,7 +64,8 @@ class GymTask(Task):
         plain = self.make_environment(assignment)
         plain.close()
         own = type(plain.unwrapped).__module__.startswith(tuple(ENGINES))
-        return self.make_judge(assignment, RGB) if own and RGB in plain.metadata.get("render_modes", ()) else None
+        drawn = own and RGB in plain.metadata.get("render_modes", ())
+        return _DrawnNowAndThen(self.make_judge(assignment, RGB)) if drawn else None
 
     def make_policy(self, assignment: Assignment) -> Policy:
         """A controller on the flat observation, normalised as it was when the run began."""
@@ -107,6 +108,26 @@ class GymTask(Task):
             raise UsageError(f"{self._id} takes no such arguments: {error}") from error
         except (Exception, SystemExit) as error:  # whatever an environment does as it is made
             raise UsageError(f"{self._id} cannot be made: {type(error).__name__}: {error}") from error
+
+
+class _DrawnNowAndThen(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Steps as an environment that is never drawn, and knows of pictures only while `render` draws one.
+
+    Where it knows, it may do more in every step: LunarLander makes bodies of its engines' sparks, which only `render`
+    removes, so that with ten pictures a second its steps take many times as long.
+    """
+
+    def __init__(self, environment: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(environment)
+        self.unwrapped.render_mode = None
+
+    def render(self) -> Any:
+        """The picture, without what only steps that are drawn leave behind."""
+        self.unwrapped.render_mode = RGB
+        try:
+            return super().render()
+        finally:
+            self.unwrapped.render_mode = None
 
 
 def _world_of(environment: gymnasium.Env[Any, Any], name: str) -> World:

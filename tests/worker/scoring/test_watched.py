@@ -98,6 +98,19 @@ def shape_of(world):
     return ControllerShape(world.observations, world.outputs)
 
 
+def test_a_world_that_is_now_and_then_drawn_steps_as_one_that_is_not():
+    task = find_task("gym:LunarLander-v3")
+    shown = task.make_shown(Assignment(TaskSpec(task.name, "", 200, 0, controller=shape_of(task.describe({})))))
+    shown.reset(seed=1)
+    for _ in range(30):
+        shown.step(2)  # the main engine, whose sparks are bodies that each further step computes
+    assert shown.unwrapped.particles == []
+    assert shown.render().shape == (400, 600, 3)
+    shown.step(2)
+    assert shown.unwrapped.particles == []
+    shown.close()
+
+
 class Sketchy(CartPoleEnv):
     """Not of gymnasium's own: its pictures might change something."""
 
