@@ -34,10 +34,12 @@ def some(names: Sequence[str], most: int) -> str:
 
 
 def setting(value: object) -> str:
-    """A setting's value as people write it: yes or no, the parts of a list after one another."""
+    """A setting's value as people write it: yes or no, a number in six digits, a list with commas."""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+    if isinstance(value, float):
+        return f"{value:g}"
+    return ", ".join(map(setting, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
 def printable_lines(text: str) -> str:

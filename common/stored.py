@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -205,6 +206,16 @@ class StoredConfirmation:
 def best_of(evaluations: Iterable[StoredEvaluation]) -> StoredEvaluation | None:
     """The one of the highest mean; of equals the first."""
     return max(evaluations, key=lambda each: each.mean, default=None)
+
+
+def unfolded(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain settings as they are shown: the task's options, which are JSON, as a part; the controller's shape once."""
+    task = dict(settings.get("task", {}))
+    with suppress(ValueError):
+        task["options"] = json.loads(task.get("options") or "{}")
+    if task.get("controller") == settings.get("controller"):
+        task.pop("controller", None)
+    return {**settings, "task": task}
 
 
 def told(found: StoredEvaluation | StoredConfirmation | None) -> str:

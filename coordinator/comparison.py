@@ -16,7 +16,7 @@ from dreamfleet.common.effort import Effort
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.fields import written
 from dreamfleet.common.runs import RunFolder
-from dreamfleet.common.stored import RunSettings, StoredConfirmation
+from dreamfleet.common.stored import RunSettings, StoredConfirmation, unfolded
 from dreamfleet.coordinator.learning import LearningCurve, Point
 from dreamfleet.coordinator.start import effort_of
 
@@ -84,7 +84,7 @@ BUDGETS: dict[str, Callable[[Effort], float]] = {
 
 def differing(sides: Sequence[Side]) -> dict[str, list[Any]]:
     """The settings in which the runs differ: of each one a value a run, `None` where it has its default."""
-    flat = [_flat(written(each.settings)) for each in sides]
+    flat = [_flat(unfolded(written(each.settings))) for each in sides]
     names = sorted({name for each in flat for name in each})
     rows = {name: [each.get(name) for each in flat] for name in names}
     return {name: values for name, values in rows.items() if any(value != values[0] for value in values)}

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from dreamfleet.common.effort import Effort, GenerationEffort
+from dreamfleet.common.printable import plural
 from dreamfleet.common.stages import begun_stages, in_turn
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.tasks import DREAM
@@ -64,7 +65,7 @@ def curves(course: Course, quartiles: Quartiles | None, spent: Sequence[Effort] 
         "stages": [each.since for each in stages[1:]],
         "dreamt": dreamt,
         "fitness_axis": f"fitness over {in_turn(str(each.stage.horizon) for each in stages)} {'dreamt ' * dreamt}steps",
-        "score_axis": f"score {'in reality, ' * dreamt}{settings.evaluation_episodes} whole episodes",
+        "score_axis": f"score{' in reality' * dreamt}, {plural(settings.evaluation_episodes, 'whole episode')}",
     }
     if spent is not None:
         drawn |= _spent([spent[each.number] for each in rows if each.number < len(spent)])

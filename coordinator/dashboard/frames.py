@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.effort import counted
 from dreamfleet.common.eta import Eta, duration, eta_of, sentence
 from dreamfleet.common.printable import printable
+from dreamfleet.common.processes import spoken
 from dreamfleet.common.status import Population, Status, WorkerStatus
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 
@@ -27,7 +29,7 @@ class Look:
     population: Sequence[Population]  # the open generation's candidates, in parts
     heard: float  # seconds since 1970
     lost: float | None = None  # since then nobody answers
-    is_stored: bool = False  # its journal lies on this disk
+    folder: Path | None = None  # where its journal lies, if on this disk
 
 
 def frame(look: Look) -> dict[str, Any]:
@@ -39,21 +41,21 @@ def frame(look: Look) -> dict[str, Any]:
         "run": status.run,
         "uid": status.run_uid,
         "link": link,
-        "stored": look.is_stored,
+        "stored": look.folder is not None,
         "state": {LOST: "coordinator lost", LIVE: status.state}.get(link, _over(status)),
-        "sentence": _lost(status) if link == LOST else printable(sentence(status)),
+        "sentence": _lost(look) if link == LOST else printable(sentence(status)),
         "lost": look.lost if link == LOST else None,
         "heard": look.heard,
         "eta": _eta(eta) if link == LIVE else None,
         "task": printable(_task(status)),
-        "tiles": _tiles(status, eta),
+        "tiles": _tiles(status, eta, link),
         "candidates": _candidates(look.population, status),
         "evaluation": _progress(status),
         "search": _search(status),
         "waste": _waste(status),
         "troubles": _troubles(status),
-        "fleet": _fleet(status),
-        "workers": _workers(look),
+        "fleet": _fleet(status, link),
+        "workers": _workers(look, link),
     }
 
 
@@ -61,11 +63,18 @@ def _over(status: Status) -> str:
     return "finished" if status.state == "ended" else "left open"
 
 
-def _lost(status: Status) -> str:
+def _lost(look: Look) -> str:
+    rest = "--join where it had one" if look.folder else "--runs-dir and --join where it had them"
+    words = ("dreamfleet coordinator --resume", look.status.run) if look.folder is None else (again(look.folder),)
     return (
         "nobody answers for it: its coordinator was killed, or the network is cut. The page goes on once it is back; "
-        f"after a kill: dreamfleet coordinator --resume {status.run}, with --runs-dir and --join where it had them"
+        f"after a kill: {printable(' '.join(words))}, with {rest}"
     )
+
+
+def again(folder: Path) -> str:
+    """The command that goes on with the run in `folder`, as far as its journal's place tells it."""
+    return spoken("coordinator", "--resume", folder.name, "--runs-dir", folder.parent)
 
 
 def _eta(eta: Eta) -> dict[str, Any]:
@@ -83,19 +92,20 @@ def _task(status: Status) -> str:
     return ", ".join(parts)
 
 
-def _tiles(status: Status, eta: Eta) -> list[dict[str, str]]:
+def _tiles(status: Status, eta: Eta, link: str) -> list[dict[str, str]]:
     """The few figures that stand large: name, value, and what stands small beneath."""
     reported = status.confirmed or status.best
     spent = status.throughput
     pace = "" if eta.pace is None else f"{duration(eta.pace)} each"
     last = status.last
+    workers, slots = _plural(status.workers.present, "worker"), _plural(status.slots, "slot")
     return [
         _tile("generation", f"{status.generation.number:,}", pace),
         _tile("last generation", NONE if last is None else f"{last.mean:,.1f}", _beneath_last(last)),
         _tile("reported", NONE if reported is None else score(reported), _beneath(reported)),
-        _tile("throughput", f"{counted(round(spent.steps_per_second))} steps/s",
+        _tile("throughput", f"{counted(round(spent.steps_per_second))} steps/s" if link == LIVE else NONE,
               f"{counted(spent.environment_steps)} steps in all"),
-        _tile("fleet", _plural(status.workers.present, "worker"), _plural(status.slots, "slot")),
+        _tile("fleet", workers, slots) if link == LIVE else _tile("fleet", NONE, f"{workers}, {slots} at the last"),
     ]  # fmt: skip
 
 
@@ -120,7 +130,9 @@ def _beneath(reported: StoredEvaluation | StoredConfirmation | None) -> str:
 
 
 def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
-    """Columns, a cell each: episodes done and wanted, fitness so far."""
+    """Columns, a cell each: episodes done and wanted, fitness so far; none where no generation is open."""
+    if status.state == "ended" or (status.state == "evaluating" and not status.generation.episodes_done):
+        parts = ()
     return {
         "generation": status.generation.number,
         "total": max((each.total for each in parts), default=0),
@@ -187,26 +199,27 @@ def _plural(count: int, noun: str) -> str:
     return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
 
 
-def _fleet(status: Status) -> str:
+def _fleet(status: Status, link: str) -> str:
     counts = status.workers
     gone = counts.known - counts.present
     told = f"{counts.present} present, {_plural(status.slots, 'slot')}" + (f", {gone} gone" if gone else "")
+    told = told if link == LIVE else f"at the last: {told}"
     return f"{told}; {status.classes.told}" if status.classes.total else told
 
 
-def _workers(look: Look) -> dict[str, list[Any]]:
-    """Columns, a row for each worker, those of one host together."""
+def _workers(look: Look, link: str) -> dict[str, list[Any]]:
+    """Columns, a row for each worker, those of one host together; what is true for a moment, of a live run alone."""
     order = sorted(range(len(look.workers)), key=lambda index: look.workers[index].worker)
     rows = [look.workers[index] for index in order]
     return {
         "worker": [printable(each.worker) for each in rows],
-        "state": [printable(each.state) for each in rows],
+        "state": [printable(each.state) if link == LIVE else NONE for each in rows],
         "slots": [each.slots for each in rows],
-        "leases": [each.leases for each in rows],
+        "leases": [each.leases if link == LIVE else None for each in rows],
         "finished": [each.finished for each in rows],
-        "rate": [round(each.steps_per_second) for each in rows],
-        "load": [each.load for each in rows],
-        "heard": [round(each.heard, 1) for each in rows],
+        "rate": [round(each.steps_per_second) if link == LIVE else None for each in rows],
+        "load": [each.load if link == LIVE else None for each in rows],
+        "heard": [round(each.heard, 1) if link == LIVE else None for each in rows],
         "picture": [printable(each.drawn_by) for each in rows],
         "lane": [look.lanes[index] for index in order],
     }

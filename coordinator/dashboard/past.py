@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,15 @@ from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.printable import printable, setting
 from dreamfleet.common.runs import RunFolder, open_run, run_paths
 from dreamfleet.common.stages import stages_of
-from dreamfleet.common.stored import RunSettings, StoredGeneration, best_of, told
+from dreamfleet.common.stored import RunSettings, StoredGeneration, best_of, told, unfolded
 from dreamfleet.common.tasks import DREAM
 from dreamfleet.coordinator.dashboard.curves import Course, Quartiles, cumulated, curves, sampled
-from dreamfleet.coordinator.dashboard.frames import NONE, Facts, optimiser, score
+from dreamfleet.coordinator.dashboard.frames import NONE, Facts, again, optimiser, score
 
-COLUMNS = ("run", "created", "task", "generations", "mean", "best", "confirmed", "error", "state", "damaged")
+COLUMNS = (
+    "run", "created", "begun", "task", "generations", "mean", "best", "confirmed", "best_error", "confirmed_error",
+    "again", "state", "damaged",
+)  # fmt: skip
 LAST = 20  # generations that are listed one by one
 MOST_READ = 256 << 20  # bytes of candidates that are looked at for their quartiles; beyond it takes too long
 
@@ -44,7 +48,8 @@ def one(runs_dir: Path, name: str) -> dict[str, Any]:
         return {
             "run": run.name,
             "state": printable(run.state),
-            "sentence": printable(f"{run.state}; {told(reported)}"),
+            "sentence": printable(f"{run.state}; {told(reported) if reported else 'no mean was evaluated'}"),
+            "again": _again(run),
             "facts": _facts(run, course, total),
             "settings": flat(settings),
             "world": _world(run),
@@ -76,7 +81,7 @@ def flat(settings: RunSettings) -> Facts:
         elif value not in (None, "", ()):
             rows.append((prefix, printable(setting(value))))
 
-    walk("", asdict(settings))
+    walk("", unfolded(asdict(settings)))
     return rows
 
 
@@ -88,17 +93,32 @@ def _row(path: Path) -> dict[str, Any]:
             return {
                 "run": printable(run.name),
                 "created": run.created,
+                "begun": begun(run.created),
                 "task": printable(run.spec.task),
                 "generations": len(history),
                 "mean": history[-1].mean if history else None,
                 "best": best.mean if best else None,
                 "confirmed": confirmed.mean if confirmed else None,
-                "error": confirmed.error if confirmed else best.error if best else None,
+                "best_error": best.error if best else None,
+                "confirmed_error": confirmed.error if confirmed else None,
+                "again": _again(run),
                 "state": printable(run.state),
                 "damaged": False,
             }
     except JournalError as error:
         return {**dict.fromkeys(COLUMNS), "run": printable(path.name), "state": printable(str(error)), "damaged": True}
+
+
+def _again(run: RunFolder) -> str:
+    """The command that goes on with an open run; empty of one that is live, or has ended."""
+    return printable(again(run.path)) if run.state == "open" else ""
+
+
+def begun(created: str) -> str:
+    """When a run began, as a person reads it, such as 2026-11-23 17:30 UTC."""
+    with suppress(ValueError):
+        return f"{datetime.fromisoformat(created).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+    return printable(created)
 
 
 def _world(run: RunFolder) -> str:
@@ -114,7 +134,7 @@ def _facts(run: RunFolder, course: Course, total: Effort) -> Facts:
     settings, best = course.settings, best_of(course.evaluations)
     facts = [
         ("task", settings.task.task),
-        ("begun", run.created),
+        ("begun", begun(run.created)),
         ("generations", f"{len(course.history):,}"),
         ("population", f"{settings.population} candidates x {settings.episodes} episodes"),
         ("horizon", f"{settings.task.horizon:,} steps"),

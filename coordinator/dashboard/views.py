@@ -127,7 +127,7 @@ class _View:
         self.lookers = 0
         self.is_leaving = False  # its process is to end
         self._over = False  # nothing comes after the latest
-        self._latest = told("starting", "Starting: the first picture takes some seconds.")
+        self._latest = told("starting", "Starting: the first picture takes some seconds, on a busy host half a minute.")
         self._pictures = 0
         self._taking: dict[object, float] = {}  # since when each of those to whom something is being sent takes it
         self._changed = asyncio.Event()  # set, and replaced, as something becomes the latest

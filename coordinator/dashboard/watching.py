@@ -70,6 +70,7 @@ class Watcher:
         self._client: Client | None = None
         self._farewells: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._followed: dict[str, _Followed] = {}
+        self._seen: dict[str, Lanes] = {}  # by a run's uid: what its workers did while somebody looked
         self._trouble = ""  # what the last look could not read, or why it is not let in
 
     def look(self) -> Picture:
@@ -93,6 +94,8 @@ class Watcher:
         if self._client is not None:
             self._client.__exit__(None, None, None)
             self._client = None
+        self._seen |= {each.uid: each.lanes for each in self._followed.values()}
+        self._seen = dict(list(self._seen.items())[-MOST_RUNS:])
         self._followed.clear()
 
     def _ask(self) -> dict[str, dict[str, Any]]:
@@ -119,6 +122,7 @@ class Watcher:
             if followed is None or followed.uid != status.run_uid or followed.is_ahead_of(status):
                 self._followed.pop(name, None)  # so that the newest one stands last
                 followed = self._followed[name] = _Followed(status, self._runs_dir)
+                followed.lanes = self._seen.pop(followed.uid, followed.lanes)
             followed.take(status, self._client, now)
         except UNREADABLE as error:
             self._trouble = f"run {name}: {error}"
@@ -170,9 +174,9 @@ class _Followed:
     lost: float | None = None
     history: list[StoredGeneration] = field(default_factory=list)
     evaluations: list[StoredEvaluation] = field(default_factory=list)
+    lanes: Lanes = field(default_factory=Lanes)
     _workers: Sequence[WorkerStatus] = ()
     _population: Sequence[Population] = ()
-    _lanes: Lanes = field(default_factory=Lanes)
     _quartiles: dict[int, tuple[float, float]] | None = None  # `None`: its journal does not lie here
     _drawn: tuple[Any, bytes, int] = (None, b"", 0)  # of what, the event, how often
 
@@ -230,15 +234,15 @@ class _Followed:
     def shown(self, live: list[str]) -> Shown:
         """As viewers get it."""
         look = Look(
-            self.status, self._workers, self._lanes.told(self._workers), self._population, self.heard, self.lost,
-            is_stored=self._quartiles is not None,
+            self.status, self._workers, self.lanes.told(self._workers), self._population, self.heard, self.lost,
+            folder=None if self._quartiles is None else self.runs_dir / self.name,
         )  # fmt: skip
         self._draw()
         _, drawing, times = self._drawn
         return Shown(event("frame", {**frame(look), "live": live}), drawing, (self.uid, times))
 
     def _lanes_of(self, now: float) -> None:
-        self._lanes.take(self._workers, now)
+        self.lanes.take(self._workers, now)
 
     def _extend(self, status: Status, client: Client) -> None:
         """Closed generations and evaluations that are not known yet."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.listing import add_json, print_rows
+from dreamfleet.common.printable import setting
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.site import offer
 
@@ -84,7 +85,10 @@ def _print_settings(sides: Sequence[Side], settings: Mapping[str, Sequence[Any]]
     rows = [
         {
             "setting": name,
-            **{side.name: "default" if value is None else value for side, value in zip(sides, values, strict=True)},
+            **{
+                side.name: "default" if value is None else setting(value)
+                for side, value in zip(sides, values, strict=True)
+            },
         }
         for name, values in settings.items()
     ]

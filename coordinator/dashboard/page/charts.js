@@ -2,7 +2,7 @@
 
 import { colour } from "./dom.js";
 
-const OPTIONS = { displayModeBar: false, responsive: true, doubleClick: "reset", showTips: false };
+const OPTIONS = { displayModeBar: false, doubleClick: "reset", showTips: false };
 const drawn = new Map(); // element: how to draw it again, in other colours
 
 const rgba = (name, alpha) => {
@@ -22,6 +22,9 @@ const axis = (title, more = {}) => ({
   ...more,
 });
 
+// There is no half a generation.
+const generations = (last) => axis("generation", { rangemode: "nonnegative", ...(last < 8 && { dtick: 1 }) });
+
 const layout = (more) => ({
   font: { family: "system-ui, sans-serif", color: colour("muted"), size: 12 },
   paper_bgcolor: "rgba(0,0,0,0)",
@@ -34,7 +37,13 @@ const layout = (more) => ({
   ...more,
 });
 
+// A chart is as wide as its card, which changes as others come and go.
+const widths = new ResizeObserver((seen) => {
+  for (const { target } of seen) if (target.isConnected && drawn.has(target)) window.Plotly.Plots.resize(target);
+});
+
 const draw = (element, make) => {
+  if (!drawn.has(element)) widths.observe(element);
   drawn.set(element, make);
   const { traces, shape } = make();
   window.Plotly.react(element, traces, layout(shape), OPTIONS);
@@ -43,11 +52,15 @@ const draw = (element, make) => {
 export const redraw = () => {
   for (const [element, make] of drawn) {
     if (element.isConnected) draw(element, make);
-    else drawn.delete(element);
+    else {
+      drawn.delete(element);
+      widths.unobserve(element);
+    }
   }
 };
 
 export const forget = () => {
+  widths.disconnect();
   for (const element of drawn.keys()) window.Plotly?.purge(element);
   drawn.clear();
 };
@@ -95,7 +108,7 @@ export const fitness = (element, curves) =>
       traces.push(points(evaluations, dreamt ? "evaluated in reality (± standard error)" : "evaluated mean (± standard error)", "green", real));
     if (confirmed) traces.push(star(confirmed, confirmed.generation, "confirmed", "red", real));
     const shape = {
-      xaxis: axis("generation", { rangemode: "nonnegative" }),
+      xaxis: generations(generation.at(-1) ?? 0),
       yaxis: axis(curves.fitness_axis),
       shapes: curves.stages.map((since) => ({
         type: "line", x0: since - 0.5, x1: since - 0.5, y0: 0, y1: 1, yref: "paper",
@@ -110,7 +123,7 @@ export const search = (element, curves) =>
   draw(element, () => {
     const traces = [line(curves.generation, curves.sigma, "step size", "purple")];
     const shape = {
-      xaxis: axis("generation", { rangemode: "nonnegative" }),
+      xaxis: generations(curves.generation.at(-1) ?? 0),
       yaxis: axis("step size (log)", { type: "log", exponentformat: "power", dtick: 1, minor: { showgrid: false } }),
     };
     // A single decade or less has its own ticks, or there would be one at most.
@@ -147,7 +160,7 @@ export const both = (element, runs, over, of) =>
     return {
       traces,
       shape: {
-        xaxis: axis(OVER[over], { rangemode: "nonnegative" }),
+        xaxis: over === "generation" ? generations(Math.max(...runs.map(({ curves }) => curves.generation.at(-1) ?? 0))) : axis(OVER[over], { rangemode: "nonnegative" }),
         yaxis: axis(label),
         hovermode: "closest",
       },

@@ -1,7 +1,7 @@
 // The page of a live run: a frame a second fills it, and curves are drawn anew when a generation was closed.
 
 import * as charts from "./charts.js";
-import { colour, facts, fill, make, open, say } from "./dom.js";
+import { ask, colour, facts, fill, make, number, open, runLink, say } from "./dom.js";
 import * as view from "./view.js";
 
 const TONES = {
@@ -17,12 +17,13 @@ const LEFT = new Set(["state", "picture"]);
 let page = null; // the parts, once they stand
 let curves = null;
 let lanes = null; // which rows are in sight
+let absent = null; // the run that was asked for, or "" for any, while none is live
 
 export const show = () => {
   page = open("live");
   page.body.hidden = page.tiles.hidden = true;
   view.show(page);
-  curves = null;
+  curves = absent = null;
   lanes?.disconnect();
   lanes = new IntersectionObserver((seen) => {
     for (const each of seen) {
@@ -43,7 +44,7 @@ export const drawCurves = (document) => {
   charts.search(page.search, curves);
   const last = curves.generation.length - 1;
   const every = curves.step > 1 ? `Every ${curves.step}th generation is drawn. ` : "";
-  const told = last < 0 ? "No generation is closed yet." : `${every}Generation ${curves.generation[last]}: mean ${curves.mean[last]}, best ${curves.best[last]}.`;
+  const told = last < 0 ? "No generation is closed yet." : `${every}Generation ${curves.generation[last]}: mean ${number(curves.mean[last])}, best ${number(curves.best[last])}.`;
   say(page["fitness-caption"], told);
   page.fitness.setAttribute("aria-label", `Fitness by generation. ${told}`);
   page.search.setAttribute("aria-label", `Step size by generation${last < 0 ? "" : `, now ${curves.sigma[last]}`}`);
@@ -54,6 +55,7 @@ export const fillFrame = (frame, wanted) => {
   page.state.hidden = false;
   choose(frame, wanted);
   if (frame.link === "absent") return fillAbsent(frame, wanted);
+  absent = null;
   const first = page.body.hidden;
   page.body.hidden = page.tiles.hidden = false;
   document.title = `${frame.run}: ${frame.state}`;
@@ -90,11 +92,28 @@ const fillAbsent = (frame, wanted) => {
   say(page.run, run || "No live run");
   say(page.state, "no coordinator");
   page.state.dataset.tone = TONES["no coordinator"];
-  say(page.sentence, `No coordinator ${run ? `of ${run} ` : ""}answers at ${frame.address}. This page shows it as soon as one does; a command that starts one:`);
+  say(page.sentence, `No coordinator ${run ? `of ${run} ` : ""}answers at ${frame.address}. This page shows it as soon as one does.`);
   fill(page.bounds, [], make, say);
   say(page.eta, "");
-  page.task.replaceChildren(make("code", `dreamfleet coordinator --run ${run || "NAME"} --listen ${frame.address.split(",")[0]}`), " ", make("a", "or look at past runs", { href: "#/runs" }));
+  if (absent === run) return;
+  absent = run;
+  page.task.replaceChildren();
+  const parts = page;
+  const mine = () => page === parts && absent === run;
+  ask("runs").then(({ runs }) => mine() && page.task.replaceChildren(...ways(frame, run, runs)), () => mine() && page.task.replaceChildren(...ways(frame, run, [])));
 };
+
+// What there is to do about a run that nobody serves: go on with what lies here, look at its result, or begin one.
+const ways = (frame, run, runs) => {
+  const stored = run ? runs.find((each) => each.run === run && !each.damaged) : latestOf(runs.filter((each) => each.again));
+  const past = make("a", "or look at past runs", { href: "#/runs" });
+  if (!stored) return ["A command that starts one: ", make("code", `dreamfleet coordinator --run ${run || "NAME"} --listen ${frame.address.split(",")[0]}`), " ", past];
+  const link = make("a", stored.run, { href: runLink(stored.run) });
+  if (!stored.again) return [`Run `, link, ` lies here, ${stored.state}; `, past];
+  return ["Run ", link, " was left open here. A command that goes on with it, with --join where it had one: ", make("code", stored.again), " ", past];
+};
+
+const latestOf = (runs) => runs.reduce((one, other) => (one && one.created > other.created ? one : other), undefined);
 
 // Where several runs are live, one of them.
 const choose = (frame, wanted) => {
@@ -129,6 +148,8 @@ const tile = () => {
   return whole;
 };
 
+const CELLS = [[400, 9], [120, 14], [64, 22], [32, 30], [12, 40], [-1, 56]]; // of more candidates than this, so wide
+
 // A cell a candidate: it fills with its episodes, and its colour says how it does among the others.
 const fillPopulation = ({ candidates, evaluation }) => {
   const { generation, total, done, wanted, fitness } = candidates;
@@ -136,21 +157,22 @@ const fillPopulation = ({ candidates, evaluation }) => {
   const [low, high] = [Math.min(...known), Math.max(...known)];
   const finished = done.filter((each, index) => each >= wanted[index]).length;
   const rest = total > done.length ? `, the first ${done.length} are shown` : "";
-  say(page["population-told"], `Generation ${generation}: ${finished} of ${total} candidates are scored${rest}.`);
-  page.cells.style.setProperty("--cell", total > 400 ? "9px" : total > 120 ? "14px" : "22px");
+  const open = total > 0;
+  say(page["population-told"], open ? `Generation ${generation}: ${finished} of ${total} candidates are scored${rest}.` : "No generation is open.");
+  page.cells.style.setProperty("--cell", `${CELLS.find(([least]) => total > least)[1]}px`);
   fill(page.cells, done, () => make("div", "", { class: "cell" }), (cell, episodes, index) => {
     const value = fitness[index];
     const share = value === null ? 0 : high > low ? (value - low) / (high - low) : 1;
     const key = `${episodes}/${wanted[index]}/${value === null ? "" : share.toFixed(2)}`;
-    const told = `candidate ${generation}/${index}: ${episodes} of ${wanted[index]} episodes${value === null ? "" : `, fitness ${value}`}`;
+    const told = `candidate ${generation}/${index}: ${episodes} of ${wanted[index]} episodes${value === null ? "" : `, fitness ${number(value)}`}`;
     if (cell.told !== told) cell.title = cell.told = told;
     if (cell.key === key) return;
     cell.key = key;
     cell.style.setProperty("--done", wanted[index] ? `${(100 * episodes) / wanted[index]}%` : "0%");
     cell.style.setProperty("--fill", value === null ? "var(--line-strong)" : shade(share));
   });
-  page.cells.setAttribute("aria-label", `${finished} of ${total} candidates of generation ${generation} are scored`);
-  say(page.scale, known.length ? `fitness so far: ${low} to ${high}` : "");
+  page.cells.setAttribute("aria-label", open ? `${finished} of ${total} candidates of generation ${generation} are scored` : "no generation is open");
+  say(page.scale, known.length ? `fitness so far: ${number(low)} to ${number(high)}` : "");
   fill(page.evaluation, evaluation, beside, (each, row) => {
     say(each.firstChild, `${row.name}: ${row.done} of ${row.wanted} episodes`);
     setBar(each.lastChild, row.done / row.wanted, row.name);
@@ -202,7 +224,7 @@ const split = (worker) => {
 };
 
 const cell = (key, value) =>
-  key === "heard" ? `${value.toFixed(1)} s ago` : key === "load" ? value.toFixed(2) : typeof value === "number" ? value.toLocaleString("en") : value;
+  value === null ? "-" : key === "heard" ? `${value.toFixed(1)} s ago` : key === "load" ? value.toFixed(2) : typeof value === "number" ? value.toLocaleString("en") : value;
 
 const workerRow = () => {
   const row = make("tr", "", { role: "row" }); // the roles that a grid would take from a table

@@ -122,7 +122,9 @@ const runRow = (each, page) => {
 };
 
 const tell = (each, key) => {
-  if (key === "created") return (each.created ?? "").replace("T", " ").slice(0, 16);
+  if (key === "created") return each.begun ?? "";
+  const error = each[`${key}_error`];
+  if (error) return `${number(each[key])} ± ${number(error)}`;
   if (key === "generations") return number(each.generations, 0);
   return NUMBERS.has(key) ? number(each[key]) : (each[key] ?? "");
 };
@@ -136,6 +138,8 @@ export const showRun = guarded(async (current, name) => {
   say(page.state, found.state.startsWith("ended") ? "finished" : found.state);
   page.state.dataset.tone = found.state.startsWith("ended") ? "done" : found.state === "live" ? "good" : "wait";
   say(page.sentence, found.sentence);
+  page.again.hidden = !found.again;
+  say(page.again.lastElementChild, found.again);
   facts(page.facts, found.facts);
   facts(page.settings, found.settings);
   const { curves } = found;

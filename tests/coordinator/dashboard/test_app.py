@@ -80,6 +80,20 @@ def test_past_runs_are_listed_with_what_is_wrong_with_them(runs):
     assert rows["broken"]["damaged"]
     assert "cannot be read" in rows["broken"]["state"]
     assert (rows["dream"]["task"], rows["dream"]["generations"]) == ("dream", 12)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d UTC", rows["dream"]["begun"])
+    assert rows["dream"]["best_error"] > 0
+
+
+def test_an_open_run_is_told_with_the_command_that_goes_on_with_it_and_an_ended_one_without(runs):
+    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
+        journal.execute("INSERT OR REPLACE INTO run VALUES ('ended', '2 minutes')")
+    client = client_of(runs)
+    assert client.get("/runs/dream").json()["again"] == ""
+    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
+        journal.execute("DELETE FROM run WHERE key = 'ended'")
+    rows = {each["run"]: each for each in client.get("/runs").json()["runs"]}
+    assert f"coordinator --resume dream --runs-dir {runs}" in rows["dream"]["again"]
+    assert client.get("/runs/dream").json()["again"] == rows["dream"]["again"]
 
 
 def test_an_empty_or_absent_runs_folder_is_an_empty_list(tmp_path):
