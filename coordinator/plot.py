@@ -99,8 +99,8 @@ def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]]) -> None:
 
 
 def _score_axis(curves: Sequence[LearningCurve]) -> str:
-    (world,) = {each.world for each in curves}
-    return f"{world}: score of the mean, whole episodes\non validation seeds, ± standard error"
+    worlds = ", ".join(sorted({each.world for each in curves}))
+    return f"{worlds}: score of the mean, whole episodes\non validation seeds, ± standard error"
 
 
 def _save(figure: Any, path: Path) -> None:

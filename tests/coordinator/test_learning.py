@@ -64,6 +64,18 @@ def test_one_run_without_evaluations_is_drawn_by_its_fitness_and_the_file_is_nam
     assert (tmp_path / "fitness.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_runs_of_several_worlds_are_drawn_with_a_note_and_short_ones_without_marks(runs, tmp_path, capsys):
+    out = tmp_path / "a.svg"
+    words = ["runs", "plot", "reality", "dream", "--runs-dir", str(runs), "--out", str(out)]
+    assert cli.main(words) == 0
+    assert PAPERS_NAME not in html.unescape(out.read_text())
+    with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal, journal:
+        journal.execute("UPDATE run SET value = replace(value, 'car-racing', 'gym:Other-v0')")
+    assert cli.main(words) == 0
+    assert "note: these runs are of the worlds car-racing, gym:Other-v0" in capsys.readouterr().err
+    assert "car-racing, gym:Other-v0: score of the mean" in html.unescape(out.read_text())
+
+
 def test_of_several_runs_one_without_evaluations_is_refused(runs, capsys):
     assert cli.main(["runs", "plot", "reality", "hidden", "--runs-dir", str(runs)]) == 2
     assert "run hidden has no evaluated mean" in capsys.readouterr().err
