@@ -89,7 +89,7 @@ def without_absence(page):
 def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes, settings, record_property):
     wait(page, "no coordinator")
     assert processes.endpoint in part(page, "sentence")
-    assert "dreamfleet coordinator --run NAME" in part(page, "task")
+    wait(page, "dreamfleet coordinator --run NAME", "task")
     coordinator = processes.coordinator(*settings, "--generations", 1000)
     wait(page, "waiting for workers")
     assert part(page, "run") == "test"
@@ -227,6 +227,8 @@ def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, 
         page.goto(f"{started.address}#/run/dream")
         page.wait_for_selector("[data-part=fitness] .scatterlayer .trace")
         assert page.locator("[data-part=generations] tr").count() == 12
+        page.goto(f"{started.address}#/live/dream")
+        wait(page, "dream lies here, ended: 12 generations", "task")
         page.goto(f"{started.address}#/run/broken")
         page.wait_for_selector("text=This cannot be shown")
         page.goto(f"{started.address}#/run/..%2F..%2Fetc")

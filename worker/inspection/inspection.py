@@ -25,6 +25,13 @@ from dreamfleet.worker.inspection.tables import measured_rows
 from dreamfleet.worker.inspection.trainings import MODELS, Training, trainings
 
 PAGE = "index.html"
+UNITS = {  # of figures of quality, by a part of their names, and what is good
+    "picture_error": "summed squared error of the mean picture, which a reconstruction has to beat",
+    "reconstruction_error": "summed squared error of a picture: the less, the better",
+    "nats_per_dimension": "of the next latent: the less, the better",
+    "latent_error": "root mean square, in the latents' spread: 0 is exact, 1 as bad as their mean",
+    "auc": "0.5 is chance, 1 exact",
+}
 DRIVEN = ("episodes", "frames", "held_out_episodes")  # of a bundle's provenance
 
 
@@ -178,6 +185,11 @@ def _dreams(bundle: Bundle, driven: EncodedRollout, eyes: Eyes) -> Iterator[Sect
         yield looked
 
 
+def _meant(name: str, value: object) -> str:
+    """A figure of quality with its unit, and what is good."""
+    return next((f"{value} ({unit})" for known, unit in UNITS.items() if known in name), str(value))
+
+
 def facts(bundle: Bundle) -> list[tuple[str, str]]:
     """What the manifest tells: sizes, models, origin, and the figures of quality on held-out drives."""
     manifest, provenance = bundle.manifest, bundle.manifest.provenance
@@ -193,7 +205,8 @@ def facts(bundle: Bundle) -> list[tuple[str, str]]:
     rows += [
         (name, str(provenance[name])) for name in ("episodes", "frames", "held_out_episodes") if name in provenance
     ]
-    rows += [(f"quality: {name}", str(value)) for name, value in quality.items()] if isinstance(quality, dict) else []
+    if isinstance(quality, dict):
+        rows += [(f"quality: {name}", _meant(name, value)) for name, value in quality.items()]
     measured = provenance.get("measured", [])
     rows += [row for told in measured for row in measured_rows(told)] if isinstance(measured, list) else []
     return [(name.replace("_", " "), value) for name, value in rows]

@@ -87,7 +87,7 @@ def test_the_table_tells_sizes_and_quality(tmp_path, attentive):
     manifest = attentive.manifest.__class__(**{**vars(attentive.manifest), "provenance": provenance})
     parts = {name: attentive.read(name) for name in attentive.manifest.parts}
     rows = dict(facts(write_bundle(tmp_path / "b.zip", manifest, parts)))
-    assert rows["quality: reward auc"] == "0.9"
+    assert rows["quality: reward auc"] == "0.9 (0.5 is chance, 1 exact)"
     assert (rows["latents"], rows["attention window"], rows["held out episodes"]) == ("5", "3", "7")
 
 
