@@ -34,9 +34,10 @@ from dreamfleet.coordinator.config import NO_SUBSPACE
 REFRESH = 0.5
 START_SECONDS = 30.0
 PAGE_PACKAGES = ("plotly", "starlette", "uvicorn")
-PLOT, VIDEO = "fitness.png", "drive.mp4"
-DREAM_LOOKS, REAL_LOOKS = (2, 8), (10, 16)  # generations between evaluations, and tracks of each; twice as many confirm
+PLOT, VIDEO, SCHEDULE = "fitness.png", "drive.mp4", "stages.toml"
+DREAM_LOOKS, REAL_LOOKS = (2, 8), (3, 16)  # generations between evaluations, and tracks of each; twice as many confirm
 FEW, ALL, ABLE = 0.3, 0.1, 0.06  # first step sizes: from zero in a subspace, of all parameters, and after a dream
+QUICK_STEPS = 400_000  # in reality on one track a candidate: far from a good driver generations tell more than tracks
 PAID = "offroad_cost=2"  # by candidates in reality: grass foretells losses that one track is too few to show
 
 
@@ -48,7 +49,7 @@ class DemoConfig:
     minutes: float = option(4.5, "then evolve in reality for so long; 0: not at all")
     temperature: float = option(1.5, "of the dream")
     population: int = option(24, "candidates a generation in reality")
-    episodes: int = option(1, "episodes a candidate in reality")
+    episodes: int = option(4, f"episodes a candidate in reality, after one for the first {QUICK_STEPS:,} steps")
     horizon: int = option(1000, "steps of an episode at most in reality")
     patience: int = option(100, "cut an episode after so many steps without reward in reality")
     sigma0: float | None = option(
@@ -80,6 +81,7 @@ class Stage:
     run: str
     what: str
     flags: Mapping[str, object]
+    schedule: str = ""  # TOML
 
 
 class Demo:
@@ -155,6 +157,10 @@ class Demo:
             "run": stage.run, "runs-dir": self._runs_dir, "listen": self._endpoint, "bundle": self._config.bundle,
             **stage.flags,
         }  # fmt: skip
+        if stage.schedule:
+            logs.mkdir(parents=True, exist_ok=True)
+            (logs / SCHEDULE).write_text(stage.schedule)
+            flags["schedule"] = logs / SCHEDULE
         arguments = [text for name, value in flags.items() for text in (f"--{name}", value)]
         with ExitStack() as stack:
             log = logs / "coordinator.log"
@@ -240,7 +246,7 @@ def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
     search: dict[str, object] = {"subspace": subspace, "covariance": "full"} if few else {}
     sigma0 = (FEW if few else ALL) if config.sigma0 is None else config.sigma0
     reality: dict[str, object] = {
-        **search, "population": config.population, "episodes": config.episodes, "horizon": config.horizon,
+        **search, "population": config.population, "horizon": config.horizon,
         "patience": config.patience, "sigma0": sigma0, "seed": config.seed, "minutes": config.minutes,
         "evaluate-every": 0, "variant": PAID,
     }  # fmt: skip
@@ -253,5 +259,6 @@ def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
         found.append(Stage(dream, f"evolving in the dream for {config.dream_minutes:g} minutes", flags))
         reality |= {"init": runs_dir / dream / CONTROLLER, "sigma0": ABLE, **_looks(*REAL_LOOKS)}
     if config.minutes:
-        found.append(Stage(name, f"evolving in reality for {config.minutes:g} minutes", reality))
+        schedule = f"[[stage]]\nsteps = {QUICK_STEPS}\nepisodes = 1\n\n[[stage]]\nepisodes = {config.episodes}\n"
+        found.append(Stage(name, f"evolving in reality for {config.minutes:g} minutes", reality, schedule))
     return tuple(found)

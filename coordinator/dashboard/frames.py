@@ -60,7 +60,7 @@ def frame(look: Look) -> dict[str, Any]:
 
 
 def _over(status: Status) -> str:
-    return "finished" if status.state == "ended" else "left open"
+    return "ended" if status.state == "ended" else "left open"
 
 
 def _lost(look: Look) -> str:
@@ -201,8 +201,10 @@ def _plural(count: int, noun: str) -> str:
 
 def _fleet(status: Status, link: str) -> str:
     counts = status.workers
-    gone = counts.known - counts.present
-    told = f"{counts.present} present, {_plural(status.slots, 'slot')}" + (f", {gone} gone" if gone else "")
+    lost = counts.lost or 0
+    silent = counts.known - counts.present - lost
+    told = f"{counts.present} present, {_plural(status.slots, 'slot')}"
+    told += "".join(f", {count} {state}" for count, state in ((silent, "silent"), (lost, "lost")) if count > 0)
     told = told if link == LIVE else f"at the last: {told}"
     return f"{told}; {status.classes.told}" if status.classes.total else told
 

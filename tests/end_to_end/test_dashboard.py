@@ -117,7 +117,7 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
         4,
     )
     processes.worker("--task", tasks.SLOW_TOY, "--name", "beta")
-    wait(page, "finished")
+    wait(page, "ended")
     assert resumed.finish()[0] == 0
     assert "4 generations" in part(page, "sentence")
     wait(page, "Generation 3:", "fitness-caption")

@@ -6,7 +6,7 @@ import * as view from "./view.js";
 
 const TONES = {
   running: "good", evaluating: "busy", paused: "bad", "waiting for workers": "wait", "coordinator lost": "bad",
-  finished: "done", "left open": "wait", "no coordinator": "wait",
+  ended: "done", "left open": "wait", "no coordinator": "wait",
 };
 const COLUMNS = [
   ["state", "state"], ["slots", "slots"], ["rate", "steps/s"], ["leases", "leases"], ["finished", "finished"],

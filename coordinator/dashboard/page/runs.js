@@ -135,7 +135,7 @@ export const showRun = guarded(async (current, name) => {
   if (!current()) return;
   const page = open("run");
   say(page.run, found.run);
-  say(page.state, found.state.startsWith("ended") ? "finished" : found.state);
+  say(page.state, found.state.startsWith("ended") ? "ended" : found.state);
   page.state.dataset.tone = found.state.startsWith("ended") ? "done" : found.state === "live" ? "good" : "wait";
   say(page.sentence, found.sentence);
   page.again.hidden = !found.again;
