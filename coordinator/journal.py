@@ -26,7 +26,7 @@ from dreamfleet.common.effort import Effort
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.files import sync, write_aside
 from dreamfleet.common.messages import Job, Result
-from dreamfleet.common.runs import BUNDLE, JOURNAL, RunFolder, counted_query, efforts_query
+from dreamfleet.common.runs import BUNDLE, ENDED_AT, JOURNAL, RunFolder, counted_query, efforts_query
 from dreamfleet.common.stages import begun_stages
 from dreamfleet.common.stored import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.checkpoint import Checkpoint
@@ -86,8 +86,7 @@ class Journal:
                 f"`dreamfleet runs delete {folder.name}` removes it"
             )
         aside = path.with_suffix(".new")
-        created = datetime.now(UTC).isoformat(timespec="seconds")
-        own = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": created}
+        own = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": _now()}
         try:
             # What a journal that was removed left beside it would be taken for this one's, and damage it.
             for left in (aside, *beside(aside), *beside(path)):
@@ -192,6 +191,12 @@ class Journal:
         if self._counted is None:
             self._counted = count(self._read(counted_query()))
         return Classes.of(self._counted)
+
+    def end(self, why: str) -> None:
+        """The run ended, now; one that had ended before, with nothing left to do, keeps its time."""
+        if self.fact("ended") is None:
+            self.set_fact(ENDED_AT, _now())
+        self.set_fact("ended", why)
 
     def set_fact(self, key: str, value: str) -> None:
         """Write one of the run's facts."""
@@ -387,6 +392,11 @@ class _Rows(list[Any]):
     def fetchall(self) -> list[Any]:
         """All of them."""
         return self
+
+
+def _now() -> str:
+    """ISO 8601, UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

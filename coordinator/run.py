@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 
 from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import ENDED_AT, ENDING
+from dreamfleet.common.runs import ENDING
 from dreamfleet.common.stages import longest_horizon
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.terms import Agenda, Terms
@@ -254,7 +253,5 @@ class Run:
 
     def _end(self) -> None:
         self.ended = self._ending or "stopped"
-        if self._journal.fact("ended") is None:  # else it had ended before, and nothing was left to do
-            self._journal.set_fact(ENDED_AT, datetime.now(UTC).isoformat(timespec="seconds"))
-        self._journal.set_fact("ended", self.ended)
+        self._journal.end(self.ended)
         self.slack.report.finish()
