@@ -11,6 +11,7 @@ from dataclasses import replace
 from time import sleep
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from dreamfleet.common.codec import MalformedError
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.listing import print_rows
 from dreamfleet.common.site import offer, offer_run, reached
@@ -53,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             print(json.dumps(documents[0], indent=2))
         elif len(documents) > 1:
-            _print_several(documents)
+            print_several(documents)
         else:
             _print_once(client, documents[0] if documents else client.document())
     return 0
@@ -67,13 +68,20 @@ def _redraws() -> bool:
     return sys.stdout.isatty() and not console.is_dumb_terminal
 
 
-def _print_several(documents: Sequence[dict[str, Any]]) -> None:
+def print_several(documents: Sequence[dict[str, Any]]) -> None:
+    """A line for each run; what cannot be read is a note."""
     from dreamfleet.common.eta import eta_of
     from dreamfleet.common.printable import plural
     from dreamfleet.common.status import read_status
     from dreamfleet.common.stored import with_error
 
-    statuses = sorted(map(read_status, documents), key=lambda each: each.run)
+    statuses = []
+    for document in documents:
+        try:
+            statuses.append(read_status(document))
+        except MalformedError as error:  # of one run, and no matter of the others
+            print(f"note: {error}", file=sys.stderr)
+    statuses.sort(key=lambda each: each.run)
     rows = [
         {
             "run": each.run,
@@ -87,7 +95,7 @@ def _print_several(documents: Sequence[dict[str, Any]]) -> None:
         for each in statuses
     ]
     print_rows(rows, right=("generation", "steps/s"), least_first=("steps/s", "workers", "best"))
-    print(f"{plural(len(rows), 'live run')}; `dreamfleet status {statuses[0].run}` tells more", file=sys.stderr)
+    print(f"{plural(len(rows), 'live run')}; `dreamfleet status RUN` tells more", file=sys.stderr)
 
 
 def _print_once(client: Client, document: dict[str, Any]) -> None:

@@ -9,6 +9,7 @@ import pytest
 from dreamfleet.common.classes import Classes, ClassShare
 from dreamfleet.common.codec import MalformedError, encode_json
 from dreamfleet.common.status import Candidate, read_document, read_status
+from dreamfleet.common.verbs.status import print_several
 from tests.support.samples import STATUS
 
 GOLDEN = Path(__file__).parent / "golden" / "status.v2.json"
@@ -86,3 +87,12 @@ def test_classes_without_names_or_results_are_told():
 
 if __name__ == "__main__" and not GOLDEN.exists():
     GOLDEN.write_bytes(encode_json(STATUS))
+
+
+def test_of_several_runs_one_that_answers_with_nonsense_is_a_note_and_the_others_are_told(capsys):
+    first, other, liar = (json.loads(encode_json(dataclasses.replace(STATUS, run=run))) for run in ("b", "a", "liar"))
+    print_several([first, liar | {"evaluations": -1}, other])
+    told = capsys.readouterr()
+    assert [line.split()[0] for line in told.out.splitlines() if line.split()[0] in {"a", "b", "liar"}] == ["a", "b"]
+    assert "liar" in told.err
+    assert "2 live runs" in told.err
