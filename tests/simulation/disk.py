@@ -73,6 +73,10 @@ class MemoryJournal:
     def set_fact(self, key: str, value: str) -> None:
         self._put("fact", key, value)
 
+    def end(self, why: str) -> None:
+        """No rule hangs on when."""
+        self.set_fact("ended", why)
+
     def drop_fact(self, key: str) -> None:
         self._put("fact", key, None)
 

@@ -1,20 +1,22 @@
 """Several hosts on this machine: network namespaces, each on a cable of its own."""
 
-import os
+import json
+import random
+import secrets
 import shutil
 import subprocess
 from contextlib import contextmanager
-from itertools import count
+from ipaddress import ip_interface, ip_network
 
-_numbers = count()
+CABLES = list(ip_network("198.18.0.0/16").subnets(new_prefix=30))  # RFC 2544: what networks are tried out with
 
 
 class Host:
     """A namespace; `address` is this end of its cable, which it reaches us by, `own` is its own end."""
 
-    def __init__(self, name, number):
+    def __init__(self, name, cable):
         self.name = name
-        self.address, self.own = (f"198.18.{os.getpid() % 250}.{4 * number + end}" for end in (1, 2))  # RFC 2544
+        self.address, self.own = map(str, cable.hosts())
         self.inside = ("ip", "netns", "exec", name)
         self._near, far = f"{name}-a", f"{name}-b"
         _ip("netns", "add", name)
@@ -39,13 +41,12 @@ class Host:
 @contextmanager
 def new_host():
     """A host, or `None` where this process may not make one."""
-    number = next(_numbers)
-    name = f"df{os.getpid()}-{number}"
+    name = f"df{secrets.token_hex(4)}"
     if shutil.which("ip") is None:
         yield None
         return
     try:
-        host = Host(name, number)
+        host = Host(name, _free_cable())
     except subprocess.CalledProcessError:
         subprocess.run(["ip", "netns", "del", name], check=False, capture_output=True)
         yield None
@@ -56,5 +57,12 @@ def new_host():
         host.remove()
 
 
+def _free_cable():
+    """None that another run of the tests has, or one that was killed left behind."""
+    told = json.loads(_ip("-json", "-4", "addr", "show"))
+    taken = {ip_interface(f"{a['local']}/30").network for device in told for a in device.get("addr_info", ())}
+    return random.SystemRandom().choice([cable for cable in CABLES if cable not in taken])
+
+
 def _ip(*arguments):
-    subprocess.run(["ip", *arguments], check=True, capture_output=True)
+    return subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True).stdout
