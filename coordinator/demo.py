@@ -35,9 +35,13 @@ REFRESH = 0.5
 START_SECONDS = 30.0
 PAGE_PACKAGES = ("plotly", "starlette", "uvicorn")
 PLOT, VIDEO, SCHEDULE = "fitness.png", "drive.mp4", "stages.toml"
-DREAM_LOOKS, REAL_LOOKS = (2, 8), (3, 16)  # generations between evaluations, and tracks of each; twice as many confirm
-FEW, ALL, ABLE = 0.3, 0.1, 0.06  # first step sizes: from zero in a subspace, of all parameters, and after a dream
-QUICK_STEPS = 400_000  # in reality on one track a candidate: far from a good driver generations tell more than tracks
+DREAM_LOOKS, REAL_LOOKS = (2, 8, 16), (3, 16, 64)  # generations between evaluations, tracks of each, of a confirmation
+FEW, ALL = 0.3, 0.1  # first step sizes from zero: in a subspace, and of all parameters
+FEW_ABLE, ALL_ABLE = 0.15, 0.06  # the same after a dream
+# In reality candidates drive one track each until a mean drives well, for so many steps at most: far from a good driver
+# generations tell more than tracks, and large steps more than small ones.
+ABLE, QUICK_STEPS = 800, 700_000
+STEADY = 0.06  # step size in a subspace from there on
 PAID = "offroad_cost=2"  # by candidates in reality: grass foretells losses that one track is too few to show
 
 
@@ -49,11 +53,12 @@ class DemoConfig:
     minutes: float = option(4.5, "then evolve in reality for so long; 0: not at all")
     temperature: float = option(1.5, "of the dream")
     population: int = option(24, "candidates a generation in reality")
-    episodes: int = option(4, f"episodes a candidate in reality, after one for the first {QUICK_STEPS:,} steps")
+    episodes: int = option(4, f"episodes a candidate in reality, after one each until a mean drives {ABLE}")
     horizon: int = option(1000, "steps of an episode at most in reality")
     patience: int = option(100, "cut an episode after so many steps without reward in reality")
     sigma0: float | None = option(
-        None, f"first step size from zero (default {FEW} in a subspace, else {ALL}); after a dream it is {ABLE}"
+        None,
+        f"first step size from zero (default {FEW} in a subspace, else {ALL}); after a dream {FEW_ABLE} and {ALL_ABLE}",
     )
     bundle: str = option("tiny", "the frozen world model: a shipped name or a file")
     subspace: str | None = option(
@@ -232,8 +237,8 @@ def _drives(scores: Sequence[float]) -> str:
     return f"{_score(fmean(scores), error, len(scores))}, {min(scores):.0f} to {max(scores):.0f}"
 
 
-def _looks(every: int, tracks: int) -> dict[str, object]:
-    return {"evaluate-every": every, "evaluation-episodes": tracks, "confirm-episodes": 2 * tracks}
+def _looks(every: int, tracks: int, confirming: int) -> dict[str, object]:
+    return {"evaluate-every": every, "evaluation-episodes": tracks, "confirm-episodes": confirming}
 
 
 def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
@@ -248,7 +253,7 @@ def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
     reality: dict[str, object] = {
         **search, "population": config.population, "horizon": config.horizon,
         "patience": config.patience, "sigma0": sigma0, "seed": config.seed, "minutes": config.minutes,
-        "evaluate-every": 0, "variant": PAID,
+        "variant": PAID, **_looks(*REAL_LOOKS),
     }  # fmt: skip
     if config.dream_minutes:
         dream = f"{name}-dream"
@@ -257,8 +262,11 @@ def stages(config: DemoConfig, name: str, runs_dir: Path) -> tuple[Stage, ...]:
             "minutes": config.dream_minutes, **_looks(*DREAM_LOOKS),
         }  # fmt: skip
         found.append(Stage(dream, f"evolving in the dream for {config.dream_minutes:g} minutes", flags))
-        reality |= {"init": runs_dir / dream / CONTROLLER, "sigma0": ABLE, **_looks(*REAL_LOOKS)}
+        reality |= {"init": runs_dir / dream / CONTROLLER, "sigma0": FEW_ABLE if few else ALL_ABLE}
     if config.minutes:
-        schedule = f"[[stage]]\nsteps = {QUICK_STEPS}\nepisodes = 1\n\n[[stage]]\nepisodes = {config.episodes}\n"
+        schedule = (
+            f"[[stage]]\nscore = {ABLE}\nsteps = {QUICK_STEPS}\nepisodes = 1\n\n"
+            f"[[stage]]\nepisodes = {config.episodes}\n" + (f"sigma0 = {STEADY}\n" if few else "")
+        )
         found.append(Stage(name, f"evolving in reality for {config.minutes:g} minutes", reality, schedule))
     return tuple(found)
