@@ -26,12 +26,12 @@ def test_its_video_shows_the_median_track(drives, expected):
 @pytest.mark.parametrize(
     ("config", "subspace", "steps"),
     [
-        (DemoConfig(), "tiny", [0.3, 0.06]),
+        (DemoConfig(), "tiny", [0.3, 0.15]),
         (DemoConfig(subspace="none"), None, [0.1, 0.06]),
         (DemoConfig(bundle="my.zip"), None, [0.1, 0.06]),
-        (DemoConfig(bundle="my.zip", subspace="few.npz"), "few.npz", [0.3, 0.06]),
+        (DemoConfig(bundle="my.zip", subspace="few.npz"), "few.npz", [0.3, 0.15]),
         (DemoConfig(dream_minutes=0), "tiny", [0.3]),
-        (DemoConfig(sigma0=0.2), "tiny", [0.2, 0.06]),
+        (DemoConfig(sigma0=0.2), "tiny", [0.2, 0.15]),
     ],
 )
 def test_both_stages_search_in_the_features_that_ship_for_its_world_model(config, subspace, steps):
