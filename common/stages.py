@@ -56,7 +56,8 @@ class Stage:
         raced = ", racing" if self.racing else ""
         driven = ", all driven" if self.driven == 1 else f", {self.driven:.0%} of them driven" if self.driven else ""
         search += "" if self.whole else " in the subspace"
-        return f"{self.horizon} steps{patience}, {self.population} x {self.episodes} episodes{driven}{raced}, {search}"
+        size = f"{self.population} x {plural(self.episodes, 'episode')}"
+        return f"{self.horizon} steps{patience}, {size}{driven}{raced}, {search}"
 
     @property
     def driven_episodes(self) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.eta import duration
 from dreamfleet.common.fields import written
+from dreamfleet.common.printable import plural
 from dreamfleet.common.receipt import Receipt, receipt_of, settings_in
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.seeds import TRAINING_FIRST
@@ -50,7 +51,7 @@ def _rows(run: RunFolder, controller: Controller, receipt: Receipt, settings: Ru
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
     yield "score", _score(run)
     yield "task", f"{spec.task}, {spec.horizon} steps, version {spec.version}"
-    size = f"population {settings.population} x {settings.episodes} episodes, sigma0 {settings.sigma0:g}"
+    size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
     yield "search", f"{settings.optimiser}, {settings.covariance}, {size}, {receipt.generations} generations"
     yield "spent", receipt.total.told
     yield "seed", f"{settings.seed}; training seeds follow from it, from {TRAINING_FIRST} up"

@@ -13,6 +13,7 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 from dreamfleet.common.charts import COLOURS, draw_fitness
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.saving import saving
 from dreamfleet.common.stages import Stage, begun_stages, in_turn
@@ -31,7 +32,7 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     stages = begun_stages(settings, run.history(), run.evaluations())
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
     handles = draw_fitness(axes, run)
-    size = in_turn(f"{each.stage.population} candidates x {each.stage.episodes} episodes" for each in stages)
+    size = in_turn(f"{each.stage.population} candidates x {plural(each.stage.episodes, 'episode')}" for each in stages)
     steps = in_turn(_steps(each.stage, dreamt=settings.task.task == DREAM) for each in stages)
     axes.set_ylabel(f"fitness over {steps}")
     title = f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}"

@@ -9,7 +9,7 @@ from typing import Any
 
 from dreamfleet.common.effort import counted
 from dreamfleet.common.eta import Eta, duration, eta_of, sentence
-from dreamfleet.common.printable import printable
+from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.processes import spoken
 from dreamfleet.common.status import Population, Status, WorkerStatus
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
@@ -86,7 +86,8 @@ def _task(status: Status) -> str:
     settings, stage = status.settings, status.generation.stage
     size = settings if stage is None else stage
     horizon = settings.task.horizon if stage is None else stage.horizon
-    parts = [settings.task.task, f"{size.population} candidates x {size.episodes} episodes", f"{horizon:,} steps"]
+    candidates = f"{size.population} candidates x {plural(size.episodes, 'episode')}"
+    parts = [settings.task.task, candidates, f"{horizon:,} steps"]
     if stage is not None:
         parts.append(f"stage {stage.number} of {stage.total}")
     return ", ".join(parts)

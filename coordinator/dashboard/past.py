@@ -12,7 +12,7 @@ from typing import Any
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.effort import START_EFFORT, Effort, start_effort
 from dreamfleet.common.errors import DreamfleetError, JournalError
-from dreamfleet.common.printable import printable, setting
+from dreamfleet.common.printable import plural, printable, setting
 from dreamfleet.common.runs import RunFolder, open_run, run_paths
 from dreamfleet.common.stages import stages_of
 from dreamfleet.common.stored import RunSettings, StoredGeneration, best_of, told, unfolded
@@ -136,7 +136,7 @@ def _facts(run: RunFolder, course: Course, total: Effort) -> Facts:
         ("task", settings.task.task),
         ("begun", begun(run.created)),
         ("generations", f"{len(course.history):,}"),
-        ("population", f"{settings.population} candidates x {settings.episodes} episodes"),
+        ("population", f"{settings.population} candidates x {plural(settings.episodes, 'episode')}"),
         ("horizon", f"{settings.task.horizon:,} steps"),
         ("optimiser", f"{optimiser(settings)}, first step size {settings.sigma0:g}"),
         ("seed", str(settings.seed)),
