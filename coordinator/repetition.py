@@ -19,7 +19,7 @@ from dreamfleet.coordinator.config import LimitsConfig, RunConfig, settings_of
 from dreamfleet.coordinator.kept import kept_network
 from dreamfleet.coordinator.optimisers.registry import known_optimisers
 from dreamfleet.coordinator.receipts import versions
-from dreamfleet.coordinator.start import Start
+from dreamfleet.coordinator.start import MEAN, Start
 
 
 @dataclass(frozen=True)
@@ -83,12 +83,18 @@ class Repetition:
     def plan(self, folder: Path) -> tuple[RunConfig | None, Table]:
         """How to begin the run in a folder, or `None` and the network it had, where it was begun there before.
 
-        `UsageError` where another run lies there, or this version would begin another one.
+        `UsageError` where another run lies there, such as the first one itself, or this version would begin another.
         """
         if not is_there(folder / JOURNAL):
             return self._config(), {}
+        start = self.receipt.start and self.receipt.start.mean
         with open_run(folder.parent, folder.name) as stored:
-            if stored.settings != self.settings:
+            if stored.uid and stored.uid == self.controller.provenance.get("run_uid"):
+                raise UsageError(
+                    f"run {folder.name} is the one that the controller came from, and would be compared with itself: "
+                    "choose another --run"
+                )
+            if stored.settings != self.settings or stored.fact(MEAN) != start:
                 raise UsageError(f"run {folder.name} exists and is another one: choose another --run")
             return None, kept_network(stored)
 

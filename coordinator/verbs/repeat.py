@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from dreamfleet.common.config import add_flags
+from dreamfleet.common.keys import check_run_name
 from dreamfleet.common.listing import add_json
 from dreamfleet.common.site import offer
 from dreamfleet.coordinator.config import NetworkConfig
@@ -34,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     controller, beside = find_controller(args.controller, args.runs_dir)
     again = Repetition.of(controller, bundle_for(controller, args.bundle, beside))
     again.check_optimiser(args.optimiser)
-    folder = args.runs_dir / (args.run_name or f"{Path(args.controller).stem}-again")
+    folder = args.runs_dir / check_run_name(args.run_name or f"{Path(args.controller).stem}-again")
     config, kept = again.plan(folder)
     request = request_of(args, folder.name, config, again.limits, kept, again.start if config else None)
 

@@ -121,6 +121,19 @@ def test_another_run_is_not_gone_on_with_and_another_version_is_named(tmp_path, 
         strange.plan(tmp_path / "new")
 
 
+def test_a_run_is_neither_compared_with_itself_nor_with_one_that_began_elsewhere(make):
+    first = make()
+    again = Repetition.of(first.end(), None)
+    with pytest.raises(UsageError, match="is the one that the controller came from"):
+        again.plan(first.path)
+    same = make()
+    assert again.plan(same.path)[0] is None
+    size = first.settings.controller.size
+    other = make(Start(np.ones(size), first.settings.task.bundle, "elsewhere"))
+    with pytest.raises(UsageError, match="exists and is another one"):
+        again.plan(other.path)
+
+
 def begun(bundle, **changes):
     """A controller of a run that has just begun."""
     settings = RunConfig(**changes).settings(bundle)
