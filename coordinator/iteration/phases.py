@@ -121,6 +121,7 @@ class Phases:
         return Outcome(made=(path,))
 
     def _mdnrnn(self, number: int) -> Outcome:
+        self._encode(number)  # latents that went, were damaged or are of a later round's encoder; mostly none
         return self._train(number, MDNRNN)
 
     def _train(self, number: int, model: str) -> Outcome:
@@ -133,6 +134,7 @@ class Phases:
         return Outcome((words,))
 
     def _bundle(self, number: int) -> Outcome:
+        self._encode(number)  # as before the training: recorded states are of latents too
         words = self._commands.bundle(number)
         told = self._call(number, BUNDLE, words)
         provenance = Bundle.open(self._layout.bundle(number)).manifest.provenance

@@ -4,8 +4,10 @@ import pytest
 
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.coordinator.iteration import artefacts
+from dreamfleet.coordinator.iteration.commands import Commands
 from dreamfleet.coordinator.iteration.config import IterateConfig
 from dreamfleet.coordinator.iteration.layout import Layout
+from dreamfleet.coordinator.iteration.phases import Phases
 from dreamfleet.coordinator.iteration.plan import Phase, Plan
 from tests.coordinator.iteration.test_ledger import entry, ledger
 
@@ -102,3 +104,18 @@ def test_random_drives_are_driven_again_only_where_they_are_damaged(layout, fini
     before = undo(layout, finished, "1/collect")
     assert not before.entries
     assert [each.stem for each in artefacts.drives(layout)] == ["000000"]
+
+
+@pytest.mark.parametrize("phase", ["mdnrnn", "bundle"])
+def test_latents_are_made_again_where_they_are_needed(layout, phase):
+    asked = []
+
+    def ask(words, log):
+        asked.append(words)
+        if words[0] != "encode":
+            raise DatasetError("enough")
+
+    commands = Commands(IterateConfig(), layout, ledger())
+    with pytest.raises(DatasetError, match="enough"):
+        Phases(commands, None, ask, lambda: False).do(Phase(1, phase))
+    assert [words[0] for words in asked] == ["encode", "bundle" if phase == "bundle" else "train"]
