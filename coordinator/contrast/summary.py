@@ -60,8 +60,7 @@ def rows(outcomes: Sequence[Outcome]) -> list[dict[str, object]]:
         {
             "kind": each.kind, "seed": each.seed, "parameters": f"{each.parameters:,}",
             **{label: each.quality.get(name) for name, label in FIGURES.items()},
-            "reality": "not evaluated" if each.score is None else
-            f"{each.score:.0f} ± {each.error or 0:.0f} on {each.tracks}{'' if each.confirmed else ', provisional'}",
+            "reality": _reality(each),
         }
         for each in outcomes
     ]  # fmt: skip
@@ -94,6 +93,13 @@ def told(kind: str, first: str, figure: str, found: Difference) -> str:
     verdict = "" if found.clear else ": none, for one under two standard errors is none"
     size = f"{found.mean:+.{digits}f} ± {found.error:.{digits}f} over {found.seeds} seeds"
     return f"{label}: {kind} less {first} {size}{verdict}"
+
+
+def _reality(found: Outcome) -> str:
+    if found.score is None:
+        return "not evaluated"
+    error = f" ± {found.error:.0f}" if found.error is not None and found.tracks > 1 else ""  # of one track: none
+    return f"{found.score:.0f}{error} on {found.tracks}{'' if found.confirmed else ', provisional'}"
 
 
 def _kinds(outcomes: Sequence[Outcome]) -> list[str]:

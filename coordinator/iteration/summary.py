@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from dreamfleet.common.printable import plural
 from dreamfleet.coordinator.iteration.gate import KNOWS, LOSES
 from dreamfleet.coordinator.iteration.layout import Layout
 from dreamfleet.coordinator.iteration.ledger import Entry, Ledger
@@ -35,7 +36,7 @@ def outcome(entry: Entry) -> str:
     if entry.phase == GATE:
         return str(figures["why"])
     if entry.phase == EVOLVE:
-        told, ended = f"{figures['generations']} generations", figures["ended"]
+        told, ended = plural(figures["generations"], "generation"), figures["ended"]
         return f"{told if ended == told else f'{told}, ended after {ended}'}; {score(figures['score'])}"
     return ""
 
@@ -45,7 +46,8 @@ def score(told: Mapping[str, Any] | None) -> str:
     if told is None:
         return "not evaluated"
     provisional = "" if told["confirmed"] else ", provisional"
-    return f"{told['mean']:.0f} ± {told['error']:.0f} on {told['episodes']} tracks{provisional}"
+    error = f" ± {told['error']:.0f}" if told["episodes"] > 1 else ""  # of one track there is none
+    return f"{told['mean']:.0f}{error} on {plural(told['episodes'], 'track')}{provisional}"
 
 
 def rounds(layout: Layout, ledger: Ledger) -> list[dict[str, Any]]:

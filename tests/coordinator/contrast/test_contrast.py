@@ -86,3 +86,8 @@ def test_one_seed_has_no_error_and_no_difference_and_what_was_not_evaluated_no_s
     assert {each.figure for each in means(outcomes)} == {"nats_per_dimension"}
     assert means(outcomes)[0].told == "0.960"
     assert rows(outcomes)[0]["reality"] == "not evaluated"
+
+
+def test_a_score_of_one_track_has_no_standard_error():
+    (row,) = rows([Outcome("plain", 1, 10, {}, -80.0, 0.0, 1)])
+    assert row["reality"] == "-80 on 1, provisional"

@@ -43,6 +43,11 @@ def test_a_round_says_whose_model_it_evolved_in():
     assert summary.score(told[1]["score"]) == "900 ± 15 on 32 tracks, provisional"
 
 
+def test_a_score_of_one_track_has_no_standard_error():
+    single = {**SCORE, "mean": -80.0, "error": 0.0, "episodes": 1, "confirmed": False}
+    assert summary.score(single) == "-80 on 1 track, provisional"
+
+
 def test_rounds_without_a_score_have_no_best_one():
     assert summary.best(rounds(*FIRST[:2])) is None
 
