@@ -110,6 +110,15 @@ def begun_stages(
     return stages.begun
 
 
+def stages_told(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str, str]:
+    """Each stage of a schedule in words, and when it began, by its name."""
+    found = {}
+    for stage in stages_of(settings) if settings.stages else ():
+        since = f"since generation {begun[stage.number - 1].since}" if stage.number <= len(begun) else "not begun"
+        found[f"stage {stage.number}"] = f"{since}, {stage.ending}: {stage.told}"
+    return found
+
+
 def in_turn(values: Iterable[str]) -> str:
     """What counted in one stage after another, in words; what stayed is said once."""
     return ", then ".join(value for value, _ in groupby(values))

@@ -13,6 +13,7 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.receipt import Receipt, receipt_of, settings_in
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.seeds import TRAINING_FIRST
+from dreamfleet.common.stages import begun_stages, stages_told
 from dreamfleet.common.stored import RunSettings, best_of, told
 
 
@@ -50,9 +51,16 @@ def _rows(run: RunFolder, controller: Controller, receipt: Receipt, settings: Ru
     yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
     yield "score", _score(run)
-    yield "task", f"{spec.task}, {spec.horizon} steps, version {spec.version}"
-    size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
-    yield "search", f"{settings.optimiser}, {settings.covariance}, {size}, {receipt.generations} generations"
+    generations = plural(receipt.generations, "generation")
+    if settings.stages:  # each has a horizon, a population and more of its own
+        begun = begun_stages(settings, run.history(), run.evaluations())
+        yield "task", f"{spec.task}, version {spec.version}"
+        yield "search", f"{settings.optimiser}, {settings.covariance}, {generations}"
+        yield from stages_told(settings, begun).items()
+    else:
+        yield "task", f"{spec.task}, {spec.horizon} steps, version {spec.version}"
+        size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
+        yield "search", f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
     yield "spent", receipt.total.told
     yield "seed", f"{settings.seed}; training seeds follow from it, from {TRAINING_FIRST} up"
     for what, (first, count) in (receipt.seeds or {}).items():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -14,7 +13,7 @@ from dreamfleet.common.listing import add_json, print_rows
 from dreamfleet.common.printable import setting
 from dreamfleet.common.runs import open_run
 from dreamfleet.common.site import offer
-from dreamfleet.common.stages import BegunStage, begun_stages, stages_of
+from dreamfleet.common.stages import begun_stages, stages_told
 from dreamfleet.common.stored import RunSettings, StoredGeneration, best_of, told
 
 SUMMARY = "show one run from its journal: settings, history, evaluations"
@@ -53,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     facts |= {f"class {name}": hosts for name, hosts in classes.rows}
     facts["reported"] = told(confirmed or best_of(evaluations))
     facts |= {"stage": f"{len(begun)} of {len(settings.stages)}"} if begun else {}
-    shown_settings = {**_flat(settings), **_stages(settings, begun)}
+    shown_settings = {**_flat(settings), **stages_told(settings, begun)}
     print_rows([{"": name, "value": value} for name, value in {**facts, **shown_settings}.items()])
     print()
     shown = history[-SHOWN:] if sys.stdout.isatty() else history
@@ -63,15 +62,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"the last {SHOWN} of {len(history)} generations; --json has all")
     print_rows(lines, right=tuple(lines[0]) if lines else (), least_first=("seconds", "worst", "steps", "std", "sigma"))
     return 0
-
-
-def _stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str, object]:
-    """Each stage of a schedule in words, and when it began."""
-    found: dict[str, object] = {}
-    for stage in stages_of(settings) if settings.stages else ():
-        since = f"since generation {begun[stage.number - 1].since}" if stage.number <= len(begun) else "not begun"
-        found[f"stage {stage.number}"] = f"{since}, {stage.ending}: {stage.told}"
-    return found
 
 
 def _flat(settings: RunSettings) -> dict[str, object]:

@@ -6,12 +6,14 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from pyarrow import parquet
 
 from dreamfleet.common import cli
+from dreamfleet.common.controller import Controller
 from dreamfleet.common.processes import command
 from dreamfleet.common.runs import open_run
 from tests.support.disks import small_disk
@@ -100,6 +102,23 @@ def test_the_receipt_says_what_a_paper_cites(runs, capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["receipt"]["generations"] == len(stored(runs)[0])
     assert told["controller"] in text
+
+
+def test_the_receipt_of_a_schedule_tells_each_stage_instead_of_the_first_ones_figures(runs, capsys):
+    with sqlite3.connect(runs / "reality" / "journal.sqlite") as journal:
+        (text,) = journal.execute("SELECT value FROM run WHERE key = 'settings'").fetchone()
+        stages = [{"generations": 1}, {"horizon": 7, "episodes": 3}]
+        text = json.dumps({**json.loads(text), "stages": stages})
+        journal.execute("UPDATE run SET value = ? WHERE key = 'settings'", (text,))
+    journal.close()
+    path = runs / "reality" / "controller.npz"
+    controller = Controller.load(path)
+    told = {**controller.provenance, "settings": json.loads(text)}
+    replace(controller, provenance=told).save(path)
+    assert cli.main(["runs", "receipt", "reality", "--runs-dir", str(runs)]) == 0
+    text = capsys.readouterr().out
+    assert "- stage 2: since generation 1, to the end: 7 steps" in text
+    assert "sigma0" not in text
 
 
 def confirm(runs, text):
