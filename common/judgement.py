@@ -18,7 +18,7 @@ from dreamfleet.common.messages import Length, Seconds
 
 MARKS = (800, 900)  # scores of CarRacing that people ask about
 ENOUGH = 100  # drives for a world to be called solved, as gymnasium's threshold has been understood
-MOST_BYTES, MOST_DRIVES = 64 << 20, 10**5
+MOST_BYTES, MOST_DRIVES, MOST_SEED = 64 << 20, 10**5, 2**63
 Drives = Annotated[tuple[Drive, ...], Length(1, MOST_DRIVES)]
 
 
@@ -92,6 +92,12 @@ def read_judgement(path: Path) -> Judgement:
         raise UsageError(f"no report at {path}: `dreamfleet evaluate --out {path}` writes one") from None
     except (OSError, ValueError, TypeError, MalformedError, RecursionError) as error:
         raise UsageError(f"{path} is no report of `dreamfleet evaluate --out` ({error}): write it again") from error
+
+
+def check_fits(first_seed: int, episodes: int) -> None:
+    """`UsageError`, before anybody drives, for seeds of which no report could tell."""
+    if episodes > MOST_DRIVES or first_seed + episodes > MOST_SEED:
+        raise UsageError(f"--episodes must be at most {MOST_DRIVES}, and seeds below {MOST_SEED}")
 
 
 def _check(drives: tuple[Drive, ...]) -> None:

@@ -14,8 +14,8 @@ from dreamfleet.common.judgement import Judgement
 class Reproduction:
     """A recorded report, and what its controller drove now, on the same seeds or on some of them.
 
-    On a host of the recorded fingerprint every drive must be the same to the bit. Elsewhere the mean may differ by two
-    standard errors of the paired difference.
+    On a host of the recorded fingerprint every drive must be the same to the bit, and so must a single one anywhere.
+    Elsewhere the mean may differ by two standard errors of the paired difference.
     """
 
     recorded: Judgement
@@ -45,7 +45,7 @@ class Reproduction:
     @property
     def holds(self) -> bool:
         """Whether the record is reproduced."""
-        return not self.differing or (not self.same_host and not self.difference.clear)
+        return not self.differing or (not self.same_host and len(self.pairs) > 1 and not self.difference.clear)
 
     @property
     def told(self) -> str:
@@ -62,4 +62,7 @@ class Reproduction:
                 f"{self.again.version}"
             )
         hosts = f"recorded on [{self.recorded.fingerprint}], this host is [{self.again.fingerprint}]"
+        if count < 2:
+            was = f"{mean:.1f} instead of {self.pairs[0][0].score:.1f}"
+            return f"{name}: NOT reproduced: {was} on one seed, and a mean of other bits takes 2 seeds or more; {hosts}"
         return f"{name}: {'' if self.holds else 'NOT '}reproduced: mean {mean:.1f}, {self.difference.told}; {hosts}"

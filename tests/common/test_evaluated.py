@@ -160,6 +160,19 @@ def test_what_else_differs_than_the_controllers_is_noted(tmp_path, capsys):
 ELSEWHERE = {"fingerprint": "aarch64"}
 
 
+def test_one_seed_of_other_bits_is_not_reproduced_and_no_difference_is_asked_of_it():
+    found = Reproduction(scored(100, 500), scored(110, **ELSEWHERE))
+    assert not found.holds
+    assert "NOT reproduced: 110.0 instead of 100.0 on one seed" in found.told
+
+
+@pytest.mark.parametrize("words", [("--episodes", "99999999999"), ("--first-seed", "9223372036854775807")])
+@pytest.mark.parametrize("verb", [("evaluate", "--controller", "tiny"), ("baseline", "evaluate", "random")])
+def test_seeds_that_no_report_could_tell_of_are_refused_before_anybody_drives(verb, words, capsys):
+    assert cli.main([*verb, *words]) == 2
+    assert "--episodes must be at most 100000, and seeds below" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("scores", "changes", "holds", "says"),
     [

@@ -35,8 +35,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Drive and print the scores."""
     pin_thread_pools()  # of NumPy and torch, which are not loaded yet
+    from dreamfleet.common.judgement import check_fits
+
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
+    check_fits(args.first_seed, args.episodes)
     if args.out:
         check_out(args.out)
     seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))

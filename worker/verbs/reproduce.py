@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.cores import cores
-from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.site import offer
 from dreamfleet.common.threads import pin_thread_pools
@@ -25,6 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("reports", metavar="REPORT", nargs="+", type=Path, help="files of `evaluate --out`")
     parser.add_argument("--episodes", type=int, help="drive only the first so many seeds of each (default all)")
+    parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
     offer(parser, "runs_dir")
     add_json(parser)
@@ -57,8 +58,14 @@ def _again(args: argparse.Namespace, path: Path, recorded: Judgement) -> Reprodu
             f"{path} records the controller {recorded.controller[:12]}, and {recorded.name} is "
             f"{controller.sha256[:12]}: take the one that was recorded, or record this one with `dreamfleet evaluate`"
         )
+    bundle = bundle_for(controller, args.bundle, beside)
+    if bundle is not None and bundle.sha256 != recorded.bundle:
+        raise BundleError(
+            f"{path} records drives by the world model {recorded.bundle[:12] or 'of none'}, and this is "
+            f"{bundle.sha256[:12]}: give that one by --bundle"
+        )
     seeds = recorded.evaluated.seeds[: args.episodes]
-    again = judge(recorded.name, agent_of(controller, bundle_for(controller, None, beside)), seeds, args.jobs)
+    again = judge(recorded.name, agent_of(controller, bundle), seeds, args.jobs)
     return Reproduction(recorded, again)
 
 

@@ -108,6 +108,9 @@ def test_what_it_writes_is_what_it_prints_and_drives_again_to_the_bit(processes,
     out.write_text(replace(recorded, controller="ef" * 32).to_json())
     code, _, err = processes.call("reproduce", out)
     assert (code, "records the controller efefefefefef" in err) == (1, True)
+    out.write_text(replace(recorded, bundle="ef" * 32).to_json())
+    code, _, err = processes.call("reproduce", out)
+    assert (code, "records drives by the world model efefefefefef" in err) == (1, True)
 
 
 def test_where_no_report_can_be_written_is_said_before_anybody_drives(processes, controller, random_bundle, tmp_path):
