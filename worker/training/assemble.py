@@ -117,7 +117,8 @@ def assemble(
                     "bundle that without --measured, and measure it"
                 )
         provenance["measured"] = [figures for *_, figures in told]
-    return write_bundle(out, manifest(name, provenance, *configs), parts)
+    with told_where_full(out):
+        return write_bundle(out, manifest(name, provenance, *configs), parts)
 
 
 def _figures(path: Path) -> tuple[object, dict[str, Any]]:

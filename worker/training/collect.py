@@ -26,6 +26,7 @@ from dreamfleet.worker.tasks.policy import Driven
 from dreamfleet.worker.training.collect_config import ALL, CollectConfig
 from dreamfleet.worker.training.dataset import check_pictures
 from dreamfleet.worker.training.pilot import Pilot
+from dreamfleet.worker.training.room import told_where_full
 from dreamfleet.worker.training.world import find_world, preprocessing_to, source_policies
 
 
@@ -82,7 +83,8 @@ def _start_process(parent: int) -> None:
 def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...]]) -> int:
     folder, config, number, pilots = task
     arrays = drive(config, number, pilots)
-    with write_aside(episode_path(folder, number)) as file:
+    path = episode_path(folder, number)
+    with told_where_full(path), write_aside(path) as file:
         write_episode(file, arrays)
     return len(arrays["action"])
 

@@ -19,6 +19,7 @@ from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files import write_aside
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.dataset import check_pictures, check_whole, episodes, load, load_pictures, load_steps
+from dreamfleet.worker.training.room import told_where_full
 from dreamfleet.worker.training.train_vae import CHECKPOINT
 from dreamfleet.worker.training.world import preprocessing_to
 from dreamfleet.worker.worldmodel.export import export_encoder
@@ -54,7 +55,7 @@ def encode(folder: Path) -> Iterator[int]:
         if mirrors:
             found = look(np.ascontiguousarray(pictures[:, :, ::-1]))
             mirrored = dict(zip(("mirrored_mu", "mirrored_logvar"), found, strict=True))
-        with write_aside(target) as file:
+        with told_where_full(target), write_aside(target) as file:
             np.savez(
                 file, mu=mu, logvar=logvar, **mirrored, action=drive["action"], reward=drive["reward"],
                 ended=drive["ended"], vae=np.array(vae),
