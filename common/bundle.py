@@ -149,8 +149,17 @@ class Bundle:
         return Bundle(self.path, self.sha256, self.manifest, shape, variant)
 
     def fitting(self, controller: Controller) -> Bundle:
-        """This bundle under one controller's shape and variant; errors as of `under`."""
-        return self.under(controller.shape, controller.variant)
+        """This bundle under one controller's shape and variant; errors as of `under`.
+
+        `ControllerError` for a controller of another world model: its parameters mean nothing to this one.
+        """
+        found = self.under(controller.shape, controller.variant)
+        if self.sha256 != controller.bundle:
+            raise ControllerError(
+                f"the controller belongs to {_named(controller.bundle)}, not to {self.path.name} "
+                f"({self.sha256[:12]}...): leave --bundle out, or fit it to this one by `dreamfleet refit`"
+            )
+        return found
 
     @property
     def recorded(self) -> int:
@@ -282,3 +291,7 @@ def _read_manifest(archive: Archive, path: Path) -> Manifest:
     except (ValueError, TypeError, KeyError, MalformedError, RecursionError) as error:
         raise BundleError(f"{path}: the manifest cannot be read ({error})") from error
     return manifest
+
+
+def _named(sha256: str) -> str:
+    return f"world model {sha256[:12]}..." if sha256 else "no world model"

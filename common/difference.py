@@ -10,7 +10,8 @@ from statistics import fmean, stdev
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.evaluated import Evaluated
 
-CLEAR = 2  # standard errors: a smaller difference is none
+CLEAR = 2  # standard errors of many seeds: a smaller difference is none
+MANY = 30  # seeds
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,28 @@ class Difference:
         return cls(len(shared), fmean(differences), stdev(differences) / math.sqrt(len(shared)))
 
     @property
+    def bound(self) -> float:
+        """Standard errors that are no difference yet: two of many seeds, more of few.
+
+        Student's t of as many degrees of freedom that chance exceeds as rarely as two deviations of a normal
+        distribution, by its expansion in 1 / (seeds - 1) (Abramowitz & Stegun 26.7.5).
+        """
+        if self.seeds >= MANY:
+            return CLEAR
+        z, freedom = float(CLEAR), self.seeds - 1
+        first, second = (z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96
+        third = (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384
+        return z + first / freedom + second / freedom**2 + third / freedom**3
+
+    @property
+    def under(self) -> str:
+        """What a difference must be more than, in words."""
+        return "two standard errors" if self.seeds >= MANY else f"{self.bound:.1f} standard errors of so few seeds"
+
+    @property
     def clear(self) -> bool:
-        """Whether it is more than two standard errors."""
-        return abs(self.mean) > CLEAR * self.error
+        """Whether it is more than chance gives."""
+        return abs(self.mean) > self.bound * self.error
 
     @property
     def told(self) -> str:
@@ -51,7 +71,7 @@ class Difference:
         found = f"{self.mean:+.1f} ± {self.error:.1f} (standard error) on {self.seeds} equal seeds"
         if self.clear:
             return f"{found}: {'better' if self.mean > 0 else 'worse'}"
-        return f"{found}: none, for a difference under two standard errors is none"
+        return f"{found}: none, for a difference under {self.under} is none"
 
 
 def _by_seed(evaluated: Evaluated) -> dict[int, float]:

@@ -119,6 +119,15 @@ def stages_told(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str,
     return found
 
 
+def steps_told(horizon: int, driven: float, *, dreamt: bool) -> str:
+    """What an episode of a candidate is, in words: its steps, and in a run of dreams where they are made."""
+    if not dreamt:
+        return f"{horizon:,} steps"
+    if driven in (0, 1):
+        return f"{horizon:,} {'driven' if driven else 'dreamt'} steps"
+    return f"{horizon:,} steps, {driven:.0%} driven"
+
+
 def in_turn(values: Iterable[str]) -> str:
     """What counted in one stage after another, in words; what stayed is said once."""
     return ", then ".join(value for value, _ in groupby(values))

@@ -227,7 +227,7 @@ def told(found: StoredEvaluation | StoredConfirmation | None) -> str:
     if isinstance(found, StoredConfirmation):
         seeds = plural(found.episodes, "fresh validation seed")
         return f"{score} on {seeds}; confirmed: they took no part in its choice"
-    return f"{score} on {plural(found.episodes, 'validation seed')}; provisional: it is the best of several looks"
+    return f"{score} on {plural(found.episodes, 'validation seed')}; provisional: it is the best of all looks so far"
 
 
 def with_error(found: StoredEvaluation | StoredConfirmation) -> str:

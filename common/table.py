@@ -18,9 +18,10 @@ from dreamfleet.common.credentials import SOON, told_left
 from dreamfleet.common.eta import eta_of, sentence
 from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.roster import Roster
-from dreamfleet.common.status import FailureStatus, OpenGeneration, Population, Progress, Status
+from dreamfleet.common.stages import steps_told
+from dreamfleet.common.status import FailureStatus, OpenGeneration, Population, Progress, StageStatus, Status
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration, with_error
-from dreamfleet.common.tasks import is_own
+from dreamfleet.common.tasks import DREAM, is_own
 
 STATE_STYLES = {
     "running": "green",
@@ -110,7 +111,7 @@ def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
     most = len(_fact_lines(facts, width))
     yield Block(4, min(3, most), min(5, most), most, lambda given: _fitting(facts, width, given))
     if len(status.recent) > 1:
-        yield Block(7, 1, 4, CURVE, lambda given: _curve(status.recent, width, given))
+        yield Block(7, 1, 4, CURVE, lambda given: _curve(status.recent, width, given, status.generation.stage))
     if (population := _open_population(status)) is not None:
         shown = population
         wanted = 1 + cells_wanted(shown, width)
@@ -133,9 +134,9 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
     """Need (0 first), name and value, in the order in which they stand."""
     settings, task, waste = status.settings, status.settings.task, status.waste
     temperature, stage = status.generation.temperature, status.generation.stage
-    warm = "" if temperature is None else f", temperature {temperature:g}"
     now, size = (task, settings) if stage is None else (stage, stage)
-    yield 6, "task", f"{task.task}, {now.horizon} steps{warm}"
+    warm = "" if temperature is None or size.driven == 1 else f", temperature {temperature:g}"
+    yield 6, "task", f"{task.task}, {steps_told(now.horizon, size.driven, dreamt=task.task == DREAM)}{warm}"
     yield 7, "population", f"{size.population} x {size.episodes}"
     if stage is not None:
         yield 4, "stage", f"{stage.number} of {stage.total}, since generation {stage.since}"
@@ -246,25 +247,34 @@ def _candidates(status: Status, population: Population, width: int, lines: int) 
     return [Text(caption[:width], style="dim"), *cell_lines(population, width, lines - 1)]
 
 
-def _curve(history: Sequence[StoredGeneration], width: int, lines: int) -> list[Text]:
+def _curve(history: Sequence[StoredGeneration], width: int, lines: int, stage: StageStatus | None = None) -> list[Text]:
     """The mean fitness of all generations: a line of bars, or, with more lines, a plot under a caption.
 
-    Where there are more than columns a bar is the mean of several.
+    Where there are more than columns a bar is the mean of several. Those before the open generation's stage are dim:
+    their fitness may be of another kind.
     """
     caption = "mean fitness by generation"
     margin = max(len(f"{each.mean:.0f}") for each in history) + 1
     room = width - margin - (len(caption) + 1 + margin if lines == 1 else 0)
     means = _compressed([each.mean for each in history], max(room, 1))
     low, high = f"{min(means):.0f}", f"{max(means):.0f}"
+    since = 0 if stage is None else stage.since
+    earlier = round(sum(each.number < since for each in history) / len(history) * len(means))  # bars
     if lines == 1:
-        return [Text.assemble((f"{caption} ", "dim"), f"{low} ", (bars(means, 1)[0], "green"), f" {high}")]
+        drawn = Text.assemble((f"{caption} ", "dim"), f"{low} ", *_in_colours(bars(means, 1)[0], earlier), f" {high}")
+        return [drawn]
     wide = max(1, room // len(means))
     rows = bars([mean for mean in means for _ in range(wide)], lines - 1)
     marks = [high] if len(rows) == 1 else [high, *[""] * (len(rows) - 2), low]
-    drawn = [Text.assemble((f"{mark:>{margin - 1}} ", "dim"), (row, "green"))
-             for mark, row in zip(marks, rows, strict=True)]  # fmt: skip
+    plot = [Text.assemble((f"{mark:>{margin - 1}} ", "dim"), *_in_colours(row, earlier * wide))
+            for mark, row in zip(marks, rows, strict=True)]  # fmt: skip
     each = "" if len(means) == len(history) else f", {round(len(history) / len(means))} to a bar"
-    return [Text(f"{caption}, {history[0].number} to {history[-1].number}{each}"[:width], style="dim"), *drawn]
+    begun = f", stage {stage.number} since {since}" if stage is not None and earlier else ""
+    return [Text(f"{caption}, {history[0].number} to {history[-1].number}{each}{begun}"[:width], style="dim"), *plot]
+
+
+def _in_colours(row: str, earlier: int) -> tuple[tuple[str, str], tuple[str, str]]:
+    return (row[:earlier], "dim green"), (row[earlier:], "green")
 
 
 def _compressed(values: Sequence[float], most: int) -> list[float]:

@@ -51,14 +51,15 @@ def _rows(run: RunFolder, controller: Controller, receipt: Receipt, settings: Ru
     yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
     yield "score", _score(run)
+    warm = "" if spec.temperature is None else f", temperature {spec.temperature:g}"
     generations = plural(receipt.generations, "generation")
     if settings.stages:  # each has a horizon, a population and more of its own
         begun = begun_stages(settings, run.history(), run.evaluations())
-        yield "task", f"{spec.task}, version {spec.version}"
+        yield "task", f"{spec.task}{warm}, version {spec.version}"
         yield "search", f"{settings.optimiser}, {settings.covariance}, {generations}"
         yield from stages_told(settings, begun).items()
     else:
-        yield "task", f"{spec.task}, {spec.horizon} steps, version {spec.version}"
+        yield "task", f"{spec.task}, {spec.horizon} steps{warm}, version {spec.version}"
         size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
         yield "search", f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
     yield "spent", receipt.total.told
@@ -90,7 +91,7 @@ def _commands(run: RunFolder) -> dict[str, str]:
         "one candidate's fitness again, to the bit, on any host of its class": (
             "replay", run.name, "--candidate", f"{last}/0", *beside,
         ),
-        "the whole run again, to the bit": ("repeat", controller, *beside),
+        "the whole run again, to the bit": ("repeat", run.name, *beside),
         "its score on unseen seeds": ("evaluate", "--controller", controller, "--episodes", "100"),
     }  # fmt: skip
     return {why: shlex.join(("dreamfleet", *each)) for why, each in words.items()}

@@ -48,6 +48,7 @@ class LearningCurve:
     world: str  # the task of the world that is driven in reality
     points: tuple[Point, ...]
     confirmed: Point | None
+    reported: Point | None  # the evaluation of the mean that was confirmed
     total: Effort  # so far, the start's included
 
     @classmethod
@@ -60,7 +61,9 @@ class LearningCurve:
                 "with --evaluate-every"
             )
         judged = None if confirmed is None else Point.of(total, confirmed)
-        return cls(run.name, _world(run), points, judged, total)
+        found = (point for point, each in zip(points, run.evaluations(), strict=True)
+                 if confirmed is not None and each.generation == confirmed.generation)  # fmt: skip
+        return cls(run.name, _world(run), points, judged, next(found, None), total)
 
 
 # Ha and Schmidhuber's public log of their CarRacing experiment: the evaluated mean on 1024 tracks. Steps are those of

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +11,16 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from dreamfleet.common.charts import COLOURS, draw_fitness
+from dreamfleet.common.effort import Effort, counted
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs import RunFolder
 from dreamfleet.common.saving import saving
-from dreamfleet.common.stages import Stage, begun_stages, in_turn
+from dreamfleet.common.stages import begun_stages, in_turn, steps_told
 from dreamfleet.common.tasks import DREAM
-from dreamfleet.coordinator.learning import LearningCurve, Mark, Point
+from dreamfleet.coordinator.learning import LearningCurve, Mark
 
 TITLE = 90  # characters of a line of it
 KINDS = (".png", ".svg")
@@ -33,21 +35,13 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
     handles = draw_fitness(axes, run)
     size = in_turn(f"{each.stage.population} candidates x {plural(each.stage.episodes, 'episode')}" for each in stages)
-    steps = in_turn(_steps(each.stage, dreamt=settings.task.task == DREAM) for each in stages)
+    dreamt = settings.task.task == DREAM
+    steps = in_turn(steps_told(each.stage.horizon, each.stage.driven, dreamt=dreamt) for each in stages)
     axes.set_ylabel(f"fitness over {steps}")
     title = f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}"
     axes.set_title("\n".join(textwrap.wrap(title, TITLE)), fontsize=11)
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     _save(figure, path)
-
-
-def _steps(stage: Stage, *, dreamt: bool) -> str:
-    """What a candidate's fitness is taken over, in words."""
-    if not dreamt:
-        return f"{stage.horizon} steps"
-    if stage.driven in (0, 1):
-        return f"{stage.horizon} {'driven' if stage.driven else 'dreamt'} steps"
-    return f"{stage.horizon} steps, {stage.driven:.0%} driven"
 
 
 def plot_learning(curves: Sequence[LearningCurve], marks: Sequence[Mark], path: Path) -> None:
@@ -58,36 +52,50 @@ def plot_learning(curves: Sequence[LearningCurve], marks: Sequence[Mark], path: 
     """
     figure, (over_steps, over_hours) = plt.subplots(1, 2, figsize=(11, 5.6), sharey=True, layout="constrained")
     for curve, colour in zip(curves, COLOURS * len(curves), strict=False):
-        _draw_curve(over_steps, curve, colour, [each.effort.steps for each in _all(curve)])
-        _draw_curve(over_hours, curve, colour, [each.effort.core_hours for each in _all(curve)])
+        _draw_curve(over_steps, curve, colour, lambda effort: effort.steps)
+        _draw_curve(over_hours, curve, colour, lambda effort: effort.core_hours)
     _draw_marks(over_steps, [(each.steps, each.score) for each in marks])
     _draw_marks(over_hours, [(each.core_hours, each.score) for each in marks if each.core_hours is not None])
     over_steps.set(xlabel="environment steps in reality, evaluations included", ylabel=_score_axis(curves))
     over_hours.set(xlabel="core-hours: time that slots worked on accepted results")
     for axes in (over_steps, over_hours):
-        axes.set_xscale("log")
+        _scale(axes)
         axes.margins(y=0.1)
         axes.grid(alpha=0.3, which="major")
     figure.legend(*over_steps.get_legend_handles_labels(), loc="outside lower center", fontsize=9, frameon=False)
     _save(figure, path)
 
 
-def _all(curve: LearningCurve) -> list[Point]:
-    return [*curve.points, *([curve.confirmed] if curve.confirmed else [])]
+def _scale(axes: Any) -> None:
+    """Logarithmic, with 20 and 50 beside 10 and 100 where there is room for them."""
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    named = FuncFormatter(lambda value, _: f"{value:g}" if value < 1000 else counted(round(value)))
+    axes.xaxis.set_major_formatter(named)
+    if high < 100 * low:
+        axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        axes.xaxis.set_minor_formatter(named)
+        axes.tick_params(axis="x", which="minor", length=mpl.rcParams["xtick.major.size"])
+    else:
+        axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Sequence[float]) -> None:
-    """Evaluations as a line, and apart from it, as a star, the confirmed score."""
-    count = len(curve.points)
+def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Callable[[Effort], float]) -> None:
+    """Evaluations as a line, and as a star the confirmed score, dotted to the evaluation of the same mean."""
+    points, last, reported = curve.points, curve.confirmed, curve.reported
     axes.errorbar(
-        spent[:count], [each.score for each in curve.points], [each.error for each in curve.points], fmt="o-",
-        color=colour, markersize=4, linewidth=1.2, capsize=2, label=f"{curve.name}: {curve.total.told}",
+        [spent(each.effort) for each in points], [each.score for each in points], [each.error for each in points],
+        fmt="o-", color=colour, markersize=4, linewidth=1.2, capsize=2, label=f"{curve.name}: {curve.total.told}",
     )  # fmt: skip
-    if curve.confirmed is not None:
-        axes.errorbar(
-            spent[count], curve.confirmed.score, curve.confirmed.error, fmt="*", color=colour, markersize=13, capsize=3,
-            markeredgecolor="black", label=f"{curve.name}, confirmed on fresh seeds: {curve.confirmed.score:.0f}",
-        )  # fmt: skip
+    if last is None:
+        return
+    if reported is not None:
+        ends = [spent(reported.effort), spent(last.effort)], [reported.score, last.score]
+        axes.plot(*ends, ":", color=colour, linewidth=1)
+    axes.errorbar(
+        spent(last.effort), last.score, last.error, fmt="*", color=colour, markersize=13, capsize=3,
+        markeredgecolor="black", label=f"{curve.name}, confirmed on fresh seeds: {last.score:.0f}",
+    )  # fmt: skip
 
 
 def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]]) -> None:

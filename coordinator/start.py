@@ -59,7 +59,8 @@ class Start:
         spec, shape = settings.task, settings.controller
         if self.bundle != spec.bundle:
             raise ControllerError(
-                f"{self.source} belongs to {_told(self.bundle)}, not to {_told(spec.bundle)}: give its own --bundle"
+                f"{self.source} belongs to {_told(self.bundle)}, not to {_told(spec.bundle)}: give its own --bundle, "
+                "or fit it to this one by `dreamfleet refit`"
             )
         self._check_options(spec)
         if len(self.mean) != shape.size:

@@ -87,10 +87,10 @@ def differences(outcomes: Sequence[Outcome]) -> Iterator[tuple[str, str, Differe
 
 
 def told(kind: str, first: str, figure: str, found: Difference) -> str:
-    """A difference in words: one under two standard errors is none."""
+    """A difference in words, and whether it is one."""
     digits = 1 if figure == SCORE else 3
     label = "score in reality" if figure == SCORE else figure.replace("_", " ")
-    verdict = "" if found.clear else ": none, for one under two standard errors is none"
+    verdict = "" if found.clear else f": none, for one under {found.under} is none"
     size = f"{found.mean:+.{digits}f} ± {found.error:.{digits}f} over {found.seeds} seeds"
     return f"{label}: {kind} less {first} {size}{verdict}"
 

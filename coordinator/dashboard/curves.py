@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from dreamfleet.common.effort import Effort, GenerationEffort
 from dreamfleet.common.printable import plural
-from dreamfleet.common.stages import begun_stages, in_turn
+from dreamfleet.common.stages import begun_stages, in_turn, steps_told
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.tasks import DREAM
 from dreamfleet.common.terms import Agenda
@@ -50,6 +50,7 @@ def curves(course: Course, quartiles: Quartiles | None, spent: Sequence[Effort] 
     dreamt = settings.task.task == DREAM
     finished = {each.generation: each for each in course.evaluations}
     stages = begun_stages(settings, course.history, course.evaluations)
+    steps = in_turn(steps_told(each.stage.horizon, each.stage.driven, dreamt=dreamt) for each in stages)
     drawn: dict[str, Any] = {
         "step": step_of(len(course.history)),
         "generation": [each.number for each in rows],
@@ -64,7 +65,7 @@ def curves(course: Course, quartiles: Quartiles | None, spent: Sequence[Effort] 
         "confirmed": None if course.confirmed is None else _confirmed(course.confirmed, course, spent),
         "stages": [each.since for each in stages[1:]],
         "dreamt": dreamt,
-        "fitness_axis": f"fitness over {in_turn(str(each.stage.horizon) for each in stages)} {'dreamt ' * dreamt}steps",
+        "fitness_axis": f"fitness over {steps}",
         "score_axis": f"score{' in reality' * dreamt}, {plural(settings.evaluation_episodes, 'whole episode')}",
     }
     if spent is not None:

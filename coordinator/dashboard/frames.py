@@ -11,8 +11,10 @@ from dreamfleet.common.effort import counted
 from dreamfleet.common.eta import Eta, duration, eta_of, sentence
 from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.processes import spoken
+from dreamfleet.common.stages import steps_told
 from dreamfleet.common.status import Population, Status, WorkerStatus
 from dreamfleet.common.stored import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.tasks import DREAM
 
 LIVE, LOST, OVER = "live", "lost", "over"
 NONE = "-"
@@ -86,8 +88,9 @@ def _task(status: Status) -> str:
     settings, stage = status.settings, status.generation.stage
     size = settings if stage is None else stage
     horizon = settings.task.horizon if stage is None else stage.horizon
+    steps = steps_told(horizon, size.driven, dreamt=settings.task.task == DREAM)
     candidates = f"{size.population} candidates x {plural(size.episodes, 'episode')}"
-    parts = [settings.task.task, candidates, f"{horizon:,} steps"]
+    parts = [settings.task.task, candidates, steps]
     if stage is not None:
         parts.append(f"stage {stage.number} of {stage.total}")
     return ", ".join(parts)

@@ -110,7 +110,10 @@ def test_a_difference_is_of_equal_seeds_and_what_tracks_have_in_common_falls_out
 def test_a_difference_under_two_standard_errors_is_none():
     found = Difference.between(scored(100, 500, 900).evaluated, scored(200, 400, 930).evaluated)
     assert not found.clear
-    assert found.told.endswith("none, for a difference under two standard errors is none")
+    assert found.told.endswith("none, for a difference under 4.4 standard errors of so few seeds is none")
+    assert Difference(30, 1.0, 0.6).told.endswith("none, for a difference under two standard errors is none")
+    bounds = [round(Difference(seeds, 0, 1).bound, 2) for seeds in (4, 8, 16)]
+    assert bounds == [3.28, 2.43, 2.18]  # t itself: 3.31, 2.43, 2.18
     assert Difference.between(*[JUDGEMENT.evaluated] * 2).told == "the same scores, to the bit, on 3 equal seeds"
     with pytest.raises(UsageError, match="1 seeds are in both"):
         Difference.between(scored(1, 2).evaluated, scored(1, 2, first=10_001).evaluated)

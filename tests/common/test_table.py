@@ -11,7 +11,7 @@ from rich.console import Console
 
 from dreamfleet.common.cells import bars, cell_lines
 from dreamfleet.common.roster import Roster, slowest_of
-from dreamfleet.common.status import Population, WorkerCount
+from dreamfleet.common.status import Population, StageStatus, WorkerCount
 from dreamfleet.common.table import Block, RunPanel, allot, picture
 from tests.support.samples import STATUS
 
@@ -200,3 +200,21 @@ def test_the_whole_run_is_in_the_curve_however_long_it_is(columns):
     assert lowest.startswith("▁")
     assert lowest.endswith("█")
     assert columns - 15 < len(lowest) < columns
+
+
+def test_a_driven_stage_of_a_dream_is_told_so_and_what_was_before_it_is_no_part_of_its_curve():
+    task = dataclasses.replace(STATUS.settings.task, task="dream")
+    history = tuple(dataclasses.replace(STATUS.recent[0], number=number) for number in range(7))
+    generation = dataclasses.replace(
+        STATUS.generation, temperature=1.5, stage=StageStatus(2, 2, 5, 1000, 100, 24, 4, racing=False, driven=1.0)
+    )
+    status = dataclasses.replace(
+        STATUS, settings=dataclasses.replace(STATUS.settings, task=task), recent=history, generation=generation
+    )
+    text = drawn(status, 100)
+    assert "dream, 1,000 driven steps" in text
+    assert "temperature" not in text
+    assert "0 to 6, stage 2 since 5" in text
+    mixed = dataclasses.replace(generation.stage, driven=0.5)
+    text = drawn(dataclasses.replace(status, generation=dataclasses.replace(generation, stage=mixed)), 100)
+    assert "dream, 1,000 steps, 50% driven, temperature 1.5" in text

@@ -96,7 +96,7 @@ def test_the_receipt_says_what_a_paper_cites(runs, capsys):
     text = capsys.readouterr().out
     with open_run(runs, "reality") as run:
         for part in (run.uid, run.spec.bundle, f"seed: {run.settings.seed};", "dreamfleet replay reality --candidate",
-                     "dreamfleet repeat ", "@misc{dreamfleet-reality,"):  # fmt: skip
+                     "dreamfleet repeat reality ", "@misc{dreamfleet-reality,"):  # fmt: skip
             assert part in text
     assert cli.main(["runs", "receipt", "reality", "--runs-dir", str(runs), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

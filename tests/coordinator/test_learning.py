@@ -14,7 +14,8 @@ from dreamfleet.coordinator.learning import PAPER, LearningCurve, Point
 from dreamfleet.coordinator.plot import PAPERS_NAME, plot_learning
 
 FIRST, LAST = Effort(10**5, 10**4, 0, 10**9), Effort(2 * 10**5, 9 * 10**4, 0, 3 * 10**9)
-CURVE = LearningCurve("night", "car-racing", (Point(FIRST, 310.0, 80.0),), Point(LAST, 680.0, 20.0), LAST)
+LOOK = Point(FIRST, 310.0, 80.0)
+CURVE = LearningCurve("night", "car-racing", (LOOK,), Point(LAST, 680.0, 20.0), LOOK, LAST)
 
 
 def sums(runs, name, until):

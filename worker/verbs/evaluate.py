@@ -50,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
     name, agent = _choose(args)
     seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
     if seeds[0] not in TEST or seeds[-1] not in TEST:
-        print(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; some of these are not", file=sys.stderr)
+        some = "some" if seeds[0] < TEST.stop and seeds[-1] >= TEST.start else "none"
+        print(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; {some} of these are among them", file=sys.stderr)
     judgement = judge(name, agent, seeds, args.jobs)
     print(judgement.to_json() if args.json else judgement.told, flush=True)
     if args.out:

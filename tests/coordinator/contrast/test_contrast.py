@@ -73,7 +73,7 @@ def test_kinds_are_told_apart_seed_by_seed():
     assert (nats.mean, nats.seeds, nats.clear) == (pytest.approx(-0.01), 2, True)
     assert (score.mean, score.clear) == (-15.0, False)
     assert told("attentive", "plain", "score", score).endswith(
-        "over 2 seeds: none, for one under two standard errors is none"
+        "over 2 seeds: none, for one under 10.4 standard errors of so few seeds is none"
     )
     (plain,) = [each for each in means(outcomes) if (each.kind, each.figure) == ("plain", "score")]
     assert plain.told == "600.0 ± 100.0"

@@ -63,7 +63,8 @@ def test_a_bundle_that_cannot_dream_is_recorded_with_two_pictures(controller, ra
     manifest = random_bundle.manifest
     parts = {name: random_bundle.read(name) for name in manifest.parts if name != DREAM}
     awake = write_bundle(tmp_path / "awake.zip", replace(manifest, parts={}), parts)
-    record(agent_of(controller, awake), SEED, 2, tmp_path / "drive.mp4")
+    own = replace(controller, bundle=awake.sha256)
+    record(agent_of(own, awake), SEED, 2, tmp_path / "drive.mp4")
     with av.open(str(tmp_path / "drive.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.width, stream.height) == AWAKE.size
