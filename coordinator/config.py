@@ -316,8 +316,8 @@ def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape) 
     if subspace.bundle != spec.bundle:
         own = f"world model {spec.bundle[:12]}" if spec.bundle else "a task without a world model"
         raise UsageError(
-            f"--subspace is of world model {subspace.bundle[:12]}, and the run is on {own}: give its own --bundle, or "
-            f"--subspace {NO_SUBSPACE}"
+            f"--subspace (given, or the preset's) is of world model {subspace.bundle[:12]}, and the run is on {own}: "
+            f"give its own --bundle, or --subspace {NO_SUBSPACE}"
         )
     if (inputs := subspace.weights.shape[1]) != shape.features:
         raise UsageError(

@@ -63,6 +63,15 @@ class Repetition:
         return LimitsConfig(generations=self.receipt.generations)
 
     @property
+    def doubt(self) -> str:
+        """Why it is known beforehand that the bits may be others; empty: nothing speaks against equal ones."""
+        if self.receipt.mixed or (self.receipt.classes is not None and self.receipt.classes.mixed):
+            return "the first run took hosts of several classes: expect another controller"
+        if self.receipt.fingerprint is None:
+            return "the receipt names no hosts of the first run: whether the bits will be equal is not known"
+        return ""
+
+    @property
     def start(self) -> Start | None:
         """Where the run began, whole."""
         kept, spec = self.receipt.start, self.settings.task

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from dreamfleet.common.config import add_flags
@@ -37,6 +38,8 @@ def run(args: argparse.Namespace) -> int:
     again.check_optimiser(args.optimiser)
     folder = args.runs_dir / check_run_name(args.run_name or f"{Path(args.controller).stem}-again")
     config, kept = again.plan(folder)
+    if again.doubt:
+        print(f"note: {again.doubt}", file=sys.stderr)
     request = request_of(args, folder.name, config, again.limits, kept, again.start if config else None)
 
     def judge() -> Outcome:

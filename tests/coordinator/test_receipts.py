@@ -106,6 +106,7 @@ def test_what_ships_can_be_begun_again_as_it_was(tmp_path):
     config, kept = again.plan(tmp_path / "tiny-again")
     assert config.settings(bundle) == settings_in(controller)
     assert (again.limits, again.start, kept) == (LimitsConfig(generations=25), None, {})
+    assert "is not known" in again.doubt  # it is from before receipts
 
 
 def test_another_run_is_not_gone_on_with_and_another_version_is_named(tmp_path, random_bundle):
