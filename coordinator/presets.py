@@ -7,6 +7,27 @@ from typing import Any
 from dreamfleet.common.presets import check_preset
 from dreamfleet.common.stored import StageSettings
 
+# A few generations in the dream, then reality, in the features that ship; docs/results.md says what each is for.
+REAL: dict[str, Any] = {
+    "task": "dream",
+    "bundle": "tiny",
+    "subspace": "tiny",
+    "population": 64,
+    "episodes": 16,
+    "sigma0": 0.3,
+    "covariance": "full",
+    "horizon": 400,
+    "temperature": 1.5,
+    "evaluate_every": 5,
+    "evaluation_episodes": 32,
+    "confirm_episodes": 64,
+    "stages": (
+        StageSettings(generations=5),
+        StageSettings(steps=1_800_000, driven=1.0, horizon=1000, patience=100, population=24, episodes=4, sigma0=0.06),
+        StageSettings(steps=5_000_000, episodes=8),
+        StageSettings(episodes=16),
+    ),
+}
 # The paper's own settings, the article's, and what two cores do in minutes.
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"population": 64, "episodes": 16, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 1024},
@@ -24,27 +45,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         "confirm_episodes": 32,
     },
     "frugal": {"population": 32, "episodes": 2, "sigma0": 0.1, "covariance": "diagonal", "patience": 100},
-    # A few generations in the dream, then reality, in the features that ship; docs/results.md says what each is for.
-    "real": {
-        "task": "dream",
-        "bundle": "tiny",
-        "subspace": "tiny",
-        "population": 64,
-        "episodes": 16,
-        "sigma0": 0.3,
-        "covariance": "full",
-        "horizon": 400,
-        "temperature": 1.5,
-        "evaluate_every": 5,
-        "evaluation_episodes": 32,
-        "confirm_episodes": 64,
+    "real": REAL,
+    # Each candidate drives one track and dreams another: docs/dreams.md, "Some of reality in it".
+    "mixed": {
+        **REAL,
         "stages": (
             StageSettings(generations=5),
-            StageSettings(
-                steps=1_800_000, driven=1.0, horizon=1000, patience=100, population=24, episodes=4, sigma0=0.06
-            ),
-            StageSettings(steps=5_000_000, episodes=8),
-            StageSettings(episodes=16),
+            StageSettings(driven=0.5, horizon=1000, patience=100, population=24, episodes=2, sigma0=0.15),
         ),
     },
 }

@@ -28,7 +28,7 @@ def complains(processes, *arguments, says):
     ("arguments", "says"),
     [
         (("--run", "No Good"), "cannot name a run"),
-        (("--preset", "huge"), "unknown run preset 'huge': choose one of article, dream, frugal, paper, real"),
+        (("--preset", "huge"), "unknown run preset 'huge': choose one of article, dream, frugal, mixed, paper, real"),
         (("--bundle", "absent"), "no bundle 'absent'"),
         (("--population", "1"), "--population must be at least 2"),
         (("--sigma0", "nan"), "--sigma0 must be a positive number"),
