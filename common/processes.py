@@ -116,6 +116,14 @@ class Child:
             times -= text in line
         return line or ""
 
+    def heard(self) -> list[str]:
+        """Lines that were said on stderr and that nobody has waited for or taken yet."""
+        lines: list[str] = []
+        with suppress(queue.Empty):
+            while (line := self._heard.get_nowait()) is not None:
+                lines.append(line)
+        return lines
+
     def finish(self, timeout: float | None = None) -> tuple[int, str]:
         """Wait for the end: exit code and stdout."""
         code = self.popen.wait(timeout)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
@@ -21,6 +22,7 @@ from rich.progress import (
 from rich.table import Column, Table
 
 WIDEST = 10_000  # columns: where nothing is cut any more
+EVERY = 60.0  # seconds between two lines of a bar that is drawn nowhere, such as into a log
 BAR, LEAST_BAR = 40, 8  # columns that a bar has where there is room, and before others are left out for it
 
 
@@ -30,10 +32,16 @@ class Bar:
     def __init__(self, progress: Progress, description: str, total: int) -> None:
         self._progress = progress
         self._task = progress.add_task(description, total=total, note="")
+        self._told = time.monotonic()
 
     def move(self, done: int, note: str = "") -> None:
-        """So many are done; `note` stands behind the bar."""
+        """So many are done; `note` stands behind the bar. Where no bar moves, its line is said once a minute."""
         self._progress.update(self._task, completed=done, note=note)
+        console = self._progress.console
+        drawn = console.is_terminal and not console.is_dumb_terminal
+        if not drawn and time.monotonic() - self._told >= EVERY:
+            self._told = time.monotonic()
+            console.print(self._progress.get_renderable())
 
 
 class Fitted(Progress):

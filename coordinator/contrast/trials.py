@@ -19,8 +19,8 @@ from dreamfleet.coordinator.contrast.summary import Outcome
 from dreamfleet.coordinator.iteration.evolving import Crew, evolve
 from dreamfleet.coordinator.iteration.process import ask
 
-SHARED = ("episodes", "encoded", "vae.safetensors")  # of the data set; its preset too, where it has one
-PRESET = "preset.json"
+# Of the data set. Not its preset: a kind is what its flags make of the preset tiny, whoever drove.
+SHARED = ("episodes", "encoded", "vae.safetensors")
 SETTINGS = "contrast.json"
 LOCK = "contrast.lock"
 MOST_BYTES = 1 << 20
@@ -84,7 +84,7 @@ class Trials:
         """A data folder of its own for the verbs that train; it leads to the one data set."""
         folder = self._of(trial)
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (*SHARED, PRESET):
+        for name in SHARED:
             source = (self._data / name).resolve()
             if source.exists() and not is_there(folder / name):
                 (folder / name).symlink_to(source, target_is_directory=is_folder(source))

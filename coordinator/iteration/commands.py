@@ -15,6 +15,7 @@ from dreamfleet.coordinator.iteration.plan import EVOLVE, GATE, MDNRNN, VAE, Pha
 Words = tuple[str, ...]
 GATE_SEED = VALIDATION.start + 30_000  # the first track of a gate: no evaluation and no confirmation has it
 GATE_NOISE = 0.3  # the measurements of docs/dreams.md
+LATER_UPDATES = {VAE: 1800, MDNRNN: 600}  # of a round that goes on with a model, if nobody says otherwise
 
 
 @dataclass(frozen=True)
@@ -57,14 +58,16 @@ class Commands:
         config, seed = self.config, self.seed(Phase(number, model))
         common = _spelt(
             "train", model, "--data", self.layout.round(number), "--preset", config.preset, "--device", config.device,
-            "--seed", seed, *words(f"{model}_flags", getattr(config, f"{model}_flags")), "--json",
+            "--seed", seed, "--json",
         )  # fmt: skip
+        flags = words(f"{model}_flags", getattr(config, f"{model}_flags"))
         if config.is_anew(number):
-            return common
+            return (*common, *flags)
         before = self.layout.checkpoint(self.ledger.kept(number - 1), model)
-        updates = getattr(config, f"{model}_updates")
+        said = getattr(config, f"{model}_updates")  # of a flag that is said twice the latter counts
+        updates = ("--updates", LATER_UPDATES[model], *flags) if said is None else (*flags, "--updates", said)
         kept = ("--decoder-only",) if model == "vae" and config.vae == "decoder" else ()
-        return (*common, *_spelt("--updates", updates, "--continue-from", before, *kept))
+        return (*common, *_spelt(*updates, "--continue-from", before, *kept))
 
     def tried(self, model: str) -> Words:
         """The same without training anything: whether its flags are of the verb, and of the model to go on with."""

@@ -42,8 +42,12 @@ class IterateConfig:
     spells: float = option(0.0, "chance of each of their steps that an action which rests, as a brake, is tried")
     drive_steps: int | None = option(None, "steps of a drive at most (default the preset's)")
     vae: Literal["decoder", "whole", "keep"] = option("decoder", "what of the VAE learns on in later rounds")
-    vae_updates: int = option(1800, "updates of the VAE in each later round")
-    mdnrnn_updates: int = option(600, "updates of the MDN-RNN in each later round")
+    vae_updates: int | None = option(
+        None, "updates of the VAE in each later round (default what --vae-flags say, else 1800)"
+    )
+    mdnrnn_updates: int | None = option(
+        None, "updates of the MDN-RNN in each later round (default what --mdnrnn-flags say, else 600)"
+    )
     vae_flags: str = option("", 'flags of `train vae` in every round, as one text: "--updates 900 --batch 50"')
     mdnrnn_flags: str = option("", "flags of `train mdnrnn` in every round")
     run_flags: str = option(

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,19 +59,24 @@ class Iteration:
             if getattr(self._config, f"{model}_flags"):
                 self._try(commands.tried(model), model)
 
-    def go_on(self, before: Callable[[Phase], None], after: Callable[[Entry], None]) -> None:
-        """Do what is left; `before` hears of each phase as it begins, `after` when it is in the ledger."""
+    def go_on(
+        self, before: Callable[[Phase], None], after: Callable[[Entry], None], hear: Callable[[str], None]
+    ) -> None:
+        """Do what is left; `before` hears of each phase as it begins, `after` when it is in the ledger.
+
+        `hear` is told each line of what a phase's verbs say of how far they are.
+        """
         while (phase := self._plan.next(self.ledger.finished)) is not None:
             before(phase)
-            entry = self._do(phase)
+            entry = self._do(phase, hear)
             self.ledger = self.ledger.add(entry)
             self.ledger.save(self._layout.ledger)
             after(entry)
 
-    def _do(self, phase: Phase) -> Entry:
+    def _do(self, phase: Phase, hear: Callable[[str], None]) -> Entry:
         commands, begun = Commands(self._config, self._layout, self.ledger), time.monotonic()
         with self._told(phase):
-            done = Phases(commands, self._crew, self._ask, self._stop).do(phase)
+            done = Phases(commands, self._crew, partial(self._ask, hear), self._stop).do(phase)
             made = artefacts.made(self._layout, done.made)
         seconds, at = round(time.monotonic() - begun, 1), datetime.now(UTC).isoformat(timespec="seconds")
         seed = commands.seed(phase)
@@ -88,9 +94,9 @@ class Iteration:
         except DreamfleetError as error:
             raise type(error)(f"{phase}: {error}") from error
 
-    def _ask(self, words: Words, path: Path) -> Any:
+    def _ask(self, hear: Callable[[str], None], words: Words, path: Path) -> Any:
         log.debug("dreamfleet %s", " ".join(words))
-        return ask(words, path, self._stop)
+        return ask(words, path, self._stop, hear)
 
     def _try(self, words: Words, model: str) -> None:
         try:

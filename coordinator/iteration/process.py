@@ -28,23 +28,32 @@ def wait(child: Child, stop: Stop, look: Callable[[], None] = lambda: None) -> N
             continue
 
 
-def ask(words: Sequence[str], log: Path, stop: Stop) -> Any:
+def ask(words: Sequence[str], log: Path, stop: Stop, hear: Callable[[str], None] = lambda _line: None) -> Any:
     """What a verb answers as JSON; the rest is as in `run`."""
-    return json.loads(run(words, log, stop).splitlines()[-1])
+    return json.loads(run(words, log, stop, hear).splitlines()[-1])
 
 
-def run(words: Sequence[str], log: Path, stop: Stop) -> str:
-    """What a verb answers; what it says besides goes to `log`.
+def run(words: Sequence[str], log: Path, stop: Stop, hear: Callable[[str], None] = lambda _line: None) -> str:
+    """What a verb answers; what it says besides goes to `log` as it says it, and to `hear`.
 
     A wrong command is a `UsageError`, any other failure a `DreamfleetError`, with its last words.
     """
-    child = Child(*words, inside=leash())
-    try:
-        wait(child, stop)
-        code, out = child.finish()
-    finally:
-        child.end(LEAVE)
-        _keep(log, child.lines)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("w") as kept:
+
+        def listen() -> None:
+            for line in child.heard():
+                kept.write(line)
+                kept.flush()
+                hear(line.strip())
+
+        child = Child(*words, inside=leash())
+        try:
+            wait(child, stop, listen)
+            code, out = child.finish()
+        finally:
+            child.end(LEAVE)
+            listen()
     if code == 0:
         return out
     if code == StoppedError.exit_code:
@@ -52,8 +61,3 @@ def run(words: Sequence[str], log: Path, stop: Stop) -> str:
     if code == UsageError.exit_code:
         raise UsageError(child.last_words())
     raise DreamfleetError(f"{child.last_words()} ({words[0]} left with {code}; its words are in {log})")
-
-
-def _keep(log: Path, lines: Sequence[str]) -> None:
-    log.parent.mkdir(parents=True, exist_ok=True)
-    log.write_text("".join(lines))

@@ -62,7 +62,7 @@ def rows(told: list[dict[str, Any]]) -> list[dict[str, object]]:
             "round": each["round"], "drives": each["drives"], "frames": each["frames"],
             "nats": each["quality"].get("nats_per_dimension"), "reward AUC": each["quality"].get("reward_auc"),
             KNOWS: _figure(each["gate"], KNOWS), LOSES: _figure(each["gate"], LOSES),
-            "model": _kept(each["gate"]), "score": each["score"] and score(each["score"]),
+            "model": _kept(each), "score": each["score"] and score(each["score"]),
         }
         for each in told
     ]  # fmt: skip
@@ -101,8 +101,11 @@ def _figure(gate: Mapping[str, Any] | None, name: str) -> str | None:
     return f"{found['value']:.2f} ± {found['error']:.2f}" if found else None
 
 
-def _kept(gate: Mapping[str, Any] | None) -> str:
-    return "kept" if gate is None or gate["kept"] else "refused"
+def _kept(told: Mapping[str, Any]) -> str | None:
+    """What became of a round's model; `None` while there is none, or none that was held to the last one yet."""
+    if told["gate"] is not None:
+        return "kept" if told["gate"]["kept"] else "refused"
+    return "kept" if told["evolved_in"] == told["round"] else None
 
 
 def _seconds(seconds: float) -> str:

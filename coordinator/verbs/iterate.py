@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     layout = Layout(args.data)
     with held(layout.lock, "iteration"), heeding_signals() as stop:
         iteration = _open(args, layout, stop)
-        _go_on(iteration)
+        _go_on(iteration, layout)
     _tell(args, layout, iteration.ledger)
     return 0
 
@@ -150,8 +150,9 @@ def _insecure(args: argparse.Namespace) -> bool:
     return load(NetworkConfig, "network", **args.sources).insecure
 
 
-def _go_on(iteration: Iteration) -> None:
+def _go_on(iteration: Iteration, layout: Layout) -> None:
     from rich.console import Console
+    from rich.markup import escape
 
     from dreamfleet.coordinator.iteration.ledger import Entry
     from dreamfleet.coordinator.iteration.plan import Phase
@@ -161,21 +162,29 @@ def _go_on(iteration: Iteration) -> None:
     if finished := iteration.ledger.finished:
         console.print(f"{len(finished)} phases are finished, the last is {finished[-1]}", markup=False)
     with console.status("") as shown:
+        doing = ""
 
         def before(phase: Phase) -> None:
-            shown.update(f"round {phase.round}: {phase.name}")
+            nonlocal doing
+            doing = f"round {phase.round}: {phase.name}"
+            shown.update(escape(f"{doing}; {layout.round(phase.round) / 'logs'} tells how far"))
+
+        def hear(line: str) -> None:
+            shown.update(escape(f"{doing}  {line}"))
 
         def after(entry: Entry) -> None:
             console.print(line(entry), markup=False, soft_wrap=True)
 
-        iteration.go_on(before, after)
+        iteration.go_on(before, after, hear)
 
 
 def _tell(args: argparse.Namespace, layout: Layout, ledger: Ledger) -> None:
     from dreamfleet.coordinator.iteration import summary
 
     told = summary.rounds(layout, ledger)
-    best, model = summary.best(told), str(layout.bundle(ledger.kept(told[-1]["round"])))
+    # Behind the last finished round one may be in its midst, with a model that no gate has judged yet.
+    counts = next(each["evolved_in"] for each in reversed(told) if each["evolved_in"] is not None)
+    best, model = summary.best(told), str(layout.bundle(counts))
     if args.json:
         answer(args, "", data=layout.root, rounds=told, best=best and best["round"], model=model)
         return

@@ -26,6 +26,17 @@ def test_what_matters_least_is_left_out_and_nothing_is_cut(width, kept, left_out
     assert not any(part in line for part in left_out)
 
 
+def test_where_no_bar_moves_a_line_is_said_now_and_then(monkeypatch):
+    console = Console(file=io.StringIO(), width=120)
+    with fitted("updates", console) as progress:
+        bar = Bar(progress, "VAE", 1800)
+        bar.move(1)
+        assert not console.file.getvalue()
+        monkeypatch.setattr("dreamfleet.common.progress.EVERY", 0.0)
+        bar.move(138)
+        assert "138/1800" in console.file.getvalue()
+
+
 @pytest.mark.parametrize(("level", "drawn"), [("INFO", True), ("WARNING", False)])
 def test_a_verb_that_is_to_be_quiet_draws_none(capsys, monkeypatch, level, drawn):
     log = logging.getLogger("dreamfleet")

@@ -29,6 +29,7 @@ SMALL = (
 def data(tmp_path):
     folder = tmp_path / "data"
     write_drives(folder)
+    (folder / "preset.json").write_text('{"preset": "attentive"}')
     layers = VAEConfig(latent=4, channels=(2, 2, 2, 2))
     train_vae(folder, replace(TINY.vae, updates=2, batch=8, validate_every=1), lambda *_: None, layers)
     for _ in encode(folder):

@@ -27,7 +27,7 @@ def test_the_first_round_takes_the_presets_amounts():
     first = commands(vae_flags="--batch 50")
     assert said(first.collect(1)) == "collect --data data --preset tiny --seed 0 --json"
     assert said(first.train(1, "vae")) == (
-        "train vae --data data/rounds/01 --preset tiny --device cpu --seed 0 --batch 50 --json"
+        "train vae --data data/rounds/01 --preset tiny --device cpu --seed 0 --json --batch 50"
     )
     assert said(first.tried("vae")) == said(first.train(1, "vae")) + " --summary"
 
@@ -58,11 +58,19 @@ def test_later_training_goes_on_from_the_model_that_counts(vae, decoder_only):
     assert "--decoder-only" not in later.train(3, "mdnrnn")
 
 
+def test_updates_among_the_flags_of_every_round_count_in_later_rounds_too():
+    told = commands(*ROUND_2, vae_flags="--updates 20", mdnrnn_flags="--updates 10", mdnrnn_updates=5)
+    assert said(told.train(1, "vae")).endswith("--updates 20")
+    assert "--updates 20 --continue-from" in said(told.train(2, "vae"))
+    assert said(told.train(1, "mdnrnn")).endswith("--updates 10")
+    assert "--updates 5 --continue-from" in said(told.train(2, "mdnrnn")), "what is said of later rounds alone"
+
+
 def test_with_init_the_first_round_goes_on_as_later_ones_do():
     told = commands(entry(0, "init", sha256="ab", controller="tiny"), init="tiny", vae="keep", mdnrnn_flags="--done")
     assert said(told.unbundle()) == "unbundle data/rounds/00/bundle.zip --data data/rounds/00 --json"
     train = said(told.train(1, "mdnrnn"))
-    assert "--seed 0 --done --json --updates 600 --continue-from data/rounds/00/mdnrnn.safetensors" in train
+    assert "--seed 0 --json --updates 600 --done --continue-from data/rounds/00/mdnrnn.safetensors" in train
     vae, mdnrnn = (said(words) for words in told.tried_on())
     assert mdnrnn == f"{train} --summary"
     assert "--continue-from data/rounds/00/vae.safetensors --summary" in vae, "one that stays sees the drives too"

@@ -48,6 +48,11 @@ def test_a_score_of_one_track_has_no_standard_error():
     assert summary.score(single) == "-80 on 1 track, provisional"
 
 
+def test_a_round_in_its_midst_has_no_model_that_was_kept():
+    for begun in (SECOND[:1], SECOND[:2]):
+        assert summary.rows(rounds(*FIRST, *begun))[-1]["model"] is None
+
+
 def test_rounds_without_a_score_have_no_best_one():
     assert summary.best(rounds(*FIRST[:2])) is None
 
