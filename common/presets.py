@@ -31,4 +31,6 @@ def check_preset(kind: Kind, name: str) -> str:
 
 def preset_help(kind: Kind) -> str:
     """What `--help` says of the presets of one kind."""
-    return f"{kind} preset to begin with: {', '.join(NAMES[kind])}"
+    told = f"{kind} preset to begin with: {', '.join(NAMES[kind])}"
+    kept = "; a data set keeps the one that it was begun with, and each verb must name it unless it is tiny"
+    return f"{told} (default tiny{kept})" if kind == "training" else told

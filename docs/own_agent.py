@@ -147,7 +147,10 @@ def main() -> None:
     }
     for name, choose in agents.items():
         scores = np.array([judge(tracks, choose, seed) for seed in validation_seeds(args.episodes)])
-        error = scores.std(ddof=1) / np.sqrt(len(scores)) if len(scores) > 1 else np.nan
+        if len(scores) == 1:
+            print(f"{name}: {scores[0]:.1f} on one real track", flush=True)
+            continue
+        error = scores.std(ddof=1) / np.sqrt(len(scores))
         told = f"{scores.mean():.1f} ± {error:.1f} on {len(scores)} real tracks"
         print(f"{name}: {told} ({scores.min():.0f} to {scores.max():.0f})", flush=True)
     tracks.close()

@@ -8,7 +8,7 @@ from typing import Literal
 
 from dreamfleet.common.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.presets import check_preset, preset_help
+from dreamfleet.common.presets import NAMES, check_preset
 
 # They change no round that is finished, nor what it means; what `--run-flags` lead to is compared instead of them.
 HARMLESS = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
@@ -31,7 +31,7 @@ class IterateConfig:
         "", "controller to go on from, and with it its world model: a file, or one that ships (default none)"
     )
     rounds: int = option(5, "rounds in all: each makes a world model and evolves in its dream; more may follow later")
-    preset: str = option("tiny", preset_help("training"))
+    preset: str = option("tiny", f"training preset to begin with: {', '.join(NAMES['training'])}")
     drives: int | None = option(
         None, "random drives that the first round learns from (default the preset's, 620 of tiny)"
     )

@@ -39,12 +39,13 @@ DRIVEN = ("episodes", "frames", "held_out_episodes")  # of a bundle's provenance
 class Subject:
     """What is looked at: a bundle; of a run, its controller too. A run without a world model shows how it went.
 
-    With neither, trainings alone are looked at.
+    With neither, trainings alone are looked at. `own` is the controller's world model, where that is another.
     """
 
     bundle: Bundle | None
     controller: Controller | None = None
     run: RunFolder | None = None
+    own: Bundle | None = None
 
 
 @contextmanager
@@ -120,7 +121,7 @@ def sections_of(
     if pictures:
         yield own_pictures(_eyes(subject, data), pictures)
     if subject.bundle is not None:
-        yield from _looks(subject.bundle, subject.controller, config)
+        yield from _looks(subject.bundle, subject, config)
     else:
         yield from _vaes(data, config)
     yield from _fitness(subject)
@@ -155,8 +156,8 @@ def _vaes(data: Sequence[Path], config: DriveConfig) -> Iterator[Section]:
         yield from _latents(driven, eyes)
 
 
-def _looks(bundle: Bundle, controller: Controller | None, config: DriveConfig) -> Iterator[Section]:
-    driven, eyes = drive(bundle, controller, config), Eyes.of_bundle(bundle)
+def _looks(bundle: Bundle, subject: Subject, config: DriveConfig) -> Iterator[Section]:
+    driven, eyes = drive(bundle, subject.controller, config, subject.own), Eyes.of_bundle(bundle)
     yield vision.reconstructions(driven, eyes)
     yield from _latents(driven, eyes)
     yield from _dreams(bundle, driven, eyes)

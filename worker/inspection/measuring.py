@@ -81,7 +81,10 @@ def _dreamer(bundle: Bundle, driving: Driving) -> Controller:
     """Who drives in dreams too."""
     controller = driving.controller
     if controller is None or controller.bundle != bundle.sha256:
-        raise UsageError("these dreams need a --controller that was evolved with this world model: it drives them")
+        raise UsageError(
+            "these dreams need a --controller that was evolved with this world model: it drives them; "
+            "`dreamfleet refit CONTROLLER --to BUNDLE --data FOLDER` fits another one to it"
+        )
     return controller
 
 

@@ -11,6 +11,7 @@ from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.scoring.episode import Course, play
+from dreamfleet.worker.scoring.hand import check_sees
 from dreamfleet.worker.tasks.api import Assignment, Collected, Policy
 from dreamfleet.worker.tasks.policy import Driven
 from dreamfleet.worker.tasks.registry import find_task
@@ -67,10 +68,17 @@ class EncodedRollout:
         return told
 
 
-def drive(bundle: Bundle, controller: Controller | None, config: DriveConfig) -> EncodedRollout:
-    """Drive one episode: the controller, or without one the world's second random driver, which drifts."""
-    assignment = Assignment.of(bundle.manifest.task, bundle)
-    task, driver = find_task(bundle.manifest.task), "the run's controller"
+def drive(
+    bundle: Bundle, controller: Controller | None, config: DriveConfig, own: Bundle | None = None
+) -> EncodedRollout:
+    """Drive one episode: the controller, or without one the world's second random driver, which drifts.
+
+    `own` is the controller's world model, where that is another than the bundle which sees the drive.
+    """
+    if own is not None:
+        check_sees(own, bundle)
+    assignment = Assignment.of(bundle.manifest.task, own or bundle)
+    task, driver = find_task(bundle.manifest.task), "the controller"
     policy: Policy = task.make_policy(assignment)
     if controller is not None:
         policy.begin(controller.parameters)

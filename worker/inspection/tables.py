@@ -8,10 +8,16 @@ from typing import Any
 
 from dreamfleet.worker.inspection.knowledge import Knowledge
 from dreamfleet.worker.inspection.likeness import Alike
-from dreamfleet.worker.inspection.losses import Compared
+from dreamfleet.worker.inspection.losses import CALM, Compared
 
+BEGUN = {"0 steps before": "at the loss", CALM: "where nothing is lost"}  # where another word says it better
 HELD = {"z": "z", "zh": "[z, h]"}
-WHERE = {"reality": "reality", "foreseen": "reality, foreseen", "dream": "dream", "same_actions": "dream, same actions"}
+WHERE = {
+    "reality": "reality",
+    "foreseen": "reality, foreseen",
+    "dream": "dream",
+    "same_actions": "dream, reality's actions",
+}
 WHAT = {"lost": "road lost", "off_at_end": "off at the end", "offset_at_end": "offset at the end", "reward": "reward"}
 
 
@@ -26,13 +32,16 @@ def knowledge_rows(knowledge: Knowledge) -> list[dict[str, str]]:
 
 def knowledge_text(knowledge: Knowledge) -> str:
     """What the rows are of."""
-    return f"R² ± standard error on held-out drives; {knowledge.drives} drives, {knowledge.steps} steps on the road"
+    return (
+        f"R² ± standard error on held-out drives; {knowledge.drives} drives, {knowledge.steps} steps on the road; "
+        "deviations in the world's own units, of CarRacing metres, radians and seconds"
+    )
 
 
 def loss_rows(compared: Sequence[Compared]) -> list[dict[str, object]]:
     """A row a kind of beginning and figure: of reality, and of the dreams."""
     return [
-        {"begun": each.begun, "n": each.count, "mean": WHAT[figure]}
+        {"begun": BEGUN.get(each.begun, each.begun), "n": each.count, "mean": WHAT[figure]}
         | {WHERE[where]: str(estimate) for where, estimate in told.items()}
         for each in compared
         for figure, told in each.figures.items()

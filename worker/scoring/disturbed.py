@@ -35,7 +35,7 @@ class Disturbed:
         """The disturbed action `(actions,)`."""
         for each in self._minds:
             each.see(observation)
-        push, chosen = self._disturbance.next(), self._hand.choose()
+        push, chosen = self._disturbance.next(), self._hand.choose(observation)
         action = self._disturbance.apply(chosen, push)
         action = self._spells.apply(chosen, action) if self._spells else action
         self.note(action, push)

@@ -12,6 +12,7 @@ from dreamfleet.common.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError
 
 Floats = NDArray[np.float32]
+ALL = "random"  # among names of drivers: each of a world's in turn
 
 
 class FlatPolicy:

@@ -22,8 +22,8 @@ from dreamfleet.worker.scoring.episode import Course, play
 from dreamfleet.worker.scoring.rollout import Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER
 from dreamfleet.worker.tasks.api import Policy
-from dreamfleet.worker.tasks.policy import Driven
-from dreamfleet.worker.training.collect_config import ALL, CollectConfig
+from dreamfleet.worker.tasks.policy import ALL, Driven
+from dreamfleet.worker.training.collect_config import CollectConfig
 from dreamfleet.worker.training.dataset import check_pictures
 from dreamfleet.worker.training.pilot import Pilot
 from dreamfleet.worker.training.room import told_where_full

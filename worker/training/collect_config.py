@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from dreamfleet.common.config import option
 from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.tasks.policy import ALL
 
-ALL = "random"  # each of the world's drivers in turn
 LOUDEST = 10.0  # noise, in halves of an action's range
 
 

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import argparse
 import types
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from dreamfleet.common.listing import add_json
 from dreamfleet.common.presets import preset_help
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import PRESETS
 
 T = TypeVar("T")
 FIXED = ("actions",)  # what the task says
 
 
-def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> None:
-    """The flags of a `train` verb whose model is configured by `layers`."""
+def add_training_flags(parser: argparse.ArgumentParser, model: Literal["vae", "mdnrnn"]) -> None:
+    """The flags of a `train` verb of that model."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--preset", help=f"{preset_help('training')}; the data set's own (default tiny)")
+    parser.add_argument("--preset", help=preset_help("training"))
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--continue-from", type=Path, metavar="FILE", help="begin from this checkpoint's weights")
     parser.add_argument(
@@ -35,18 +36,34 @@ def add_training_flags(parser: argparse.ArgumentParser, layers: type[Any]) -> No
         "--tensorboard", type=Path, metavar="FOLDER", help="write the losses as TensorBoard's events there too"
     )
     add_json(parser)
-    add_config_flags(parser, "training", TrainConfig)
-    add_config_flags(parser, "layers", layers)
+    add_config_flags(parser, "training", {name: getattr(each, model) for name, each in PRESETS.items()})
+    add_config_flags(parser, "layers", {name: getattr(each, f"{model}_layers") for name, each in PRESETS.items()})
 
 
-def add_config_flags(parser: argparse.ArgumentParser, title: str, config: type[Any]) -> None:
-    """A flag a field of `config`; one that is not given leaves no trace."""
+def add_config_flags(parser: argparse.ArgumentParser, title: str, presets: Mapping[str, Any]) -> None:
+    """A flag a field of the presets' configuration; one that is not given leaves no trace.
+
+    Help tells each preset's value: that of the first one, which counts where none is named, and where others differ.
+    """
+    config = type(next(iter(presets.values())))
     group, hints = parser.add_argument_group(f"{title}, instead of the preset's"), get_type_hints(config)
     for each in fields(config):
         if each.name not in FIXED:
             flag, text = "--" + each.name.replace("_", "-"), each.metadata.get("help")
-            text = text and f"{text} (default the preset's)"
+            told = _told({name: getattr(preset, each.name) for name, preset in presets.items()})
+            text = text and f"{text} (default {told})"
             group.add_argument(flag, default=argparse.SUPPRESS, help=text, **_options(hints[each.name]))
+
+
+def _told(values: Mapping[str, Any]) -> str:
+    """The presets' values of one field: `1500; notebook 30000; article, paper 60000`."""
+    names: dict[str, list[str]] = {}
+    for name, value in values.items():
+        plain = ("on" if value else "off") if isinstance(value, bool) else value
+        said = " ".join(map(str, plain)) if isinstance(plain, tuple) else str(plain)
+        names.setdefault(said, []).append(name)
+    (first, _), *others = names.items()
+    return "; ".join((first, *(f"{', '.join(each)} {said}" for said, each in others)))
 
 
 def changed(config: T, args: argparse.Namespace) -> T:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.training.presets import Preset
+from dreamfleet.worker.training.train_config import TrainConfig
 
 Words = tuple[str, ...]
 COLLECT, VAE, ENCODE, MDNRNN, BUNDLE = STAGES = ("collect", "train.vae", "encode", "train.mdnrnn", "bundle")
@@ -22,7 +23,7 @@ class Source:
 
     preset: Preset
     data: Path
-    scale: float = 1.0  # share of the drives and of each training's updates
+    scale: float = 1.0  # share of the drives, of each training's updates, and of those between its checkpoints
     seed: int = 0
     collect_flags: str = ""
     vae_flags: str = ""
@@ -39,18 +40,22 @@ class Source:
 
     def stages(self, jobs: int, device: str, out: Path | None = None) -> dict[str, Words]:
         """The words behind each verb; of a flag that is said twice the latter counts."""
-        drives, vae, mdnrnn = self.preset.collect.episodes, self.preset.vae.updates, self.preset.mdnrnn.updates
         folder = ("--data", str(self.data))
         begun = (*folder, "--preset", self.preset.name, "--seed", str(self.seed))
-        trained = (*begun, "--device", device, "--updates")
+        drives = self._share(self.preset.collect.episodes, LEAST_DRIVES)
+        trained = (*begun, "--device", device)
         return {
-            COLLECT: (*begun, "--jobs", str(jobs), "--episodes", self._share(drives, LEAST_DRIVES),
+            COLLECT: (*begun, "--jobs", str(jobs), "--episodes", drives,
                       *_words("--collect-flags", self.collect_flags)),
-            VAE: (*trained, self._share(vae), *_words("--vae-flags", self.vae_flags)),
+            VAE: (*trained, *self._updates(self.preset.vae), *_words("--vae-flags", self.vae_flags)),
             ENCODE: folder,
-            MDNRNN: (*trained, self._share(mdnrnn), *_words("--mdnrnn-flags", self.mdnrnn_flags)),
+            MDNRNN: (*trained, *self._updates(self.preset.mdnrnn), *_words("--mdnrnn-flags", self.mdnrnn_flags)),
             BUNDLE: (*folder, "--out", str(out or self.bundle)),
         }  # fmt: skip
+
+    def _updates(self, config: TrainConfig) -> Words:
+        """As many looks at held-out drives, and checkpoints, at any scale; they change no weight but by patience."""
+        return ("--updates", self._share(config.updates), "--validate-every", self._share(config.validate_every))
 
     def _share(self, amount: int, least: int = 1) -> str:
         return str(max(least, math.ceil(round(amount * self.scale, 6))))

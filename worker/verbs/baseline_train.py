@@ -21,9 +21,8 @@ EXTRAS = ("train",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from dreamfleet.worker.baselines.agent_config import AgentConfig
-    from dreamfleet.worker.baselines.learning_config import LearningConfig
     from dreamfleet.worker.baselines.names import NAMES
+    from dreamfleet.worker.baselines.presets import PRESETS
     from dreamfleet.worker.training.flags import add_config_flags
 
     parser.add_argument("agent", choices=NAMES, help="drqn; random drivers learn nothing")
@@ -31,8 +30,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", default="learning", help=f"{preset_help('baseline')} (default learning)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--new", action="store_true", help="begin anew where a checkpoint lies, which goes")
-    add_config_flags(parser, "learning", LearningConfig)
-    add_config_flags(parser, "layers and driving", AgentConfig)
+    add_config_flags(parser, "learning", {name: each.learning for name, each in PRESETS.items()})
+    add_config_flags(parser, "layers and driving", {name: each.agent for name, each in PRESETS.items()})
     add_json(parser)
 
 

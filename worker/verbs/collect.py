@@ -7,13 +7,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.config import add_flags
 from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.presets import preset_help
 from dreamfleet.common.site import offer
-from dreamfleet.worker.training.collect_config import CollectConfig
 
 if TYPE_CHECKING:
     from dreamfleet.worker.training.pilot import Pilot
@@ -24,9 +22,12 @@ EXTRAS = ("worker",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
+    from dreamfleet.worker.training.flags import add_config_flags
+    from dreamfleet.worker.training.presets import PRESETS
+
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--preset", help=f"{preset_help('training')} (default tiny); the data set keeps it")
-    add_flags(parser, CollectConfig, default="the preset's")
+    parser.add_argument("--preset", help=preset_help("training"))
+    add_config_flags(parser, "drives", {name: each.collect for name, each in PRESETS.items()})
     parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
     parser.add_argument(
         "--controller", nargs="+", default=[], metavar="CONTROLLER",

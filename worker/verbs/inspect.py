@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,9 +51,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     figures.add_argument("--probe", action="store_true", help="how much of the simulator's truth [z, h] holds")
     figures.add_argument("--losses", action="store_true", help="whether dreams lose the road where reality lost it")
     figures.add_argument("--likeness", action="store_true", help="whether dreams hold what is rare on drives as often")
-    figures.add_argument("--controller", help="who drives: a file, a run, or one that ships (default the run's own)")
-    figures.add_argument("--driver", help="who drives for --probe: a random driver by name, from anywhere")
-    figures.add_argument("--episodes", type=int, help=f"drives of --probe ({DRIVES}), losses of --losses ({LOSSES})")
+    parser.add_argument("--controller", help="who drives: a file, a run, or one that ships (default the run's own)")
+    figures.add_argument(
+        "--driver", help="who drives for --probe, from anywhere: of CarRacing those of `collect --driver`, which are "
+        "random, held, ornstein-uhlenbeck, random-walk, uniform, pushed and network",
+    )  # fmt: skip
+    figures.add_argument(
+        "--episodes", type=int, help=f"drives of --probe and --likeness (default {DRIVES}, at least {FEWEST_DRIVES}), "
+        f"losses of --losses (default {LOSSES}, at least {FEWEST_LOSSES})",
+    )  # fmt: skip
     figures.add_argument("--noise", type=float, default=0.3, help="added to actions, of half their range (default 0.3)")
     figures.add_argument("--temperature", type=float, help="of the dreams (default the run's, else 1.0)")
     offer(parser, "runs_dir")
@@ -67,8 +73,8 @@ def run(args: argparse.Namespace) -> int:
         if args.picture:
             raise UsageError("--picture is of the page: leave --probe, --losses and --likeness out")
         return _measure(args)
-    if args.controller or args.driver:
-        raise UsageError("--controller and --driver drive for figures: give --probe, --losses or --likeness too")
+    if args.driver:
+        raise UsageError("--driver drives for figures: give --probe too")
     if not args.subject and not args.data:
         raise UsageError("give a bundle or a run to look into, or --data folders whose trainings to draw")
     return _draw(args)
@@ -82,7 +88,7 @@ def _draw(args: argparse.Namespace) -> int:
     from dreamfleet.worker.inspection.rollout import DriveConfig
 
     with ExitStack() as held:
-        subject = _found(args, held)
+        subject = _driven(args, _found(args, held))
         sections = SECTIONS + len(args.data)
         bar = held.enter_context(progress_bar("inspect", sections, "sections"))
         page = inspect(subject, args.out, DriveConfig(args.seed, args.steps), args.data, bar.move, args.picture)
@@ -166,10 +172,23 @@ def _lose(
     return {**facts, "begun": [asdict(each) for each in compared]}
 
 
+def _driven(args: argparse.Namespace, subject: Subject) -> Subject:
+    """The subject with who drives for its page, where that is said."""
+    if not args.controller:
+        return subject
+    bundle, driving = _choose(args, subject)
+    controller, own = driving.controller, driving.own
+    if controller is None or own is None:
+        raise UsageError(f"controller {args.controller} sees no world model: give one that was evolved with one")
+    if controller.bundle == bundle.sha256:
+        return replace(subject, bundle=bundle.fitting(controller), controller=controller)
+    return replace(subject, bundle=bundle, controller=controller, own=own.fitting(controller))
+
+
 def _check(args: argparse.Namespace) -> None:
-    fewest = FEWEST_LOSSES if args.losses else FEWEST_DRIVES
+    fewest, what = (FEWEST_LOSSES, "losses, for --losses") if args.losses else (FEWEST_DRIVES, "drives")
     if args.episodes is not None and args.episodes < fewest:
-        raise UsageError(f"--episodes must be at least {FEWEST_DRIVES} to probe, {FEWEST_LOSSES} losses to dream")
+        raise UsageError(f"--episodes must be at least {fewest} {what}, not {args.episodes}")
     if args.seed < 0 or not 0 <= args.noise <= 10:
         raise UsageError("--seed must be at least 0, --noise from 0 to 10")
     if args.controller and args.driver:

@@ -27,10 +27,11 @@ EXAMPLES = {"collect": "--steps 200", "vae": "--batch 50", "mdnrnn": "--hidden 1
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set; one that was begun goes on")
-    parser.add_argument("--preset", help=f"{preset_help('training')} (default tiny); the data set keeps it")
+    parser.add_argument("--preset", help=preset_help("training"))
     parser.add_argument(
         "--scale", type=float, default=1.0, metavar="SHARE",
-        help="share of the preset's drives, and of each training's updates (default 1)",
+        help="share of the preset's drives, of each training's updates, and of those between two of its checkpoints "
+        "(default 1)",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="makes the drives and the trainings (default 0)")
     parser.add_argument("--jobs", type=int, default=cores(), help="processes that drive (default one a core)")

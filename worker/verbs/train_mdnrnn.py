@@ -19,9 +19,8 @@ EXTRAS = ("train",)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     from dreamfleet.worker.training.flags import add_training_flags
-    from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
-    add_training_flags(parser, MDNRNNConfig)
+    add_training_flags(parser, "mdnrnn")
 
 
 def run(args: argparse.Namespace) -> int:

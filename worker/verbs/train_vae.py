@@ -18,9 +18,8 @@ EXTRAS = ("train",)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     from dreamfleet.worker.training.flags import add_training_flags
-    from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
-    add_training_flags(parser, VAEConfig)
+    add_training_flags(parser, "vae")
     parser.add_argument(
         "--decoder-only", action="store_true", help="leave the encoder, and so latents and controllers, as they are"
     )

@@ -8,6 +8,8 @@ import pytest
 
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.runs import CONTROLLER, run_paths
+from dreamfleet.common.shelf import find_controller
+from dreamfleet.common.store import find_bundle
 from dreamfleet.common.stored import RunSettings, StoredGeneration
 from dreamfleet.coordinator.evaluation import Evaluation
 from dreamfleet.coordinator.jobs import travelling
@@ -16,7 +18,7 @@ from dreamfleet.worker.inspection import measuring
 from dreamfleet.worker.inspection.estimate import Estimate
 from dreamfleet.worker.inspection.inspection import find_subject, inspect
 from dreamfleet.worker.inspection.losses import Compared
-from dreamfleet.worker.inspection.rollout import DriveConfig
+from dreamfleet.worker.inspection.rollout import DriveConfig, drive
 from dreamfleet.worker.verbs import inspect as verb
 from tests.support.samples import SPEC
 
@@ -58,7 +60,15 @@ def test_a_run_that_has_ended_is_driven_by_its_controller(runs_dir, random_bundl
     with find_subject("night", runs_dir) as subject:
         assert np.array_equal(subject.controller.parameters, parameters)
         page = inspect(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
-    assert "a fresh drive by the run&#x27;s controller" in page
+    assert "a fresh drive by the controller" in page
+
+
+def test_a_bundle_is_shown_a_drive_of_another_ones_controller(random_bundle, tmp_path):
+    controller, _ = find_controller("tiny", tmp_path)
+    own = find_bundle("tiny")
+    seen, driven = (drive(each, controller, DriveConfig(steps=30), own) for each in (random_bundle, own))
+    assert np.array_equal(seen.action, driven.action)
+    assert seen.mu.shape != driven.mu.shape or not np.array_equal(seen.mu, driven.mu)
 
 
 def test_a_runs_own_controller_is_measured_at_the_runs_temperature(runs_dir, random_bundle, tmp_path, monkeypatch):

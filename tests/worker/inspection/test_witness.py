@@ -13,6 +13,7 @@ from dreamfleet.worker.scoring.episode import Course, play
 from dreamfleet.worker.scoring.hand import ControllersHand, controllers_hand, drivers_hands
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.training.world import known_drivers
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.mind import Mind
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -67,8 +68,13 @@ def test_a_controller_of_another_world_model_drives_by_its_own(tiny, controller,
         controllers_hand(controller, tiny, other, Mind(other))
 
 
+def test_whoever_drives_for_a_data_set_drives_for_a_probe(tiny):
+    for name in ("random", *known_drivers()):
+        assert drive(tiny, drivers(name, tiny), steps=3).action.shape == (3, 3)
+
+
 def test_a_driver_that_there_is_not_is_named_with_those_that_there_are(tiny):
-    with pytest.raises(UsageError, match="no driver 'ghost': choose one of held"):
+    with pytest.raises(UsageError, match="no driver 'ghost': choose one of random, held"):
         drivers_hands(tiny, "ghost")
 
 

@@ -69,8 +69,8 @@ def test_it_goes_on_where_it_stopped_to_the_same_bundle(tmp_path, monkeypatch, c
 def test_a_share_of_every_amount_is_rounded_up():
     stages = Source(PRESETS["notebook"], Path("data"), scale=0.02).stages(2, "cpu")
     assert "--episodes 20" in " ".join(stages["collect"])
-    assert "--updates 600" in " ".join(stages["train.vae"])
-    assert "--updates 200" in " ".join(stages["train.mdnrnn"])
+    assert "--updates 600 --validate-every 4" in " ".join(stages["train.vae"])
+    assert "--updates 200 --validate-every 4" in " ".join(stages["train.mdnrnn"])
     least = Source(PRESETS["tiny"], Path("data"), scale=1e-6).stages(2, "cpu")
     assert "--episodes 2" in " ".join(least["collect"])
     assert "--updates 1" in " ".join(least["train.vae"])
