@@ -32,7 +32,7 @@ def test_it_learns_in_the_dream_and_is_judged_on_real_tracks(small):
     learning, learnt, random = done.stdout.splitlines()
     assert learning.startswith("11776 steps, ")
     for name, line in ("learnt", learnt), ("random", random):
-        assert re.fullmatch(rf"{name}: (-?\d+\.\d) ± nan on 1 real tracks \((-?\d+) to \2\)", line)
+        assert re.fullmatch(rf"{name}: -?\d+\.\d on one real track", line)
 
 
 def test_a_choice_is_held_until_the_dream_ends_and_no_longer(small):
