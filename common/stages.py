@@ -122,10 +122,10 @@ def stages_told(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str,
 def steps_told(horizon: int, driven: float, *, dreamt: bool) -> str:
     """What an episode of a candidate is, in words: its steps, and in a run of dreams where they are made."""
     if not dreamt:
-        return f"{horizon:,} steps"
+        return f"{horizon} steps"
     if driven in (0, 1):
-        return f"{horizon:,} {'driven' if driven else 'dreamt'} steps"
-    return f"{horizon:,} steps, {driven:.0%} driven"
+        return f"{horizon} {'driven' if driven else 'dreamt'} steps"
+    return f"{horizon} steps, {driven:.0%} driven"
 
 
 def in_turn(values: Iterable[str]) -> str:

@@ -212,9 +212,9 @@ def test_a_driven_stage_of_a_dream_is_told_so_and_what_was_before_it_is_no_part_
         STATUS, settings=dataclasses.replace(STATUS.settings, task=task), recent=history, generation=generation
     )
     text = drawn(status, 100)
-    assert "dream, 1,000 driven steps" in text
+    assert "dream, 1000 driven steps" in text
     assert "temperature" not in text
     assert "0 to 6, stage 2 since 5" in text
     mixed = dataclasses.replace(generation.stage, driven=0.5)
     text = drawn(dataclasses.replace(status, generation=dataclasses.replace(generation, stage=mixed)), 100)
-    assert "dream, 1,000 steps, 50% driven, temperature 1.5" in text
+    assert "dream, 1000 steps, 50% driven, temperature 1.5" in text

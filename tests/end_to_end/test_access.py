@@ -154,6 +154,7 @@ def test_a_link_of_half_a_second_to_and_fro_lets_a_worker_in(processes, access, 
         relay.close()
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_revoked_counts_no_more_while_the_run_goes_on(processes, access, endpoint, random_bundle):
     seats = {}
     for name in ("fired", "newcomer"):
@@ -208,6 +209,7 @@ def answered(replies):
     return any(reply.ok for reply in replies)
 
 
+@pytest.mark.slow
 def test_a_worker_leaves_before_its_join_file_ends_and_says_so(processes, access, endpoint, random_bundle):
     begin(processes, access, endpoint, random_bundle, "--generations", 10_000)
     access.authority.issue("worker", "brief", access.path("brief"), connect=[endpoint], days=15 / 86400)

@@ -84,6 +84,7 @@ def test_who_is_not_read_still_hears_that_it_shall_leave(processes, random_bundl
     assert run.wait(PATIENCE) == 130
 
 
+@pytest.mark.slow
 def test_an_answer_that_nobody_reads_waits_and_a_signal_ends_it(processes, random_bundle, frozen):
     run = frozen(*coordinator(processes, random_bundle, tasks.TOY, 1, "--json"), stdout=True)
     worker = frozen(*WORKER, tasks.TOY, "--connect", processes.endpoint, "--exit-when-done")

@@ -20,6 +20,7 @@ from tests.support.samples import JSON, MSGPACK
 pytestmark = pytest.mark.timeout(120)
 
 
+@pytest.mark.slow
 def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
@@ -83,6 +84,7 @@ def resident(process):
     return int(Path(f"/proc/{process.popen.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
+@pytest.mark.slow
 def test_a_flood_of_damaged_messages_is_counted_to_the_last_and_the_run_goes_on(processes, random_bundle):
     assert flood(processes, random_bundle, 2000)[0][0] == 2000
 
@@ -151,6 +153,7 @@ def test_every_query_is_answered_whatever_it_asks_for(processes, random_bundle):
     assert processes.status()["state"] == "waiting for workers"
 
 
+@pytest.mark.slow
 def test_large_messages_fill_no_memory_and_the_run_goes_on(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,

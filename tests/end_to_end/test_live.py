@@ -154,6 +154,7 @@ def test_the_verb_writes_what_it_saw_when_it_is_told_to_end(processes, run, tmp_
     assert json.loads(out)["pictures"] >= 3
 
 
+@pytest.mark.slow
 def test_the_verb_ends_with_the_run_and_says_how_that_ended(processes, settings, tmp_path):
     coordinator = processes.coordinator(*settings, "--generations", 1)
     live = processes.start("live", "--connect", processes.endpoint, "--out", tmp_path / "live.mp4")

@@ -14,6 +14,7 @@ from tests.support.served import snapshot
 pytestmark = pytest.mark.timeout(120)
 
 
+@pytest.mark.slow
 def test_a_fleets_log_is_json_where_it_is_asked_for_and_tells_how_to_start_a_worker(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,

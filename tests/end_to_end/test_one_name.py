@@ -42,6 +42,7 @@ def ended(*coordinators):
     return []
 
 
+@pytest.mark.slow
 def test_of_two_on_routers_that_are_linked_later_the_newcomer_leaves_and_the_other_goes_on(processes, settings):
     first_at, second_at = processes.endpoint, f"tcp/127.0.0.1:{free_port()}"
     first = begin(processes, processes.folder / "a", first_at, "--run", "test", *settings)
@@ -75,6 +76,7 @@ def test_of_two_copies_of_one_run_the_one_that_was_continued_last_goes_on(proces
     assert "serves this very run on this network, in incarnation 3" in first.lines[-1]
 
 
+@pytest.mark.slow
 def test_a_frozen_predecessor_that_comes_back_leaves_and_its_token_hurts_nobody(processes, settings):
     """Both are clients of one router: the token of the frozen one lingers until its lease is over."""
     with open_session(Network(listen=(processes.endpoint,))):
@@ -95,6 +97,7 @@ def test_a_frozen_predecessor_that_comes_back_leaves_and_its_token_hurts_nobody(
         new.wait_for("generation 0: mean")
 
 
+@pytest.mark.slow
 def test_a_coordinator_that_is_killed_and_continued_at_once_goes_on_and_so_does_one_whose_link_is_cut(
     processes, settings
 ):

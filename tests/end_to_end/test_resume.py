@@ -120,6 +120,7 @@ def test_one_file_serves_coordinator_worker_and_status(processes, random_bundle)
     assert "filed\t" in out
 
 
+@pytest.mark.slow
 def test_a_file_that_speaks_of_another_run_does_not_keep_this_one_from_going_on(processes, settings):
     stopped(processes, settings, "--generations", 3)
     path = processes.folder / "fleet.toml"

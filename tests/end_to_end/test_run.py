@@ -28,6 +28,7 @@ def history(processes, name="test"):
         return [(each.number, each.mean, each.best, each.sigma) for each in run.history()]
 
 
+@pytest.mark.slow
 def test_a_worker_that_started_first_waits_fetches_the_bundle_and_leaves_when_the_run_is_over(processes, settings):
     worker = processes.worker("--task", tasks.TOY, "--exit-when-done")
     worker.wait_for("waiting for a coordinator")
@@ -138,6 +139,7 @@ def test_a_foreign_coordinator_on_the_same_network_is_refused(processes, setting
     assert "has a live coordinator already" in err
 
 
+@pytest.mark.slow
 def test_pause_resume_and_drain_from_the_command_line(processes, settings):
     coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 500)
     processes.worker("--task", tasks.SLOW_TOY)

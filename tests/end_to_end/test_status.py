@@ -27,6 +27,7 @@ def lines(out):
     return [json.loads(line) for line in out.splitlines()]
 
 
+@pytest.mark.slow
 def test_a_watcher_prints_a_line_each_time_and_at_last_how_the_run_ended(processes, settings):
     watcher = processes.start("status", "--connect", processes.endpoint, "--watch", "--json")
     watcher.wait_for("waiting for it")

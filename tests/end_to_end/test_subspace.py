@@ -51,6 +51,7 @@ def candidates(processes, name):
         return np.array([[run.candidate(g, i) for i in range(5)] for g in range(6)]).astype(np.float64)
 
 
+@pytest.mark.slow
 def test_the_same_bits_through_kills_and_again_by_the_receipt(processes, begin, subspace, random_bundle):
     coordinator = begin("calm")
     coordinator.wait_for("a new search with step size 0.1 in the subspace")

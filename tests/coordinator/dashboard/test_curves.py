@@ -41,12 +41,12 @@ def test_columns_are_equally_long_and_the_band_says_what_it_is():
 
 def test_only_a_dream_has_a_temperature_and_two_axes():
     plain = curves(course(3), None)
-    assert (plain["temperature"], plain["dreamt"], plain["fitness_axis"]) == (None, False, "fitness over 1,000 steps")
+    assert (plain["temperature"], plain["dreamt"], plain["fitness_axis"]) == (None, False, "fitness over 1000 steps")
     task = dataclasses.replace(STATUS.settings.task, task="dream", temperature=1.5)
     dream = curves(course(3, settings=dataclasses.replace(STATUS.settings, task=task)), None)
     assert (dream["temperature"], dream["dreamt"]) == ([1.5, 1.5, 1.5], True)
     assert (dream["fitness_axis"], dream["score_axis"]) == (
-        "fitness over 1,000 dreamt steps", "score in reality, 16 whole episodes",
+        "fitness over 1000 dreamt steps", "score in reality, 16 whole episodes",
     )  # fmt: skip
 
 
