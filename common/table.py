@@ -136,8 +136,8 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
     temperature, stage = status.generation.temperature, status.generation.stage
     now, size = (task, settings) if stage is None else (stage, stage)
     warm = "" if temperature is None or size.driven == 1 else f", temperature {temperature:g}"
-    steps = steps_told(now.horizon, size.driven, dreamt=task.task == DREAM and size.driven > 0)
-    yield 6, "task", f"{task.task}, {steps}{warm}"
+    length = steps_told(now.horizon, size.driven, dreamt=task.task == DREAM and size.driven > 0)
+    yield 6, "task", f"{task.task}, {length}{warm}"
     yield 7, "population", f"{size.population} x {size.episodes}"
     if stage is not None:
         yield 4, "stage", f"{stage.number} of {stage.total}, since generation {stage.since}"
