@@ -156,7 +156,7 @@ class Bundle:
         found = self.under(controller.shape, controller.variant)
         if self.sha256 != controller.bundle:
             raise ControllerError(
-                f"the controller belongs to {_named(controller.bundle)}, not to {self.path.name} "
+                f"the controller belongs to {told(controller.bundle)}, not to {self.path.name} "
                 f"({self.sha256[:12]}...): leave --bundle out, or fit it to this one by `dreamfleet refit`"
             )
         return found
@@ -293,5 +293,6 @@ def _read_manifest(archive: Archive, path: Path) -> Manifest:
     return manifest
 
 
-def _named(sha256: str) -> str:
-    return f"world model {sha256[:12]}..." if sha256 else "no world model"
+def told(sha256: str) -> str:
+    """A world model by its hash, in words; empty: none."""
+    return f"the world model {sha256[:12]}" if sha256 else "no world model"

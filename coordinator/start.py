@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.bundle import told
 from dreamfleet.common.effort import START_EFFORT, Effort, start_effort
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
 from dreamfleet.common.fields import written
@@ -59,7 +60,7 @@ class Start:
         spec, shape = settings.task, settings.controller
         if self.bundle != spec.bundle:
             raise ControllerError(
-                f"{self.source} belongs to {_told(self.bundle)}, not to {_told(spec.bundle)}: give its own --bundle, "
+                f"{self.source} belongs to {told(self.bundle)}, not to {told(spec.bundle)}: give its own --bundle, "
                 "or fit it to this one by `dreamfleet refit`"
             )
         self._check_options(spec)
@@ -87,10 +88,6 @@ class Start:
 
 def _way(variant: Variant) -> str:
     return f"with {variant.options}" if variant.options else "the plain way"
-
-
-def _told(bundle: str) -> str:
-    return f"the world model {bundle[:12]}" if bundle else "no world model"
 
 
 def find_start(name: str, runs_dir: Path) -> Start:

@@ -157,5 +157,5 @@ def test_the_verb_writes_a_controller_of_the_other_model(bundles, drives, folder
         call(tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 1)
     with pytest.raises(UsageError, match="is a folder"):
         call(tmp_path / "before.npz", "--to", new.path, *flags, "--out", tmp_path)
-    with pytest.raises(ControllerError, match="belongs to world model"):
+    with pytest.raises(ControllerError, match="belongs to the world model"):
         call(tmp_path / "before.npz", "--to", new.path, *flags, "--bundle", new.path)
