@@ -100,6 +100,8 @@ Actions = Continuous | Discrete
 
 # hardmaru/WorldModelsExperiments, carracing: steering tanh; gas (tanh + 1) / 2; brake clip(tanh, 0, 1).
 STEERING_GAS_BRAKE = Continuous(scale=(1, 0.5, 1), shift=(0, 0.5, 0), low=(-1, 0, 0), high=(1, 1, 1))
+# AppliedDataSciencePartners/WorldModels, controller/arch.py, and the notebook after it: gas and brake (tanh + 1) / 2.
+STEERING_AND_HALVES = Continuous.between(low=(-1, 0, 0), high=(1, 1, 1))
 # gymnasium's CarRacing-v3 with continuous=False: nothing, right, left, gas, brake.
 FIVE_CHOICES = replace(
     STEERING_GAS_BRAKE, choices=((0, 0, 0), (0.6, 0, 0), (-0.6, 0, 0), (0, 0.2, 0), (0, 0, 0.8))

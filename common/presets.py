@@ -11,7 +11,7 @@ from dreamfleet.common.errors import UsageError
 
 Kind = Literal["run", "training", "baseline"]
 NAMES: dict[Kind, tuple[str, ...]] = {
-    "run": ("article", "dream", "frugal", "mixed", "paper", "real"),
+    "run": ("article", "dream", "frugal", "mixed", "notebook", "paper", "real"),
     "training": ("article", "attentive", "notebook", "paper", "tiny"),
     "baseline": ("learning", "notebook"),
 }

@@ -12,13 +12,13 @@ from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, Literal
 
-from dreamfleet.common.actions import FIVE_CHOICES, STEERING_GAS_BRAKE, Continuous
+from dreamfleet.common.actions import FIVE_CHOICES, STEERING_AND_HALVES, STEERING_GAS_BRAKE, Continuous
 from dreamfleet.common.errors import UsageError
 
 WORLD = "car-racing"  # whose options these are, and its dream's
 KNOWN = {
-    "actions": "continuous, or discrete without pedals=one",
-    "pedals": "two or one",
+    "actions": "continuous, or discrete with pedals=two",
+    "pedals": "two, half or one",
     "pedal_shift": "a number from -1 to 1, and 0 unless pedals=one",
     "decide_every": "a whole number from 1 to 50",
     "feedback": "none or last",
@@ -35,7 +35,7 @@ class Variant:
     """
 
     actions: Literal["continuous", "discrete"] = "continuous"  # discrete: one of gymnasium's five
-    pedals: Literal["two", "one"] = "two"  # one: an output above 0 is gas, one below it brake
+    pedals: Literal["two", "half", "one"] = "two"  # half: at 0 both are half down; one: above 0 is gas, below it brake
     pedal_shift: float = 0.0  # added to the one pedal
     decide_every: int = 1  # steps for which a choice is held
     feedback: Literal["none", "last"] = "none"  # last: the last choice and its change are features too
@@ -44,8 +44,8 @@ class Variant:
 
     def __post_init__(self) -> None:
         fits = {
-            "actions": self.actions == "continuous" or (self.actions == "discrete" and self.pedals != "one"),
-            "pedals": self.pedals in ("two", "one"),
+            "actions": self.actions == "continuous" or (self.actions == "discrete" and self.pedals == "two"),
+            "pedals": self.pedals in ("two", "half", "one"),
             "pedal_shift": _within(self.pedal_shift, -1, 1) and (self.pedals == "one" or not self.pedal_shift),
             "decide_every": type(self.decide_every) is int and 1 <= self.decide_every <= 50,
             "feedback": self.feedback in ("none", "last"),
@@ -104,6 +104,8 @@ class Variant:
             return FIVE_CHOICES
         if self.pedals == "two":
             return STEERING_GAS_BRAKE
+        if self.pedals == "half":
+            return STEERING_AND_HALVES
         shift = (0.0, self.pedal_shift, -self.pedal_shift)
         return Continuous((1, 1, -1), shift, low=(-1, 0, 0), high=(1, 1, 1), outputs_of=(0, 1, 1))
 

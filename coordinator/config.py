@@ -55,8 +55,8 @@ class RunConfig:
     task_options: str | None = option(None, "the task's own options as `runs show` prints them, instead of these two")
     variant: tuple[str, ...] = option(
         (),
-        "NAME=VALUE of how car-racing is driven: pedals=one, pedal_shift=, decide_every=, feedback=last, in its dream "
-        "too, and time_cost=, offroad_cost= (docs/tasks.md)",
+        "NAME=VALUE of how car-racing is driven: actions=discrete, pedals=half or one, pedal_shift=, decide_every=, "
+        "feedback=last, in its dream too, and time_cost=, offroad_cost= (docs/tasks.md)",
     )
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
     hidden_units: int = option(8, "units of a hidden controller's layer")
@@ -231,7 +231,7 @@ class RunConfig:
         """How the run's controllers drive."""
         variant = Variant.named(_arguments("--variant", self.variant, "pedals=one"))
         if not variant.plain and self.task not in (WORLD, DREAM):
-            raise UsageError(f"task {self.task} has no variants: {WORLD} has, and its dream")
+            raise UsageError(f"task {self.task} has no variants (given, or the preset's): {WORLD} has, and its dream")
         if (variant.time_cost or variant.offroad_cost) and self.task == DREAM:
             cost = "time_cost" if variant.time_cost else "offroad_cost"
             raise UsageError(
@@ -241,7 +241,9 @@ class RunConfig:
 
     def _described(self) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
         if self.temperature is not None or self.collect_every or self.variant:
-            raise UsageError("--temperature, --collect-every and --variant are of tasks with a world model")
+            raise UsageError(
+                "--temperature, --collect-every and --variant (given, or the preset's) are of tasks with a world model"
+            )
         told = describe_task(self.task, self._options())
         options = told.options if self.task_options is None else self.task_options
         shape = ControllerShape(told.observations, told.outputs, self._hidden)

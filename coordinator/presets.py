@@ -28,10 +28,32 @@ REAL: dict[str, Any] = {
         StageSettings(episodes=16),
     ),
 }
-# The paper's own settings, the article's, and what two cores do in minutes.
+# Both pedals of these two sources are half down at an output of 0.
+HALVES = ("pedals=half",)
+# The settings of the sources, and what two cores do in minutes.
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"population": 64, "episodes": 16, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 1024},
-    "article": {"population": 32, "episodes": 4, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 100},
+    "article": {
+        "variant": HALVES,
+        "population": 32,
+        "episodes": 4,
+        "sigma0": 0.1,
+        "covariance": "full",
+        "evaluation_episodes": 100,
+    },
+    # Ten generations of dreams, and then a drive.
+    "notebook": {
+        "task": "dream",
+        "variant": HALVES,
+        "population": 256,
+        "episodes": 5,
+        "sigma0": 0.1,
+        "covariance": "full",
+        "horizon": 1000,
+        "temperature": 1.0,
+        "evaluate_every": 10,
+        "evaluation_episodes": 16,
+    },
     "dream": {
         "task": "dream",
         "population": 64,

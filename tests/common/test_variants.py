@@ -1,8 +1,9 @@
 import json
 
+import numpy as np
 import pytest
 
-from dreamfleet.common.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.actions import STEERING_AND_HALVES, STEERING_GAS_BRAKE
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.variants import KNOWN, PLAIN, Variant
 
@@ -11,6 +12,7 @@ from dreamfleet.common.variants import KNOWN, PLAIN, Variant
     "options",
     [
         '{"pedals": "one"}',
+        '{"pedals": "half"}',
         '{"actions": "discrete"}',
         '{"actions": "discrete", "decide_every": 4}',
         '{"pedal_shift": 0.25, "pedals": "one"}',
@@ -32,6 +34,13 @@ def test_the_plain_way_is_named_by_nothing():
     assert Variant.of("") == Variant.named({"pedals": "two", "decide_every": 1, "time_cost": 0}) == PLAIN
     assert (PLAIN.options, PLAIN.plain, PLAIN.version, PLAIN.seen) == ("", True, 1, 0)
     assert PLAIN.controls == STEERING_GAS_BRAKE
+
+
+def test_with_half_pedals_gas_and_brake_are_half_down_at_nothing():
+    assert Variant(pedals="half").controls == STEERING_AND_HALVES
+    outputs = np.array([[0, 0, 0], [9, 9, 9], [-9, -9, -9]], np.float32)
+    assert Variant(pedals="half").controls.of(outputs).round(4).tolist() == [[0, 0.5, 0.5], [1, 1, 1], [-1, 0, 0]]
+    assert Variant(pedals="half", feedback="last").seen == 6
 
 
 def test_a_whole_number_is_written_as_the_number_that_it_means():
@@ -92,7 +101,10 @@ def test_options_that_are_no_object_are_refused(options):
 
 def test_a_shift_that_leaves_no_pedal_is_refused():
     assert Variant(pedals="one", pedal_shift=-1).controls.shift == (0, -1, 1)
-    with pytest.raises(UsageError, match="discrete without pedals=one"):
-        Variant(actions="discrete", pedals="one")
+    for pedals in ("one", "half"):
+        with pytest.raises(UsageError, match="discrete with pedals=two"):
+            Variant(actions="discrete", pedals=pedals)
+    with pytest.raises(UsageError, match="0 unless pedals=one"):
+        Variant(pedals="half", pedal_shift=0.5)
     with pytest.raises(UsageError, match="from -1 to 1"):
         Variant(pedals="one", pedal_shift=1.5)

@@ -132,7 +132,7 @@ def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(rando
             {"variant": ("pedal=one",)},
             "car-racing knows no option pedal: known are actions, pedals, pedal_shift, decide_every, ",
         ),
-        ({"variant": ("pedals=three",)}, "pedals must be two or one, not 'three'"),
+        ({"variant": ("pedals=three",)}, "pedals must be two, half or one, not 'three'"),
         ({"variant": ("pedals",)}, "--variant 'pedals': write KEY=VALUE, such as pedals=one"),
         ({"variant": ("pedals=one", "pedals=one")}, "a KEY stands there twice"),
         ({"variant": ("time_cost=1",), "task": "dream"}, "time_cost is of candidates that drive"),

@@ -13,6 +13,7 @@ pytestmark = pytest.mark.timeout(300)
 POPULATION, GENERATIONS, HORIZON = 4, 2, 30
 RUNS = {
     "pedals": (("--variant", "pedals=one", "pedal_shift=0.25"), (288, 2)),
+    "halves": (("--preset", "article"), (288, 3)),
     "discrete": (("--variant", "actions=discrete"), (288, 5)),
     "held": (("--variant", "decide_every=4"), (288, 3)),
     "feedback": (("--variant", "feedback=last"), (294, 3)),

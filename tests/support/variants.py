@@ -6,6 +6,7 @@ from dreamfleet.common.controller import Controller
 from dreamfleet.common.variants import Variant
 
 VARIANTS = {
+    "half pedals": Variant(pedals="half"),
     "one pedal": Variant(pedals="one"),
     "shifted pedal": Variant(pedals="one", pedal_shift=0.25),
     "every third": Variant(decide_every=3),

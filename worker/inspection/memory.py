@@ -15,7 +15,7 @@ from dreamfleet.worker.inspection.section import Section
 from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
 
 Floats = NDArray[np.float32]
-STEPS = (0, 5, 10, 20, 50, 100)  # shown of a dream
+STEPS = (0, 5, 10, 20, 50, 100, 200, 299)  # shown of a dream
 TEMPERATURES = (0.5, 1.0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.scoring.episode import Course, play
 from dreamfleet.worker.scoring.hand import check_sees
-from dreamfleet.worker.tasks.api import Assignment, Collected, Policy
+from dreamfleet.worker.tasks.api import Assignment, Collected, Continuous, Policy, World
 from dreamfleet.worker.tasks.policy import Driven
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.inference import Encoder
@@ -28,6 +29,7 @@ class DriveConfig:
 
     seed: int = 20_000  # a validation track
     steps: int = 300
+    action: tuple[float, ...] = ()  # done at each step, whoever else could drive
 
 
 @dataclass(frozen=True)
@@ -68,10 +70,36 @@ class EncodedRollout:
         return told
 
 
+class OneAction:
+    """A driver that does the same at each step; `UsageError` for what is no action of the world."""
+
+    def __init__(self, action: Sequence[float], world: World) -> None:
+        actions, names = world.actions, world.action_names
+        done = np.array(action, np.float32)
+        if not isinstance(actions, Continuous) or done.shape != (actions.actions,):
+            wanted = f"{', '.join(names)}: {len(names)} numbers" if names else "numbers, of a world with such actions"
+            raise UsageError(f"--action takes {wanted}, not {_told(action)}")
+        if not ((actions.low <= done) & (done <= actions.high)).all():
+            bounds = ", ".join(
+                f"{name} from {low:g} to {high:g}"
+                for name, low, high in zip(names, actions.low, actions.high, strict=True)
+            )
+            raise UsageError(f"--action takes {bounds}, not {_told(action)}")
+        self._done = done
+
+    def act(self) -> Floats:
+        """The action."""
+        return self._done
+
+
+def _told(action: Sequence[float]) -> str:
+    return " ".join(f"{each:g}" for each in action)
+
+
 def drive(
     bundle: Bundle, controller: Controller | None, config: DriveConfig, own: Bundle | None = None
 ) -> EncodedRollout:
-    """Drive one episode: the controller, or without one the world's second random driver, which drifts.
+    """Drive one episode: one action alone, else the controller, else the world's second random driver, which drifts.
 
     `own` is the controller's world model, where that is another than the bundle which sees the drive.
     """
@@ -80,7 +108,9 @@ def drive(
     assignment = Assignment.of(bundle.manifest.task, own or bundle)
     task, driver = find_task(bundle.manifest.task), "the controller"
     policy: Policy = task.make_policy(assignment)
-    if controller is not None:
+    if config.action:
+        driver, policy = f"one action alone, {_told(config.action)}", Driven(OneAction(config.action, task.world))
+    elif controller is not None:
         policy.begin(controller.parameters)
     elif isinstance(task, Collected):
         driver = "a random driver"

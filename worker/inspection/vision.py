@@ -11,6 +11,7 @@ from dreamfleet.worker.inspection.section import Section
 
 SHOWN = 8  # pictures a row, latents a table
 TRAVERSED = np.linspace(-3, 3, 7)
+NOISE = (-2, -1, 0, 1, 2)  # means of the latents out of nothing
 
 
 def reconstructions(drive: EncodedRollout, eyes: Eyes) -> Section:
@@ -67,7 +68,7 @@ def moments(drive: EncodedRollout) -> Section:
 def samples(eyes: Eyes) -> Section:
     """Decodings of latents that no picture stands behind."""
     normal = np.random.default_rng(0).standard_normal((SHOWN, eyes.latent)).astype(np.float32)
-    rows = [(f"N({mean}, 1)", eyes.decode(normal + np.float32(mean))) for mean in (0, -2, 2)]
+    rows = [(f"N({mean}, 1)", eyes.decode(normal + np.float32(mean))) for mean in NOISE]
     return Section(
         "samples", "Latents out of nothing",
         "The decoder's pictures of random latents: where the latents of real pictures lie, N(0, 1) looks like the "

@@ -51,19 +51,20 @@ def add_config_flags(parser: argparse.ArgumentParser, title: str, presets: Mappi
         if each.name not in FIXED:
             flag, text = "--" + each.name.replace("_", "-"), each.metadata.get("help")
             told = _told({name: getattr(preset, each.name) for name, preset in presets.items()})
-            text = text and f"{text} (default {told})"
+            text = text and f"{text} ({told})" if told else text
             group.add_argument(flag, default=argparse.SUPPRESS, help=text, **_options(hints[each.name]))
 
 
 def _told(values: Mapping[str, Any]) -> str:
-    """The presets' values of one field: `1500; notebook 30000; article, paper 60000`."""
+    """The presets' values of one field: `default 1500; notebook 30000; article, paper 60000`; nothing where all are."""
     names: dict[str, list[str]] = {}
     for name, value in values.items():
         plain = ("on" if value else "off") if isinstance(value, bool) else value
         said = " ".join(map(str, plain)) if isinstance(plain, tuple) else str(plain)
         names.setdefault(said, []).append(name)
     (first, _), *others = names.items()
-    return "; ".join((first, *(f"{', '.join(each)} {said}" for said, each in others)))
+    told = [f"default {first}"] if first else []
+    return "; ".join((*told, *(f"{', '.join(each)} {said}" for said, each in others)))
 
 
 def changed(config: T, args: argparse.Namespace) -> T:

@@ -19,6 +19,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Encode what is not encoded yet."""
+    from dreamfleet.worker.training.processor import spare_processor
+
+    spare_processor()  # before torch is loaded
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.worker.training.dataset import episodes
     from dreamfleet.worker.training.encode import encode, mirrored_too

@@ -47,6 +47,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     first = VALIDATION.start
     parser.add_argument("--seed", type=int, default=first, help=f"the (first) track that is driven (default {first})")
     parser.add_argument("--steps", type=int, default=300, help="steps of the page's drive (default 300)")
+    parser.add_argument(
+        "--action", type=float, nargs="+", metavar="N",
+        help="the page's drive does this at each step, and nobody drives: of CarRacing steering, gas and brake, "
+        "such as --action -0.01 1 0",
+    )  # fmt: skip
     figures = parser.add_argument_group("figures, printed instead of the page")
     figures.add_argument("--probe", action="store_true", help="how much of the simulator's truth [z, h] holds")
     figures.add_argument("--losses", action="store_true", help="whether dreams lose the road where reality lost it")
@@ -72,6 +77,8 @@ def run(args: argparse.Namespace) -> int:
     if args.probe or args.losses or args.likeness:
         if args.picture:
             raise UsageError("--picture is of the page: leave --probe, --losses and --likeness out")
+        if args.action:
+            raise UsageError("--action is of the page: leave --probe, --losses and --likeness out")
         return _measure(args)
     if args.driver:
         raise UsageError("--driver drives for figures: give --probe too")
@@ -83,15 +90,20 @@ def run(args: argparse.Namespace) -> int:
 def _draw(args: argparse.Namespace) -> int:
     if args.steps < 2 or args.seed < 0:
         raise UsageError("--steps must be at least 2 and --seed at least 0")
+    if args.action and args.controller:
+        raise UsageError("one drives: give --controller or --action")
     from dreamfleet.common.progress import progress_bar
     from dreamfleet.worker.inspection.inspection import inspect
     from dreamfleet.worker.inspection.rollout import DriveConfig
 
     with ExitStack() as held:
         subject = _driven(args, _found(args, held))
+        if args.action and subject.bundle is None:
+            raise UsageError("--action is driven beside a world model's dream: name a bundle, or a run with one")
         sections = SECTIONS + len(args.data)
+        config = DriveConfig(args.seed, args.steps, tuple(args.action or ()))
         bar = held.enter_context(progress_bar("inspect", sections, "sections"))
-        page = inspect(subject, args.out, DriveConfig(args.seed, args.steps), args.data, bar.move, args.picture)
+        page = inspect(subject, args.out, config, args.data, bar.move, args.picture)
         bar.move(sections)
     answer(args, str(page), page=page)
     return 0

@@ -25,6 +25,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train and print the quality on held-out episodes."""
+    from dreamfleet.worker.training.processor import spare_processor
+
+    spare_processor()  # before torch is loaded
     from dreamfleet.worker.training.encode import unencoded
     from dreamfleet.worker.training.flags import changed
     from dreamfleet.worker.training.origin import agreed_preset

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dreamfleet.common.bundle import DREAM, write_bundle
-from dreamfleet.common.errors import BundleError, DatasetError
+from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.worker.inspection import memory
 from dreamfleet.worker.inspection.inspection import Subject, facts, find_subject, inspect
 from dreamfleet.worker.inspection.page import Page
@@ -50,6 +50,25 @@ def write_curves(folder):
 @pytest.fixture
 def attentive(tmp_path):
     return write_random_bundle(tmp_path / "attentive.zip", vae=VAE, rnn=ATTENTIVE)
+
+
+def test_the_pages_drive_can_be_one_action_alone(attentive):
+    driven = drive(attentive, None, DriveConfig(steps=12, action=(-0.01, 1.0, 0.0)))
+    assert driven.action.tolist() == [np.array((-0.01, 1, 0), np.float32).tolist()] * 12
+    assert driven.told == "a fresh drive by one action alone, -0.01 1 0"
+
+
+@pytest.mark.parametrize(
+    ("action", "told"),
+    [
+        ((1.0,), "takes steer, gas, brake: 3 numbers, not 1"),
+        ((0.0, 2.0, 0.0), "takes steer from -1 to 1, gas from 0 to 1, brake from 0 to 1, not 0 2 0"),
+        ((0.0, float("nan"), 0.0), "not 0 nan 0"),
+    ],
+)
+def test_what_is_no_action_of_the_world_is_refused(attentive, action, told):
+    with pytest.raises(UsageError, match=told):
+        drive(attentive, None, DriveConfig(action=action))
 
 
 def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
