@@ -18,9 +18,9 @@ class BaselinePreset:
     learning: LearningConfig
 
 
-# The settings of a notebook as they were handed down (docs/sources.md). Its rate, the sizes of its layers and replay, how
-# often it learns and how often its target follows are ours. Its LSTM sees single transitions, its advantages lie between
-# 0 and 1, and full gas spins the car: it stays at about -20 to -60.
+# The settings of a notebook as they were handed down (docs/sources.md). Its rate, the sizes of its layers and replay,
+# how often it learns and how often its target follows are ours. Its LSTM sees single transitions, its advantages lie
+# between 0 and 1, and full gas spins the car: it stays at about -20 to -60.
 NOTEBOOK = BaselinePreset(
     name="notebook",
     agent=AgentConfig(picture=96, choices="notebook", heads="softmax", channels=(16, 32, 32), hidden=128),

@@ -1,8 +1,9 @@
 """The MDN-RNN: an LSTM that predicts the next latents as mixtures of Gaussians, and what comes with them.
 
 Mixtures a latent dimension as in hardmaru/WorldModelsExperiments. Heads of its successors: the reward in three forms,
-and whether the episode ends (the paper's Doom). Additive attention over past inputs is what miketynes/AttentiveWorldModels
-means; in its code the softmax runs over the batch and the state stays zero, so that it never attended.
+and whether the episode ends (the paper's Doom). Additive attention over past inputs is what
+miketynes/AttentiveWorldModels means; in its code the softmax runs over the batch and the state stays zero, so that it
+never attended.
 """
 
 from __future__ import annotations
