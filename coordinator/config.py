@@ -105,6 +105,7 @@ class RunConfig:
         "a TOML file of stages, each a [[stage]] with its end (generations, steps, score) and its own horizon, "
         "patience, episodes, population, sigma0 and racing (docs/operations.md); none: no stages",
     )
+    preset_variant: tuple[str, ...] = ()  # how the preset drives, where nothing else says it by name
     stages: tuple[StageSettings, ...] = ()  # what the schedule, or the configuration file, holds
     searched: Subspace | None = None  # what that file holds
 
@@ -229,9 +230,10 @@ class RunConfig:
 
     def _variant(self) -> Variant:
         """How the run's controllers drive."""
-        variant = Variant.named(_arguments("--variant", self.variant, "pedals=one"))
+        given, preset = (_arguments("--variant", each, "pedals=one") for each in (self.variant, self.preset_variant))
+        variant = Variant.named(preset | given)
         if not variant.plain and self.task not in (WORLD, DREAM):
-            raise UsageError(f"task {self.task} has no variants (given, or the preset's): {WORLD} has, and its dream")
+            raise UsageError(f"task {self.task} has no variants: {WORLD} has, and its dream")
         if (variant.time_cost or variant.offroad_cost) and self.task == DREAM:
             cost = "time_cost" if variant.time_cost else "offroad_cost"
             raise UsageError(
@@ -241,9 +243,7 @@ class RunConfig:
 
     def _described(self) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
         if self.temperature is not None or self.collect_every or self.variant:
-            raise UsageError(
-                "--temperature, --collect-every and --variant (given, or the preset's) are of tasks with a world model"
-            )
+            raise UsageError("--temperature, --collect-every and --variant are of tasks with a world model")
         told = describe_task(self.task, self._options())
         options = told.options if self.task_options is None else self.task_options
         shape = ControllerShape(told.observations, told.outputs, self._hidden)

@@ -34,7 +34,7 @@ HALVES = ("pedals=half",)
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"population": 64, "episodes": 16, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 1024},
     "article": {
-        "variant": HALVES,
+        "preset_variant": HALVES,
         "population": 32,
         "episodes": 4,
         "sigma0": 0.1,
@@ -44,7 +44,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Ten generations of dreams, and then a drive.
     "notebook": {
         "task": "dream",
-        "variant": HALVES,
+        "preset_variant": HALVES,
         "population": 256,
         "episodes": 5,
         "sigma0": 0.1,

@@ -42,9 +42,15 @@ class Start:
     effort: Effort | None = None  # what was spent on it, where that is known
 
     def under(self, config: RunConfig) -> RunConfig:
-        """The configuration with the options that this start was evolved under, where it names none."""
+        """The configuration with the options that this start was evolved under, where it does not name them.
+
+        They are stronger than a preset's: parameters mean something in their own way of driving alone. What candidates
+        pay is the start's only where nothing is named.
+        """
         if self.bundle:
-            return config if config.variant else replace(config, variant=Variant.of(self.options).texts)
+            own, said = Variant.of(self.options), {_name(text) for text in config.variant}
+            kept = (text for text in (own.driving if said else own).texts if _name(text) not in said)
+            return replace(config, variant=(*kept, *config.variant), preset_variant=())
         given = config.task_options is not None or config.environment or config.normalise
         return config if given else replace(config, task_options=self.options)
 
@@ -84,6 +90,11 @@ class Start:
                 f"{self.source} drives {_way(own)}, this run's controllers {_way(wanted)}, so that its parameters mean "
                 "something else: leave --variant out, and it brings its own"
             )
+
+
+def _name(text: str) -> str:
+    """Of a NAME=VALUE."""
+    return text.partition("=")[0]
 
 
 def _way(variant: Variant) -> str:

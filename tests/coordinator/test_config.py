@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from dreamfleet.common.config import load
 from dreamfleet.common.errors import ControllerError, DreamfleetError, UsageError
 from dreamfleet.common.fields import written
 from dreamfleet.common.messages import TaskSpec
@@ -11,7 +12,7 @@ from dreamfleet.common.store import find_bundle
 from dreamfleet.common.stored import RunSettings
 from dreamfleet.common.tasks import Description
 from dreamfleet.coordinator.config import RunConfig, settings_of
-from dreamfleet.coordinator.presets import PRESETS
+from dreamfleet.coordinator.presets import PRESETS, find_preset
 from dreamfleet.coordinator.start import Start
 from dreamfleet.worker.tasks.api import Task
 from tests.support.bundles import states, write_random_bundle
@@ -159,6 +160,46 @@ def test_a_start_that_drives_otherwise_is_refused_and_one_that_pays_otherwise_is
             RunConfig(variant=("decide_every=4",)).settings(random_bundle)
         )
     assert one_pedal.under(RunConfig()).settings(random_bundle).task.options == one_pedal.options
+
+
+HALF, HELD = '{"pedals": "half"}', '{"decide_every": 2, "pedals": "half"}'
+
+
+@pytest.mark.parametrize(
+    ("texts", "options"),
+    [
+        ((), HALF),
+        (("decide_every=2",), HELD),
+        (("pedals=two",), ""),
+        (("pedals=one",), '{"pedals": "one"}'),
+    ],
+)
+def test_what_is_said_of_a_variant_is_stronger_than_the_presets_name_by_name(random_bundle, texts, options):
+    found = load(RunConfig, "run", file={"run": {"preset": "article", "variant": list(texts)}}, preset=find_preset)
+    assert found.settings(random_bundle).task.options == options
+
+
+def test_a_presets_variant_is_no_matter_of_worlds_without_a_world_model():
+    found = load(RunConfig, "run", file={"run": {"preset": "article", "task": "gym:CartPole-v1"}}, preset=find_preset)
+    assert found.settings(None).task == RunConfig(task="gym:CartPole-v1").settings(None).task
+
+
+@pytest.mark.parametrize(
+    ("own", "texts", "options"),
+    [
+        ("", (), ""),
+        (HALF, (), HALF),
+        (HALF, ("time_cost=1",), '{"pedals": "half", "time_cost": 1.0}'),
+        ('{"decide_every": 2, "time_cost": 1.0}', (), '{"decide_every": 2, "time_cost": 1.0}'),
+        ('{"decide_every": 2, "time_cost": 1.0}', ("offroad_cost=2",), '{"decide_every": 2, "offroad_cost": 2.0}'),
+    ],
+)
+def test_a_start_keeps_its_way_of_driving_whatever_a_preset_does(random_bundle, own, texts, options):
+    config = RunConfig(preset="article", variant=texts, preset_variant=("pedals=half",))
+    start = Start(np.zeros(867), random_bundle.sha256, "run night", own)
+    settings = start.under(config).settings(random_bundle)
+    start.check(settings)
+    assert settings.task.options == options
 
 
 def test_a_start_of_another_length_is_refused(random_bundle):

@@ -10,7 +10,7 @@ from pathlib import Path
 from dreamfleet.common.bundle import Bundle
 from dreamfleet.common.controller import Controller
 from dreamfleet.common.errors import BundleError, DatasetError, JournalError, MissingExtraError, UsageError
-from dreamfleet.common.files import is_file
+from dreamfleet.common.files import is_file, write_aside
 from dreamfleet.common.runs import RunFolder, open_run
 from dreamfleet.common.stages import begun_stages, in_turn
 from dreamfleet.common.store import find_bundle, shipped_names
@@ -87,8 +87,10 @@ def inspect(
             sections.append(section)
             on_section(len(sections), section.name)
             if section.picture is not None:
-                (out / f"{section.name}.png").write_bytes(section.picture)
-        (out / PAGE).write_text(_page(subject, trained, sections).html(), encoding="utf-8", errors="replace")
+                with write_aside(out / f"{section.name}.png") as file:
+                    file.write(section.picture)
+        with write_aside(out / PAGE) as file:
+            file.write(_page(subject, trained, sections).html().encode(errors="replace"))
     except OSError as error:
         raise DatasetError(f"cannot write in {out}: {error.strerror}; choose another --out") from error
     return out / PAGE

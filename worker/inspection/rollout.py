@@ -75,7 +75,7 @@ class OneAction:
 
     def __init__(self, action: Sequence[float], world: World) -> None:
         actions, names = world.actions, world.action_names
-        done = np.array(action, np.float32)
+        done = np.array(action, np.float64)
         if not isinstance(actions, Continuous) or done.shape != (actions.actions,):
             wanted = f"{', '.join(names)}: {len(names)} numbers" if names else "numbers, of a world with such actions"
             raise UsageError(f"--action takes {wanted}, not {_told(action)}")
@@ -85,7 +85,7 @@ class OneAction:
                 for name, low, high in zip(names, actions.low, actions.high, strict=True)
             )
             raise UsageError(f"--action takes {bounds}, not {_told(action)}")
-        self._done = done
+        self._done = done.astype(np.float32)
 
     def act(self) -> Floats:
         """The action."""

@@ -14,8 +14,8 @@ DEFAULT = "tiny"
 MOST_BYTES = 1000
 
 
-def keep_preset(folder: Path, preset: str) -> None:
-    """Keep the preset of a data set that is begun now; one that has rollouts already stays as it is.
+def keep_preset(folder: Path, preset: str, seed: int) -> None:
+    """Keep the preset and the seed of a data set that is begun now; one that has rollouts already stays as it is.
 
     `DatasetError` where nothing can be written.
     """
@@ -23,7 +23,7 @@ def keep_preset(folder: Path, preset: str) -> None:
     if not path.exists() and not any((folder / "episodes").glob("[0-9]*.npz")):
         try:
             with write_aside(path) as file:
-                file.write(json.dumps({"preset": preset}).encode())
+                file.write(json.dumps({"preset": preset, "seed": seed}).encode())
         except OSError as error:
             raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
 
@@ -40,6 +40,18 @@ def kept_preset(folder: Path) -> str | None:
         raise DatasetError(
             f"{path} names no preset ({error}); write the one that collected the data into it"
         ) from error
+
+
+def check_seed(folder: Path, seed: int) -> None:
+    """`UsageError` for another seed than the data set was begun with; one from before seeds were kept has none."""
+    if kept_preset(folder) is None:
+        return
+    own = json.loads(read_text(folder / NAME, MOST_BYTES)).get("seed", seed)
+    if own != seed:
+        raise UsageError(
+            f"{folder} was begun with --seed {own}, and this is --seed {seed}: give --seed {own} to go on with it, or "
+            "another --data"
+        )
 
 
 def agreed_preset(folder: Path, given: str | None) -> str:

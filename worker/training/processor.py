@@ -18,7 +18,7 @@ def spare_processor() -> None:
     update's tensors were given back to the system and asked for again, page by page: an eighth of an update's time.
     What the user set in the environment stays.
     """
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ["OMP_WAIT_POLICY"] = os.environ.get("OMP_WAIT_POLICY") or "PASSIVE"
     if not any(name.startswith("MALLOC_") for name in os.environ):
         _keep_freed_memory()
 

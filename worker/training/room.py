@@ -19,7 +19,7 @@ def told_where_full(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise DatasetError(
-            f"cannot write {path}: {error.strerror}; what was saved before is kept: "
+            f"cannot write {path}: {error.strerror}; nothing that was saved before is lost: "
             f"{'make it writable' if error.errno in FORBIDDEN else 'make room there'}, and the same command (without "
-            "--new) goes on from it"
+            "--new, where it had that) goes on"
         ) from error

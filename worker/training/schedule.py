@@ -43,11 +43,13 @@ class Schedule:
         begun = not new and path.exists() and load_progress(path).get("update") != 0
         if not new and (found := load_checkpoint(path, model, self.optimiser, frozenset() if begun else free)):
             self.progress = found
+            _check_seed(path, found.get("seed", config.seed), config.seed)
         elif other is not None and load_checkpoint(other, model, self.optimiser, free) is None:
             raise UsageError(f"--continue-from: no checkpoint at {other}")
         # Ended early: only something new to learn from, or no patience at all, makes it go on.
         if self.progress.get("stopped") not in (None, episodes) or not config.patience:
             self.progress |= {"stopped": None, "idle": 0}
+        self.progress["seed"] = config.seed
         if new:
             self._replace(other)
 
@@ -140,6 +142,15 @@ class Schedule:
         for each in (self._best_path, self._path.with_suffix(".jsonl"), *kept):
             if other is None or each.resolve() != other.resolve():
                 each.unlink(missing_ok=True)
+
+
+def _check_seed(path: Path, own: Any, given: int) -> None:
+    """`UsageError` where a training would go on by another seed than it was begun with."""
+    if own != given:
+        raise UsageError(
+            f"{path} was begun with --seed {own}, and this is --seed {given}: give --seed {own} to go on with it; "
+            "another training is one in another --data, or begins anew with --new"
+        )
 
 
 def kept_path(path: Path, update: int) -> Path:

@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     total = before + len(missing(args.data, config))
     with progress_bar("collect", total, "episodes") as bar, heeding_signals() as stop:
         bar.move(before)
-        keep_preset(args.data, preset.name)
+        keep_preset(args.data, preset.name, config.seed)
         with closing(collect(args.data, config, max(1, args.jobs), pilots)) as counts:
             for count in counts:
                 frames, done = frames + count, done + 1

@@ -46,11 +46,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Go through the stages, each of which does what is left of it."""
     from dreamfleet.common.saving import check_out
-    from dreamfleet.worker.training.origin import agreed_preset
+    from dreamfleet.worker.training.origin import agreed_preset, check_seed
     from dreamfleet.worker.training.presets import find_preset
     from dreamfleet.worker.training.source import Source
 
     preset = find_preset(agreed_preset(args.data, args.preset))
+    check_seed(args.data, args.seed)
     flags = (args.collect_flags, args.vae_flags, args.mdnrnn_flags)
     source = Source(preset, args.data, args.scale, args.seed, *flags)
     stages = source.stages(max(1, args.jobs), args.device, args.out)

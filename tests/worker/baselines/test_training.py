@@ -188,7 +188,7 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(whole, tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
 
     try:
-        with pytest.raises(DatasetError, match=r"cannot write .*000003\.npz: .*saved before is kept: make room"):
+        with pytest.raises(DatasetError, match=r"cannot write .*000003\.npz: .*saved before is lost: make room"):
             train_drqn(tmp_path, LAYERS, SHORT, fill)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

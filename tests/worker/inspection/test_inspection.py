@@ -64,6 +64,7 @@ def test_the_pages_drive_can_be_one_action_alone(attentive):
         ((1.0,), "takes steer, gas, brake: 3 numbers, not 1"),
         ((0.0, 2.0, 0.0), "takes steer from -1 to 1, gas from 0 to 1, brake from 0 to 1, not 0 2 0"),
         ((0.0, float("nan"), 0.0), "not 0 nan 0"),
+        ((0.0, 1e40, 0.0), r"not 0 1e\+40 0"),
     ],
 )
 def test_what_is_no_action_of_the_world_is_refused(attentive, action, told):

@@ -55,6 +55,15 @@ def train(data, config=SHORT, report=ignore, **more):
     return train_vae.train_vae(data, config, report, LAYERS, **more)
 
 
+def test_a_training_goes_on_by_the_seed_that_it_was_begun_with(data):
+    train(data)
+    with pytest.raises(UsageError, match=r"begun with --seed 0, and this is --seed 3: give --seed 0"):
+        train(data, replace(SHORT, updates=8, seed=3))
+    assert load_progress(data / "vae.safetensors")["update"] == 6
+    train(data, replace(SHORT, seed=3), new=True)
+    assert load_progress(data / "vae.safetensors")["seed"] == 3
+
+
 def call(*words):
     parser = argparse.ArgumentParser()
     verb.configure(parser)
@@ -118,7 +127,7 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(drives, data):
             resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
 
     try:
-        with pytest.raises(DatasetError, match=r"cannot write .*vae\.safetensors: .*saved before is kept: make room"):
+        with pytest.raises(DatasetError, match=r"cannot write .*vae\.safetensors: .*saved before is lost: make room"):
             train(data, report=fill)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

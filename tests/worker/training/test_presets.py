@@ -14,7 +14,7 @@ from dreamfleet.worker.training.collect_config import CollectConfig
 from dreamfleet.worker.training.dataset import load
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.following import follow
-from dreamfleet.worker.training.origin import agreed_preset, keep_preset, kept_preset
+from dreamfleet.worker.training.origin import agreed_preset, check_seed, keep_preset, kept_preset
 from dreamfleet.worker.training.presets import PRESETS
 from dreamfleet.worker.training.rollouts import Rollouts, inputs_of, load_rollouts
 from dreamfleet.worker.training.train_config import TrainConfig
@@ -154,7 +154,7 @@ def test_a_later_verb_without_the_data_sets_preset_is_refused(tmp_path, capsys):
 
 def test_a_data_set_from_before_presets_were_kept_stays_without_one(tmp_path):
     write_drive(tmp_path, 0)
-    keep_preset(tmp_path, "article")
+    keep_preset(tmp_path, "article", 0)
     assert kept_preset(tmp_path) is None
     assert agreed_preset(tmp_path, "paper") == "paper"
     assert agreed_preset(tmp_path, None) == "tiny"
@@ -168,6 +168,16 @@ def test_a_damaged_note_of_the_preset_is_told_in_a_line(tmp_path, content):
 
 
 def test_a_preset_is_kept_once(tmp_path):
-    keep_preset(tmp_path, "paper")
-    keep_preset(tmp_path, "tiny")
-    assert json.loads((tmp_path / "preset.json").read_text()) == {"preset": "paper"}
+    keep_preset(tmp_path, "paper", 5)
+    keep_preset(tmp_path, "tiny", 6)
+    assert json.loads((tmp_path / "preset.json").read_text()) == {"preset": "paper", "seed": 5}
+
+
+def test_a_data_set_has_one_seed(tmp_path):
+    check_seed(tmp_path, 7)
+    keep_preset(tmp_path, "paper", 5)
+    check_seed(tmp_path, 5)
+    with pytest.raises(UsageError, match="begun with --seed 5, and this is --seed 7: give --seed 5"):
+        check_seed(tmp_path, 7)
+    (tmp_path / "preset.json").write_text('{"preset": "paper"}')  # from before seeds were kept
+    check_seed(tmp_path, 7)
