@@ -28,7 +28,7 @@ def complains(processes, *arguments, says):
     ("arguments", "says"),
     [
         (("--run", "No Good"), "cannot name a run"),
-        (("--preset", "huge"), "unknown run preset 'huge': choose one of article, dream, frugal, mixed, paper, real"),
+        (("--preset", "huge"), "unknown run preset 'huge': choose one of article, dream, frugal, mixed, notebook"),
         (("--bundle", "absent"), "no bundle 'absent'"),
         (("--population", "1"), "--population must be at least 2"),
         (("--sigma0", "nan"), "--sigma0 must be a positive number"),
@@ -157,6 +157,7 @@ def test_a_worker_or_viewer_without_a_coordinator(processes):
     complains(processes, "worker", "--connect", "nowhere", says="write it as tcp/HOST:PORT")
     complains(processes, "worker", "--connect", processes.endpoint, "--run", "No", says="cannot name a run")
     complains(processes, "worker", "--connect", processes.endpoint, "--slots", "-1", says="--slots must be from 0")
+    complains(processes, "worker", "--any", "--exit-when-done", says="--any goes on to the next run")
 
 
 def test_runs_that_do_not_exist(processes):

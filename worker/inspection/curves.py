@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from dreamfleet.common.charts import COLOURS, draw_fitness
@@ -20,6 +20,7 @@ from dreamfleet.worker.inspection.section import Section
 from dreamfleet.worker.inspection.trainings import MODELS, UNITS, Curve, Training
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+MARKED = 25  # points of a line, about
 Style = dict[str, Any]
 
 
@@ -57,10 +58,10 @@ def _losses(found: Sequence[Training], model: str, looks: Mapping[str, Look]) ->
         curves = [(each.curves[part], looks[each.name]) for each in found if part in each.curves]
         for curve, look in curves:
             _draw(panel, curve, ALONE if len(found) == 1 else look)
-        _scale(panel, [line.values for curve, _ in curves for line in (curve.trained, curve.held_out)])
         panel.set_title(UNITS[part][0], fontsize=FONT + 1)
         panel.set_xlabel("update", fontsize=FONT)
         panel.set_ylabel(UNITS[part][1], fontsize=FONT)
+        _scale(panel, [line.values for curve, _ in curves for line in (curve.trained, curve.held_out)])
         panel.grid(alpha=0.3)
     handles = _keys([each.name for each in found], looks)
     figure.legend(handles=handles, fontsize=FONT, loc="outside upper center", ncols=min(len(handles), 4))
@@ -80,7 +81,7 @@ def _draw(panel: Any, curve: Curve, look: Look) -> None:
         panel.plot(
             *(np.convolve(each, mean, mode="valid") for each in (trained.updates, trained.values)), **look.trained
         )
-    panel.plot(held.updates, held.values, **look.held_out)
+    panel.plot(held.updates, held.values, markevery=max(1, len(held) // MARKED), **look.held_out)
 
 
 def _keys(names: Sequence[str], looks: Mapping[str, Look]) -> list[Line2D]:
@@ -100,6 +101,9 @@ def _scale(panel: Any, lines: Sequence[NDArray[np.float64]]) -> None:
         panel.set_yscale("log")
         panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         panel.yaxis.set_minor_formatter(NullFormatter())
+        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        panel.set_ylabel(f"{panel.get_ylabel()}, logarithmic", fontsize=FONT)
+        return
     panel.yaxis.set_major_formatter(ScalarFormatter())
 
 

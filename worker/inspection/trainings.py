@@ -72,7 +72,7 @@ class Training:
         parts = [
             f"{UNITS[part][0]} {line.at(self.best):.4g}" for part, line in held.items() if self.best in line.updates
         ]
-        return f"{self.updates:,.0f} updates; best on held-out drives at {self.best:,.0f}: {', '.join(parts)}"
+        return f"{self.updates:,.0f} updates; held-out drives lost least in all at {self.best:,.0f}: {', '.join(parts)}"
 
 
 def trainings(folders: Sequence[Path]) -> list[Training]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +27,8 @@ from dreamfleet.worker.training.schedule import Schedule
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
+
+log = logging.getLogger(__name__)
 
 CHECKPOINT, CURVE = "vae.safetensors", "vae.jsonl"
 VALIDATION_PICTURES = 2000
@@ -80,7 +83,14 @@ def train_vae(
             if schedule.update % 20 == 0:
                 point(update=schedule.update, error=loss.error, kl=loss.divergence)
             schedule.close_update(lambda: _look(model, validation, point, schedule.update, device))
-    return quality(model, held_out, device)
+    figures = quality(model, held_out, device)
+    if figures["reconstruction_error"] >= figures["mean_picture_error"]:
+        log.warning(
+            "held-out pictures are nearer to their mean (squared error %.4g) than to what this VAE makes of them "
+            "(%.4g): it holds nothing to evolve on yet; give it more --updates",
+            figures["mean_picture_error"], figures["reconstruction_error"],
+        )  # fmt: skip
+    return figures
 
 
 def _look(model: VAE, pictures: NDArray[np.uint8], point: Point, update: int, device: torch.device | None) -> float:

@@ -54,7 +54,7 @@ def test_a_completed_training_shows_batches_and_held_out_drives_of_every_loss(tr
         for curve in each.curves.values():
             assert list(curve.trained.updates) == updates
             assert list(curve.held_out.updates) == [10, 20]
-    assert vae.told.startswith("20 updates; best on held-out drives at 20: reconstruction error ")
+    assert vae.told.startswith("20 updates; held-out drives lost least in all at 20: reconstruction error ")
     assert [each.name for each in curves.losses([vae, rnn])] == ["loss-vae", "loss-mdnrnn"]
 
 
@@ -118,7 +118,7 @@ def test_a_curve_from_before_the_held_out_divergence_is_drawn(tmp_path):
         {"update": 20, "held_out": 11.0, "held_out_error": 8.0},
     )  # fmt: skip
     (found,) = trainings([folder])
-    assert found.told == "20 updates; best on held-out drives at 20: reconstruction error 8"
+    assert found.told == "20 updates; held-out drives lost least in all at 20: reconstruction error 8"
     assert not len(found.curves["kl"].held_out)
     assert curves.losses([found])[0].picture
 

@@ -55,6 +55,12 @@ def train(data, config=SHORT, report=ignore, **more):
     return train_vae.train_vae(data, config, report, LAYERS, **more)
 
 
+def test_a_vae_that_knows_less_than_the_mean_picture_is_told(data, caplog):
+    figures = train(data)
+    assert figures["reconstruction_error"] > figures["mean_picture_error"]
+    assert "it holds nothing to evolve on yet; give it more --updates" in caplog.text
+
+
 def test_a_training_goes_on_by_the_seed_that_it_was_begun_with(data):
     train(data)
     with pytest.raises(UsageError, match=r"begun with --seed 0, and this is --seed 3: give --seed 0"):
