@@ -6,7 +6,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from datetime import datetime
 from difflib import SequenceMatcher
 from pathlib import Path
@@ -361,7 +361,7 @@ def run_paths(runs_dir: Path) -> Iterator[Path]:
         yield journal.parent
 
 
-def _connect_read_only(path: Path) -> tuple[sqlite3.Connection, int]:
+def _connect_read_only(path: Path, *, rolled_back: bool = False) -> tuple[sqlite3.Connection, int]:
     """An open journal and its schema version."""
     # A finished journal on a read-only disk has no shared-memory file to map; nobody writes it either.
     immutable = "" if os.access(path.parent, os.W_OK) else "&immutable=1"
@@ -374,10 +374,19 @@ def _connect_read_only(path: Path) -> tuple[sqlite3.Connection, int]:
         return connection, schema.check(connection, path)
     except (sqlite3.Error, UnicodeError) as error:
         connection.close()
+        if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_READONLY_ROLLBACK and not rolled_back:
+            _roll_back(path)
+            return _connect_read_only(path, rolled_back=True)
         raise JournalError(f"{path} cannot be read: {_mend(error)}") from error
     except JournalError:
         connection.close()
         raise
+
+
+def _roll_back(path: Path) -> None:
+    """Undo what a coordinator that was killed had begun to write, as it turned to its log: no reader may do that."""
+    with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=5)) as connection:
+        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
 def _is_locked(error: Exception) -> bool:

@@ -32,6 +32,28 @@ def look(folder):
         run.candidate(0, 0), run.fitness(0, 0), run.results(0, 0), run.classes.told
 
 
+def test_what_a_killed_coordinator_had_begun_to_write_is_undone(folder, tmp_path):
+    """Before a journal turns to its log it has a rollback journal, which a reader must not roll back."""
+    path = folder / "journal.sqlite"
+    with sqlite3.connect(path, isolation_level=None) as writer:
+        writer.execute("PRAGMA journal_mode = DELETE")
+        writer.execute("PRAGMA cache_size = 1")  # so that pages are written before the commit
+        writer.execute("BEGIN")
+        writer.execute("CREATE TABLE more (content BLOB)")
+        for _ in range(100):
+            writer.execute("INSERT INTO more VALUES (zeroblob(4000))")
+        writer.execute("UPDATE run SET value = 'x'")
+        killed = shutil.copytree(folder, tmp_path / "killed")
+        writer.execute("ROLLBACK")
+    writer.close()
+    assert (killed / "journal.sqlite-journal").exists()
+    with pytest.raises(sqlite3.OperationalError, match="readonly"):
+        sqlite3.connect(f"file:{killed / 'journal.sqlite'}?mode=ro", uri=True).execute("SELECT * FROM run")
+    look(killed)
+    with RunFolder(killed) as run, RunFolder(folder) as own:
+        assert (run.uid, run.settings) == (own.uid, own.settings)
+
+
 def test_damaged_pages(folder, watched):
     path = folder / "journal.sqlite"
     whole, source, read = path.read_bytes(), random.Random(5), 0
