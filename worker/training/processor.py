@@ -15,7 +15,8 @@ def spare_processor() -> None:
 
     Threads that spin until the others are through take the time of whatever else runs: beside one busy process an
     update of the article's VAE on two threads took 0.61 s, and 0.38 s where they sleep; alone it is the same. Each
-    update's tensors were given back to the system and asked for again, page by page: an eighth of an update's time.
+    update's tensors were given back to the system and asked for again, page by page: an eighth of the time
+    of a VAE's update, a quarter of an MDN-RNN's (docs/measurements.md).
     What the user set in the environment stays.
     """
     os.environ["OMP_WAIT_POLICY"] = os.environ.get("OMP_WAIT_POLICY") or "PASSIVE"
