@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
 .PHONY: demo test slow setup check wheel long box2d-py simulate chaos sanitize bundle worker-size stranger reproduce \
-  reproduce-evolution lock audit sbom clean
+  reproduce-evolution lock audit sbom structure clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(ARGS)
@@ -97,6 +97,9 @@ sbom: $(SUPPLY)/.done  ## build/worker.cdx.json: what a worker's environment is 
 	$(SUPPLY)/bin/python -m pip --disable-pip-version-check --python build/locked/bin/python install --quiet --no-deps .
 	$(SUPPLY)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --validate \
 	  --output-file build/worker.cdx.json build/locked/bin/python
+
+structure:  ## figures of the structure: rooms, floors, imports between rooms, files a folder, class names, wording
+	$(PYTHON) deploy/structure.py $(ARGS)
 
 clean:
 	rm -rf $(VENV) $(SUPPLY) .venv-box2d-py build dist *.egg-info

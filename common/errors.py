@@ -43,7 +43,7 @@ class ConnectionFailedError(DreamfleetError):
     """Nobody answered over Zenoh, or the address cannot be listened on."""
 
 
-class NotLetInError(ConnectionFailedError):
+class HandshakeRejectedError(ConnectionFailedError):
     """Somebody listens there and does not let this side in; the text says why."""
 
 

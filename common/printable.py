@@ -11,7 +11,7 @@ def printable(text: str) -> str:
     return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
 
 
-def shortened(text: str, longest: int) -> str:
+def truncate(text: str, longest: int) -> str:
     """The text, printable and cut to `longest` characters, whatever its length and content."""
     text = printable(text[: longest + 1])  # what is cut off need not be looked at
     return text if len(text) <= longest else text[: longest - 3] + "..."
@@ -27,19 +27,19 @@ def plural(count: float, noun: str, nouns: str = "") -> str:
     return f"{count:{',' if isinstance(count, int) else 'g'}} {noun if count == 1 else nouns or f'{noun}s'}"
 
 
-def some(names: Sequence[str], most: int) -> str:
+def join_some(names: Sequence[str], most: int) -> str:
     """The first `most` of the names, and how many more there are: a, b and 3 more."""
     more = f" and {len(names) - most:,} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
 
-def setting(value: object) -> str:
+def format_setting(value: object) -> str:
     """A setting's value as people write it: yes or no, a number in six digits, a list with commas."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:g}"
-    return ", ".join(map(setting, value)) if isinstance(value, (list, tuple)) else str(value)
+    return ", ".join(map(format_setting, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
 def printable_lines(text: str) -> str:

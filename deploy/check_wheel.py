@@ -19,7 +19,7 @@ EXPECTED = (
     "dreamfleet/common/pretrained/tiny.zip",
     "dreamfleet/coordinator/dashboard/page/index.html",
     "dreamfleet/coordinator/dashboard/page/main.js",
-    "dreamfleet/coordinator/service.py",
+    "dreamfleet/coordinator/service/service.py",
     "dreamfleet/worker/service/worker.py",
 )
 HOSTILE = ("worker.py", "coordinator.py", "common/__init__.py", "tasks.py")

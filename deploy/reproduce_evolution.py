@@ -11,8 +11,8 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-from dreamfleet.common.processes import Child, command
-from dreamfleet.common.runs import default_runs_dir
+from dreamfleet.common.host.processes import VerbProcess, command
+from dreamfleet.common.runs.run_folder import default_runs_dir
 
 
 def main() -> int:
@@ -30,7 +30,7 @@ def main() -> int:
         for name in (f"core-{number}" for number in range(args.workers)):
             joined = ("--connect", endpoint, "--run", run, "--name", name, "--slots", 1)
             joined += ("--task", args.task) if args.task else ()
-            stack.enter_context(Child("worker", *joined, log=args.runs_dir / run / f"{name}.log"))
+            stack.enter_context(VerbProcess("worker", *joined, log=args.runs_dir / run / f"{name}.log"))
         return subprocess.run(command("repeat", args.controller, *where, "--listen", endpoint), check=False).returncode
 
 

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dreamfleet.common.actions import FIVE_CHOICES
-from dreamfleet.common.seeds import validation_seeds
+from dreamfleet.common.artifacts.actions import FIVE_CHOICES
+from dreamfleet.common.runs.seeds import validation_seeds
 
 DREAM = "dreamfleet.worker.dream:dreamfleet/CarRacingDream-v0"
 REALITY = "dreamfleet.worker.car_racing:dreamfleet/CarRacingLatent-v0"

@@ -15,19 +15,19 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dreamfleet.common.actions import Continuous, Discrete
-    from dreamfleet.common.bundle import Bundle
-    from dreamfleet.common.client import Client
-    from dreamfleet.common.controller import Controller
+    from dreamfleet.common.artifacts.actions import Continuous, Discrete
+    from dreamfleet.common.artifacts.bundle import Bundle
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.artifacts.controller import Controller
     from dreamfleet.common.errors import DreamfleetError
-    from dreamfleet.common.evaluated import Evaluated
-    from dreamfleet.common.messages import TaskSpec
-    from dreamfleet.common.runs import RunFolder as Run
-    from dreamfleet.common.store import find_bundle
-    from dreamfleet.common.tasks import Description
+    from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.protocol.messages import TaskSpec
+    from dreamfleet.common.protocol.tasks import Description
+    from dreamfleet.common.runs.episode_results import EpisodeResults
+    from dreamfleet.common.runs.run_folder import RunFolder as Run
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Task, World
-    from dreamfleet.worker.tools.face import (
+    from dreamfleet.worker.tools.public_api import (
         evaluate,
         find_agent,
         find_controller,
@@ -37,26 +37,26 @@ if TYPE_CHECKING:
     )
 
 _HOMES = {
-    "Bundle": "common.bundle",
-    "Client": "common.client",
-    "Continuous": "common.actions",
-    "Controller": "common.controller",
-    "Description": "common.tasks",
-    "Discrete": "common.actions",
+    "Bundle": "common.artifacts.bundle",
+    "Client": "common.monitoring.client",
+    "Continuous": "common.artifacts.actions",
+    "Controller": "common.artifacts.controller",
+    "Description": "common.protocol.tasks",
+    "Discrete": "common.artifacts.actions",
     "DreamfleetError": "common.errors",
-    "Evaluated": "common.evaluated",
-    "Run": "common.runs:RunFolder",
+    "EpisodeResults": "common.runs.episode_results",
+    "Run": "common.runs.run_folder:RunFolder",
     "Scorer": "worker.scoring.scorer",
     "Task": "worker.tasks.api",
-    "TaskSpec": "common.messages",
+    "TaskSpec": "common.protocol.messages",
     "World": "worker.tasks.api",
-    "evaluate": "worker.tools.face",
-    "find_agent": "worker.tools.face",
-    "find_bundle": "common.bundle",
-    "find_controller": "worker.tools.face",
-    "make_environment": "worker.tools.face",
-    "make_policy": "worker.tools.face",
-    "open_run": "worker.tools.face",
+    "evaluate": "worker.tools.public_api",
+    "find_agent": "worker.tools.public_api",
+    "find_bundle": "common.artifacts.bundle_store",
+    "find_controller": "worker.tools.public_api",
+    "make_environment": "worker.tools.public_api",
+    "make_policy": "worker.tools.public_api",
+    "open_run": "worker.tools.public_api",
 }
 __all__ = [
     "Bundle",
@@ -66,7 +66,7 @@ __all__ = [
     "Description",
     "Discrete",
     "DreamfleetError",
-    "Evaluated",
+    "EpisodeResults",
     "Run",
     "Scorer",
     "Task",

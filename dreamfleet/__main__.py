@@ -2,6 +2,6 @@
 
 import sys
 
-from dreamfleet.common.cli import main
+from dreamfleet.common.cli.command_line import main
 
 sys.exit(main())

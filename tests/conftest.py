@@ -1,12 +1,35 @@
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
 from tests.support.bundles import write_random_bundle
 from tests.support.processes import processes_in
+from tests.support.programs import LIST, NOT_INSTALLED, require_programs
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # gymnasium's checker opens every kind of window that there is
+
+
+if (
+    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+):  # as in a script's background job: all that is started inherits it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    for mark in item.iter_markers("needs_programs"):
+        require_programs(*mark.args)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport():
+    """pytest's summary has one line for the skips of one place and reason: all for a missing program get one place."""
+    report = yield
+    if report.skipped and isinstance(report.longrepr, tuple) and NOT_INSTALLED in report.longrepr[2]:
+        report.longrepr = (str(LIST), None, report.longrepr[2])
+    return report
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from dreamfleet.common.health import Finding
+from dreamfleet.common.cli.health import Finding
 
 
 def examine() -> Iterator[Finding]:
     """Whether the native picture was built and equals the installed gymnasium's."""
     remedy = "install a C compiler, then pip install --force-reinstall --no-deps dreamfleet; gymnasium draws until then"
     try:
-        from dreamfleet.worker.car_racing.check import native_is_exact
-        from dreamfleet.worker.car_racing.environment import available
+        from dreamfleet.worker.car_racing.environment import is_native_available
+        from dreamfleet.worker.car_racing.native_check import native_is_exact
     except ModuleNotFoundError as error:
         yield Finding("native picture", False, False, f"no {error.name}", "worker", "pip install 'dreamfleet[worker]'")
         return
-    if not available():
+    if not is_native_available():
         yield Finding("native picture", False, False, "not built", "worker", remedy)
     elif not native_is_exact():
         remedy = "install the tested versions of gymnasium and pygame-ce; gymnasium draws until then"

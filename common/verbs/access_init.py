@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.site import offer
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 
 SUMMARY = "make an authority, whose join files let hosts into a fleet, each in its role, over TLS"
 EXTRAS = ("access",)
@@ -13,7 +13,7 @@ EXTRAS = ("access",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    offer(
+    add_global_flags(
         parser,
         "access_dir",
         texts={"access_dir": "the folder to make (default access); it lets in whom its holder likes"},
@@ -22,18 +22,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--passwords", action="store_true",
         help="the fleet is joined by passwords that follow from a secret, rather than by certificates",
     )  # fmt: skip
-    add_json(parser)
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Make it."""
-    from dreamfleet.common.authority import Authority
+    from dreamfleet.common.security.authority import Authority
 
-    folder = args.site.access_dir
+    folder = args.global_config.access_dir
     Authority.create(folder, passwords=args.passwords)
     text = (
         f"{folder}: keep it on this host, and a copy where only you read it; next: dreamfleet access issue coordinator "
         "NAME --host HOST --out FILE"
     )
-    answer(args, text, access_dir=folder, passwords=args.passwords)
+    print_answer(args, text, access_dir=folder, passwords=args.passwords)
     return 0

@@ -7,10 +7,10 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from dreamfleet.common.difference import Difference
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.judgement import Judgement, read_judgement
-from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
+from dreamfleet.common.runs.paired_difference import PairedDifference
 
 SUMMARY = "tell the paired difference of reports that `evaluate --out` wrote, each against the first"
 EXTRAS = ()
@@ -19,30 +19,30 @@ EXTRAS = ()
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("reports", metavar="REPORT", nargs="+", type=Path, help="files of `evaluate --out`, 2 or more")
-    add_json(parser)
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print each mean, and its difference from the first on equal seeds."""
     if len(args.reports) < 2:
         raise UsageError("give two reports or more: each is compared with the first")
-    (first, base), *others = [(path, read_judgement(path)) for path in args.reports]
+    (first, base), *others = [(path, read_evaluation_report(path)) for path in args.reports]
     lines, rows = [_line(first, base)], []
     for path, each in others:
         _warn(first, base, path, each)
-        found = Difference.between(base.evaluated, each.evaluated)
-        lines += [_line(path, each), f"{path} less {first}: {found.told}"]
-        rows.append({"report": path, "against": first, **asdict(found), "clear": found.clear})
-    answer(args, "\n".join(lines), differences=rows)
+        found = PairedDifference.between(base.results, each.results)
+        lines += [_line(path, each), f"{path} less {first}: {found.description}"]
+        rows.append({"report": path, "against": first, **asdict(found), "clear": found.is_significant})
+    print_answer(args, "\n".join(lines), differences=rows)
     return 0
 
 
-def _line(path: Path, found: Judgement) -> str:
-    error = "" if found.evaluated.error is None else f" ± {found.evaluated.error:.1f}"
-    return f"{path}: {found.name}, {found.evaluated.mean:.1f}{error} on {len(found.drives)} seeds"
+def _line(path: Path, found: EvaluationReport) -> str:
+    error = "" if found.results.error is None else f" ± {found.results.error:.1f}"
+    return f"{path}: {found.name}, {found.results.mean:.1f}{error} on {len(found.drives)} seeds"
 
 
-def _warn(first: Path, base: Judgement, path: Path, other: Judgement) -> None:
+def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationReport) -> None:
     """Say what else than the controllers may make a difference."""
     for what in ("world", "fingerprint"):
         one, another = getattr(base, what), getattr(other, what)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 
-from dreamfleet.common.listing import add_json, answer
+from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.printable import printable
-from dreamfleet.common.site import offer, reached
 
 
 @dataclass(frozen=True)
@@ -17,31 +17,31 @@ class ControlVerb:
     name: str
     SUMMARY: str
     outcome: str
-    with_workers: str = ""  # what is asked for instead with --workers; empty where that is no flag
-    leaves: bool = False  # whether its coordinator leaves the run
+    request_with_workers: str = ""  # what is asked for instead with --workers; empty where that is no flag
+    coordinator_leaves: bool = False  # whether its coordinator leaves the run
     EXTRAS: tuple[str, ...] = ()
 
     def configure(self, parser: argparse.ArgumentParser) -> None:
         """Add the verb's arguments."""
         parser.add_argument("run_name", nargs="?", metavar="RUN", help="name of the run (default: the only live one)")
-        if self.with_workers:
+        if self.request_with_workers:
             parser.add_argument(
                 "--workers", action="store_true", help="end its workers too, but those of any run (--any)"
             )
-        offer(parser, "connect")
-        add_json(parser)
+        add_global_flags(parser, "connect")
+        add_json_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         """Ask, and say what follows."""
-        from dreamfleet.common.client import Client
+        from dreamfleet.common.monitoring.client import Client
 
-        asked = self.with_workers if self.with_workers and args.workers else self.name
-        with Client(reached(args, "operator", "coordinator")) as client:
+        asked = self.request_with_workers if self.request_with_workers and args.workers else self.name
+        with Client(resolve_network(args, "operator", "coordinator")) as client:
             name = args.run_name or client.status().run
             told = printable(client.control(name, asked))
-        again = {"continue": told or f"dreamfleet coordinator --resume {name}"} if self.leaves else {}
+        again = {"continue": told or f"dreamfleet coordinator --resume {name}"} if self.coordinator_leaves else {}
         then = "".join(f"; continue it on its host with: {each}" for each in again.values())
-        answer(args, f"run {name} {self.outcome}{then}", run=name, asked=asked, accepted=True, **again)
+        print_answer(args, f"run {name} {self.outcome}{then}", run=name, asked=asked, accepted=True, **again)
         return 0
 
 
@@ -49,8 +49,12 @@ PAUSE = ControlVerb("pause", "give out no more jobs; what runs is finished and c
 RESUME = ControlVerb("resume", "go on after a pause; jobs that failed are tried again", "goes on")
 DRAIN = ControlVerb(
     "drain", "give out no more jobs, wait for those that run, then leave; the run can be continued", "is draining",
-    leaves=True,
+    coordinator_leaves=True,
 )  # fmt: skip
 STOP = ControlVerb(
-    "stop", "leave now; the run can be continued", "is left by its coordinator", with_workers="disband", leaves=True
+    "stop",
+    "leave now; the run can be continued",
+    "is left by its coordinator",
+    request_with_workers="disband",
+    coordinator_leaves=True,
 )

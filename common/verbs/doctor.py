@@ -8,12 +8,12 @@ import platform
 import sys
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.cores import cores
-from dreamfleet.common.listing import add_json, print_rows
-from dreamfleet.common.site import offer
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_rows
+from dreamfleet.common.host.resource_limits import usable_cores
 
 if TYPE_CHECKING:
-    from dreamfleet.common.health import Finding
+    from dreamfleet.common.cli.health import Finding
 
 SUMMARY = "check this installation: versions, fingerprint, what each role lacks and the remedy"
 EXTRAS = ()
@@ -26,18 +26,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--role", choices=ALL_ROLES, default="coordinator",
         help="exit 1 if this role cannot be played here (default coordinator, on which every other stands)",
     )  # fmt: skip
-    offer(parser, "runs_dir", "join")
-    add_json(parser)
+    add_global_flags(parser, "runs_dir", "join")
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the report; exit 1 if the role that was asked about cannot be played."""
-    from dreamfleet.common.fingerprint import fingerprint
-    from dreamfleet.common.health import examine, lacking
+    from dreamfleet.common.cli.health import missing_for_role, run_checks
+    from dreamfleet.common.host.fingerprint import fingerprint
 
-    findings = examine(args.runs_dir, args.site.join)
-    roles = {role: lacking(role, findings) for role in ALL_ROLES}
-    host = {"python": platform.python_version(), "platform": platform.platform(), "cores": cores(),
+    findings = run_checks(args.runs_dir, args.global_config.join)
+    roles = {role: missing_for_role(role, findings) for role in ALL_ROLES}
+    host = {"python": platform.python_version(), "platform": platform.platform(), "cores": usable_cores(),
             "fingerprint": fingerprint()}  # fmt: skip
     if args.json:
         told = {role: not lacks for role, lacks in roles.items()}

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 
-from dreamfleet.common.config import add_flags, load, option
-from dreamfleet.common.descriptors import raise_limit
+from dreamfleet.common.cli.config import add_flags, load, option
+from dreamfleet.common.cli.global_config import add_global_flags, load_credentials
 from dreamfleet.common.errors import DreamfleetError, UsageError
-from dreamfleet.common.files import open_new
-from dreamfleet.common.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT, Network
-from dreamfleet.common.site import joined, offer
-from dreamfleet.common.stopping import SIGNALS
-from dreamfleet.common.unblocked import unblock_stderr
+from dreamfleet.common.files.atomic_write import open_new
+from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
+from dreamfleet.common.host.resource_limits import raise_open_file_limit
+from dreamfleet.common.host.stop_signals import SIGNALS
+from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT, Network
 
 SUMMARY = "pass messages on between coordinators and workers that connect here; it keeps nothing and may be restarted"
 EXTRAS = ()
@@ -36,7 +36,7 @@ class RouterConfig:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     add_flags(parser, RouterConfig)
-    offer(parser, "join", "access_dir")
+    add_global_flags(parser, "join", "access_dir")
     parser.add_argument(
         "--print-config", action="store_true", help="print what Zenoh's own zenohd reads to do the same, and leave"
     )
@@ -48,44 +48,46 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Route until Ctrl-C or SIGTERM."""
-    from dreamfleet.common.ledger import Revocations
-    from dreamfleet.common.router import route
-    from dreamfleet.common.session import settings_of
+    from dreamfleet.common.security.certificate_ledger import RevocationWatcher
+    from dreamfleet.common.transport.router import run_router
+    from dreamfleet.common.transport.session import zenoh_config
 
-    unblock_stderr()
-    raise_limit()
+    make_stderr_nonblocking()
+    raise_open_file_limit()
     config = load(RouterConfig, "router", **args.sources)
-    credentials = joined(args, ("router",))
-    barred = Revocations(args.site.access_dir, credentials).barred
+    credentials = load_credentials(args, ("router",))
+    revoked_seats = RevocationWatcher(args.global_config.access_dir, credentials).revoked_seats
     default = DEFAULT_ENDPOINT if credentials is None else SECURED_ENDPOINT
-    network = Network(config.listen or args.site.listen or (default,), config.connect, credentials, barred)
+    network = Network(
+        config.listen or args.global_config.listen or (default,), config.connect, credentials, revoked_seats
+    )
     network.check_open(insecure=config.insecure)
     if args.print_config:
         if credentials is not None:
             raise UsageError("--print-config would print what the join file keeps secret: --write-config FILE.json5")
-        print(json.dumps(settings_of(network, None), indent=2))
+        print(json.dumps(zenoh_config(network, None), indent=2))
         return 0
     if args.write_config is not None:
-        _write(args.write_config, network)
+        _write_config(args.write_config, network)
         return 0
     stopped = Event()
     for number in SIGNALS:
         signal.signal(number, lambda *_: stopped.set())
-    route(network, stopped)
+    run_router(network, stopped)
     return 0
 
 
-def _write(path: Path, network: Network) -> None:
+def _write_config(path: Path, network: Network) -> None:
     """What zenohd reads, as a file; certificates and keys stand in it."""
-    from dreamfleet.common.session import settings_of
+    from dreamfleet.common.transport.session import zenoh_config
 
     if path.suffix not in (".json", ".json5"):
         raise UsageError(f"--write-config {path}: zenohd knows what it reads by its name: end it in .json5")
-    if network.credentials is not None and network.credentials.with_passwords:
+    if network.credentials is not None and network.credentials.uses_passwords:
         raise UsageError("--write-config is for certificates: of a fleet with passwords let this verb be the router")
     try:
         with open_new(path) as file:
-            file.write(json.dumps(settings_of(network, None), indent=2).encode())
+            file.write(json.dumps(zenoh_config(network, None), indent=2).encode())
     except FileExistsError:
         raise UsageError(f"--write-config {path} exists: name another, or remove it first") from None
     except OSError as error:

@@ -11,17 +11,17 @@ from dataclasses import replace
 from time import sleep
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from dreamfleet.common.codec import MalformedError
+from dreamfleet.common.cli.global_config import add_global_flags, add_run_argument, resolve_network
+from dreamfleet.common.cli.output import print_rows
 from dreamfleet.common.errors import ConnectionFailedError
-from dreamfleet.common.listing import print_rows
-from dreamfleet.common.site import offer, offer_run, reached
+from dreamfleet.common.serialization.validation import MalformedError
 
 if TYPE_CHECKING:
-    from dreamfleet.common.client import Client
-    from dreamfleet.common.network import Network
-    from dreamfleet.common.status import Status
-    from dreamfleet.common.stored import StoredGeneration
-    from dreamfleet.common.table import RunPanel
+    from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.monitoring.status import Status
+    from dreamfleet.common.monitoring.status_panel import RunPanel
+    from dreamfleet.common.runs.records import StoredGeneration
+    from dreamfleet.common.transport.network import Network
 
 T = TypeVar("T")
 SUMMARY = "show how a run is: generation, population, best, workers, throughput, waste"
@@ -31,8 +31,8 @@ REFRESH = 0.5  # seconds
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    offer(parser, "connect")
-    offer_run(parser)
+    add_global_flags(parser, "connect")
+    add_run_argument(parser)
     parser.add_argument(
         "--json", action="store_true", help="print the document as the wire has it; with --watch one line each time"
     )
@@ -45,22 +45,22 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the status; of several live runs, of which none is named, a line each."""
-    from dreamfleet.common.client import Client
+    from dreamfleet.common.monitoring.client import Client
 
     if args.watch:
-        return _watch(reached(args), args.run_name, as_json=args.json)
-    with Client(reached(args)) as client:
+        return _watch(resolve_network(args), args.run_name, as_json=args.json)
+    with Client(resolve_network(args)) as client:
         documents = [client.document(args.run_name)] if args.run_name or args.json else client.statuses()
         if args.json:
             print(json.dumps(documents[0], indent=2))
         elif len(documents) > 1:
-            print_several(documents)
+            print_runs(documents)
         else:
             _print_once(client, documents[0] if documents else client.document())
     return 0
 
 
-def _redraws() -> bool:
+def _can_redraw() -> bool:
     """Whether a picture can be drawn over the last one: a terminal that is dumb would show nothing until the end."""
     from rich.console import Console
 
@@ -68,12 +68,12 @@ def _redraws() -> bool:
     return sys.stdout.isatty() and not console.is_dumb_terminal
 
 
-def print_several(documents: Sequence[dict[str, Any]]) -> None:
+def print_runs(documents: Sequence[dict[str, Any]]) -> None:
     """A line for each run; what cannot be read is a note."""
-    from dreamfleet.common.eta import eta_of
+    from dreamfleet.common.monitoring.eta import estimate_eta
+    from dreamfleet.common.monitoring.status import read_status
     from dreamfleet.common.printable import plural
-    from dreamfleet.common.status import read_status
-    from dreamfleet.common.stored import with_error
+    from dreamfleet.common.runs.records import format_mean
 
     statuses = []
     for document in documents:
@@ -87,35 +87,35 @@ def print_several(documents: Sequence[dict[str, Any]]) -> None:
             "run": each.run,
             "state": each.state,
             "generation": each.generation.number,
-            "best": None if (best := each.confirmed or each.best) is None else with_error(best),
+            "best": None if (best := each.confirmed or each.best) is None else format_mean(best),
             "workers": f"{each.workers.present}" + (f", {each.workers.lost} lost" if each.workers.lost else ""),
             "steps/s": f"{each.throughput.steps_per_second:,.0f}",
-            "to go": eta_of(each).told,
+            "to go": estimate_eta(each).description,
         }
         for each in statuses
     ]
-    print_rows(rows, right=("generation", "steps/s"), least_first=("steps/s", "workers", "best"))
+    print_rows(rows, right=("generation", "steps/s"), drop_order=("steps/s", "workers", "best"))
     print(f"{plural(len(rows), 'live run')}; `dreamfleet status RUN` tells more", file=sys.stderr)
 
 
 def _print_once(client: Client, document: dict[str, Any]) -> None:
     from rich.console import Console
 
-    from dreamfleet.common.status import read_status
+    from dreamfleet.common.monitoring.status import read_status
 
-    Console().print(_Picture(client).of(read_status(document)))
+    Console().print(_PanelBuilder(client).build(read_status(document)))
 
 
 def _watch(network: Network, name: str | None, *, as_json: bool) -> int:
     """Until the coordinator leaves; one that does not answer (yet, or any more) is waited for."""
-    from dreamfleet.common.client import Client
+    from dreamfleet.common.monitoring.client import Client
 
-    show = _print_lines if as_json else _show if _redraws() else _tell
-    with _patiently(lambda: Client(network)) as client:
-        return show(client, name or str(_patiently(client.document)["run"]))
+    show = _print_json_lines if as_json else _show_live if _can_redraw() else _print_changes
+    with _retry_until_answered(lambda: Client(network)) as client:
+        return show(client, name or str(_retry_until_answered(client.document)["run"]))
 
 
-def _patiently(ask: Callable[[], T]) -> T:
+def _retry_until_answered(ask: Callable[[], T]) -> T:
     """What `ask` answers, once it does; that it does not is said once."""
     told = False
     while True:
@@ -128,54 +128,54 @@ def _patiently(ask: Callable[[], T]) -> T:
             sleep(REFRESH)
 
 
-def _followed(client: Client, name: str) -> Iterator[dict[str, Any]]:
+def _follow_documents(client: Client, name: str) -> Iterator[dict[str, Any]]:
     """The status again and again, until the coordinator leaves."""
     while True:
         try:
             yield from client.watch_documents(name, REFRESH)
         except ConnectionFailedError:
-            _patiently(lambda: client.document(name))
+            _retry_until_answered(lambda: client.document(name))
         else:
             return
 
 
-def _print_lines(client: Client, name: str) -> int:
-    for document in _followed(client, name):
+def _print_json_lines(client: Client, name: str) -> int:
+    for document in _follow_documents(client, name):
         print(json.dumps(document), flush=True)
     return 0
 
 
-def _show(client: Client, name: str) -> int:
+def _show_live(client: Client, name: str) -> int:
     from rich.live import Live
 
-    from dreamfleet.common.status import read_status
+    from dreamfleet.common.monitoring.status import read_status
 
-    picture = _Picture(client, fitted=True)
+    panels = _PanelBuilder(client, fitted=True)
     with Live(refresh_per_second=4, vertical_overflow="crop") as live:
-        for document in _followed(client, name):
-            live.update(picture.of(read_status(document)), refresh=True)
+        for document in _follow_documents(client, name):
+            live.update(panels.build(read_status(document)), refresh=True)
     return 0
 
 
-def _tell(client: Client, name: str) -> int:
+def _print_changes(client: Client, name: str) -> int:
     """A line when a generation, an evaluation, the state or the number of workers is another; at last the picture."""
     from rich.console import Console
 
-    from dreamfleet.common.eta import summary
+    from dreamfleet.common.monitoring.eta import summarise_status
+    from dreamfleet.common.monitoring.status import read_status
     from dreamfleet.common.printable import one_line
-    from dreamfleet.common.status import read_status
 
     told = None
-    for status in map(read_status, _followed(client, name)):
+    for status in map(read_status, _follow_documents(client, name)):
         now = status.state, status.generation.number, status.evaluations, status.workers.present
         if now != told:
-            print(one_line(f"{status.run}: {summary(status)}"), flush=True)
+            print(one_line(f"{status.run}: {summarise_status(status)}"), flush=True)
         told = now
-    Console().print(_Picture(client).of(status))
+    Console().print(_PanelBuilder(client).build(status))
     return 0
 
 
-class _Picture:
+class _PanelBuilder:
     """Draws one status after another, with all workers and all closed generations, of which each is asked for once."""
 
     def __init__(self, client: Client, *, fitted: bool = False) -> None:
@@ -184,30 +184,30 @@ class _Picture:
         self._run_uid = ""
         self._history: list[StoredGeneration] = []
 
-    def of(self, status: Status) -> RunPanel:
+    def build(self, status: Status) -> RunPanel:
         """The picture of this one."""
-        from dreamfleet.common.table import RunPanel
+        from dreamfleet.common.monitoring.status_panel import RunPanel
 
-        whole = replace(_with_all_workers(self._client, status), recent=tuple(self._all(status)))
+        whole = replace(_with_all_workers(self._client, status), recent=tuple(self._full_history(status)))
         return RunPanel(whole, self._client.worker_flags, fitted=self._fitted)
 
-    def _all(self, status: Status) -> list[StoredGeneration]:
+    def _full_history(self, status: Status) -> list[StoredGeneration]:
         if status.run_uid != self._run_uid:
             self._run_uid, self._history = status.run_uid, []
-        if not status.over and status.recent and status.recent[0].number > self._next:
+        if not status.is_over and status.recent and status.recent[0].number > self._next_generation:
             with suppress(ConnectionFailedError):
                 self._history += self._client.history(status.run, len(self._history))
-        self._history += [each for each in status.recent if each.number >= self._next]
+        self._history += [each for each in status.recent if each.number >= self._next_generation]
         return self._history
 
     @property
-    def _next(self) -> int:
+    def _next_generation(self) -> int:
         return self._history[-1].number + 1 if self._history else 0
 
 
 def _with_all_workers(client: Client, status: Status) -> Status:
     """The same with those that had no room in it, while the coordinator is there to tell of them."""
-    if status.over or len(status.worker_list) >= status.workers.known:
+    if status.is_over or len(status.worker_list) >= status.workers.known:
         return status
     with suppress(ConnectionFailedError):
         return replace(status, worker_list=tuple(client.workers(status.run)))

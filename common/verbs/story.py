@@ -8,17 +8,17 @@ import re
 import sys
 from typing import TYPE_CHECKING, get_args
 
+from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
+from dreamfleet.common.cli.output import add_json_flag, print_rows
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, print_rows
-from dreamfleet.common.printable import some
-from dreamfleet.common.site import offer, reached
+from dreamfleet.common.printable import join_some
 
 if TYPE_CHECKING:
-    from dreamfleet.common.client import Client
+    from dreamfleet.common.monitoring.client import Client
 
 SUMMARY = "tell what happened to a live run's workers and jobs of late: given, seen, lost, reissued, accepted, ..."
 EXTRAS = ()
-MOST_TOLD = 8  # workers by name
+MOST_NAMED = 8  # workers by name
 LAST = 40  # events that people are shown unless they say otherwise
 
 
@@ -35,14 +35,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--last", type=int, metavar="N", help=f"so many events at most (default {LAST}; with --json all that are told)"
     )
-    offer(parser, "connect")
-    add_json(parser)
+    add_global_flags(parser, "connect")
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the events, the newest last; how many more there are goes to stderr."""
-    from dreamfleet.common.client import Client
-    from dreamfleet.common.status import What
+    from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.monitoring.status import EventKind
 
     if args.job is not None and not re.fullmatch(r"\d{1,12}/\d{1,12}", args.job):
         raise UsageError(f"--job {args.job!r}: write generation/index, such as 3/0")
@@ -50,10 +50,10 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--worker {args.worker!r}: give a name as `dreamfleet status` shows it")
     if args.last is not None and args.last < 1:
         raise UsageError("--last must be at least 1")
-    if strange := [each for each in args.what if each not in (words := get_args(What))]:
+    if strange := [each for each in args.what if each not in (words := get_args(EventKind))]:
         raise UsageError(f"--what {strange[0]!r}: there are {', '.join(words)}")
-    with Client(reached(args)) as client:
-        events, total = client.story(args.run_name, args.worker or "", args.job or "", args.what)
+    with Client(resolve_network(args)) as client:
+        events, total = client.events(args.run_name, args.worker or "", args.job or "", args.what)
         if args.worker is not None and not events and not args.what:
             _check_known(client, args.run_name or client.status().run, args.worker)
     events = events[-(args.last or (len(events) if args.json else LAST)) :]
@@ -74,10 +74,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_known(client: Client, run: str, worker: str) -> None:
     """`UsageError` with the names of those that are known, unless this is a worker's or a host's."""
-    events, _ = client.story(run)  # of those that are gone, too
+    events, _ = client.events(run)  # of those that are gone, too
     known = [*(each.worker for each in client.workers(run)), *(each.worker for each in events)]
     hosts = list(dict.fromkeys(each.partition("/")[0] for each in known))
     if worker in (*known, *hosts):
         return
-    there = f"known are {some(hosts, MOST_TOLD)}" if hosts else "none has come"
+    there = f"known are {join_some(hosts, MOST_NAMED)}" if hosts else "none has come"
     raise UsageError(f"run {run} knows no worker {worker!r}: {there}")

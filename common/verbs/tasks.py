@@ -6,7 +6,7 @@ import argparse
 import json
 from importlib.metadata import EntryPoint
 
-from dreamfleet.common.listing import print_rows
+from dreamfleet.common.cli.output import print_rows
 
 SUMMARY = "list the tasks that installed packages register, and what keeps one from running here"
 EXTRAS = ()
@@ -19,7 +19,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a line a task; the exit code is 0 also where one cannot run."""
-    from dreamfleet.common.tasks import registered_tasks
+    from dreamfleet.common.protocol.tasks import registered_tasks
 
     rows = [_row(name, point) for name, point in registered_tasks().items()]
     if args.json:
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _row(name: str, point: EntryPoint) -> dict[str, object]:
-    from dreamfleet.common.tasks import GYM
+    from dreamfleet.common.protocol.tasks import GYM
 
     distribution = "-" if point.dist is None else f"{point.dist.name} {point.dist.version}"
     shown = f"{name}:ENVIRONMENT" if name == GYM else name

@@ -15,36 +15,36 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from dreamfleet.common.errors import DreamfleetError, UsageError
-from dreamfleet.common.metrics import CONTENT_TYPE, exposition
+from dreamfleet.common.monitoring.prometheus import CONTENT_TYPE, exposition
 from dreamfleet.common.printable import printable
-from dreamfleet.coordinator.dashboard import past
+from dreamfleet.coordinator.dashboard import stored_runs
+from dreamfleet.coordinator.dashboard.assets import Assets
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.dashboard.feed import Feed
-from dreamfleet.coordinator.dashboard.files import Files
 from dreamfleet.coordinator.dashboard.guard import Guard
-from dreamfleet.coordinator.dashboard.plain import event, written
-from dreamfleet.coordinator.dashboard.views import Subject, Views
+from dreamfleet.coordinator.dashboard.sse import event, to_json
+from dreamfleet.coordinator.dashboard.view_processes import ViewProcesses, ViewTarget
 
 EVENTS = "text/event-stream"
 FULL = "too many pages are open: close some\n"
 FOR_EVER = "private, max-age=31536000, immutable"
 
 
-def make_app(feed: Feed, views: Views, runs_dir: Path, config: DashboardConfig) -> ASGIApp:
+def make_app(feed: Feed, views: ViewProcesses, runs_dir: Path, config: DashboardConfig) -> ASGIApp:
     """The page, behind its guard; `ModuleNotFoundError` where a package of the extra is missing."""
-    answers = _Answers(feed, views, runs_dir, Files())
+    handlers = _Handlers(feed, views, runs_dir, Assets())
     routes = [
-        Route("/", answers.index), Route("/files/{digest}/{name}", answers.file), Route("/live", answers.live),
-        Route("/view", answers.view), Route("/metrics", answers.metrics),
-        Route("/runs", answers.runs), Route("/runs/{name}", answers.run),
+        Route("/", handlers.index), Route("/files/{digest}/{name}", handlers.file), Route("/live", handlers.live),
+        Route("/view", handlers.view), Route("/metrics", handlers.metrics),
+        Route("/runs", handlers.runs), Route("/runs/{name}", handlers.run),
     ]  # fmt: skip
     return Guard(Starlette(routes=routes), config.token, is_loopback=config.is_loopback)
 
 
-class _Answers:
+class _Handlers:
     """Those that are no `async def` run in a thread: they read disks."""
 
-    def __init__(self, feed: Feed, views: Views, runs_dir: Path, files: Files) -> None:
+    def __init__(self, feed: Feed, views: ViewProcesses, runs_dir: Path, files: Assets) -> None:
         self._feed = feed
         self._views = views
         self._runs_dir = runs_dir
@@ -60,8 +60,8 @@ class _Answers:
             return PlainTextResponse("there is no such file; load the page anew\n", 404)
         headers = {"cache-control": FOR_EVER, "vary": "accept-encoding"}
         if "gzip" in request.headers.get("accept-encoding", ""):
-            return Response(found.packed, 200, {**headers, "content-encoding": "gzip"}, found.kind)
-        return Response(found.data, 200, headers, found.kind)
+            return Response(found.gzipped, 200, {**headers, "content-encoding": "gzip"}, found.media_type)
+        return Response(found.data, 200, headers, found.media_type)
 
     async def live(self, request: Request) -> Response:
         if self._feed.is_full:
@@ -72,43 +72,43 @@ class _Answers:
         if self._views.is_full:
             return PlainTextResponse(FULL, 503)
         try:
-            subject = Subject.of(request.query_params)
+            target = ViewTarget.of(request.query_params)
         except UsageError as error:
             return PlainTextResponse(f"{printable(str(error))}\n", 400)
-        return _stream(request, self._views.events(subject))
+        return _stream(request, self._views.events(target))
 
     async def metrics(self, _request: Request) -> Response:
         """Of all live runs; who reads them is a viewer for one picture."""
-        async with aclosing(self._feed.pictures()) as pictures:
-            async for picture in pictures:
-                return Response(exposition(*picture.statuses), media_type=CONTENT_TYPE)
+        async with aclosing(self._feed.snapshots()) as snapshots:
+            async for snapshot in snapshots:
+                return Response(exposition(*snapshot.statuses), media_type=CONTENT_TYPE)
         return PlainTextResponse("this page is about to leave\n", 503)
 
     async def runs(self, _request: Request) -> Response:
         """Read once for all who ask meanwhile: thousands of journals take seconds, and would take every thread."""
         if self._listing is None or self._listing.done():
-            self._listing = asyncio.create_task(asyncio.to_thread(past.listed, self._runs_dir))
+            self._listing = asyncio.create_task(asyncio.to_thread(stored_runs.list_runs, self._runs_dir))
         rows = await asyncio.shield(self._listing)
         return _json({"runs": rows, "folder": printable(str(self._runs_dir))})
 
     def run(self, request: Request) -> Response:
         try:
-            return _json(past.one(self._runs_dir, request.path_params["name"]))
+            return _json(stored_runs.describe_run(self._runs_dir, request.path_params["name"]))
         except DreamfleetError as error:
             return _json({"error": printable(str(error))}, 404)
 
     async def _events(self, run: str | None) -> AsyncIterator[bytes]:
         """A frame for each picture, and the curves of its run whenever they are others."""
-        yield event("hello", {"digest": self._files.digest, "views": self._views.are_offered})
-        drawn = None
-        async for picture in self._feed.pictures():
-            shown = picture.of(run)
+        yield event("hello", {"digest": self._files.digest, "views": self._views.is_enabled})
+        curves_version = None
+        async for snapshot in self._feed.snapshots():
+            shown = snapshot.find(run)
             if shown is None:
-                yield picture.absent
+                yield snapshot.absent_event
                 continue
-            yield shown.frame
-            if shown.drawn != drawn:
-                drawn = shown.drawn
+            yield shown.page_state
+            if shown.curves_version != curves_version:
+                curves_version = shown.curves_version
                 yield shown.curves
 
 
@@ -118,4 +118,4 @@ def _stream(request: Request, events: AsyncIterator[bytes]) -> Response:
 
 
 def _json(document: Mapping[str, Any], status: int = 200) -> Response:
-    return Response(written(document), status, media_type="application/json")
+    return Response(to_json(document), status, media_type="application/json")

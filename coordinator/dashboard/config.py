@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from dreamfleet.common.config import option
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.network import is_loopback_host
+from dreamfleet.common.transport.network import is_loopback_host
 
 LEAST_TOKEN = 12  # characters: whoever can reach the port can guess
 

@@ -6,8 +6,8 @@ import asyncio
 import logging
 from collections.abc import AsyncGenerator, Callable
 
-from dreamfleet.common.mishaps import Mishaps
-from dreamfleet.coordinator.dashboard.watching import Picture, Watcher
+from dreamfleet.common.host.error_counter import ErrorCounter
+from dreamfleet.coordinator.dashboard.live_runs import DashboardSnapshot, Watcher
 
 REFRESH = 1.0  # seconds
 LINGER = 5.0  # seconds that it looks on after the last viewer has gone: perhaps the page is only loaded anew
@@ -25,9 +25,9 @@ class Feed:
         self._watcher = watcher
         self._refresh = refresh
         self._linger = linger
-        self._mishaps = Mishaps(log)
+        self._error_counter = ErrorCounter(log)
         self._viewers = 0
-        self._latest: Picture | None = None
+        self._latest: DashboardSnapshot | None = None
         self._changed = asyncio.Event()  # set, and replaced, as a picture becomes the latest
         self._polling: asyncio.Task[None] | None = None
         self._closed = False
@@ -38,11 +38,11 @@ class Feed:
         return self._viewers >= MOST_VIEWERS
 
     @property
-    def is_looking(self) -> bool:
+    def is_polling(self) -> bool:
         """Whether anybody is asked anything."""
         return self._polling is not None
 
-    async def pictures(self) -> AsyncGenerator[Picture, None]:
+    async def snapshots(self) -> AsyncGenerator[DashboardSnapshot, None]:
         """The latest one, then each that is newer, until the feed is closed."""
         self._viewers += 1
         if self._polling is None:
@@ -62,7 +62,7 @@ class Feed:
     def close(self) -> None:
         """Let every viewer go."""
         self._closed = True
-        self._tell()
+        self._notify()
 
     async def _poll(self) -> None:
         clock = asyncio.get_running_loop().time
@@ -70,22 +70,22 @@ class Feed:
         try:
             while not self._closed and clock() < left:
                 began = clock()
-                await self._look(self._watcher.look)
+                await self._poll_once(self._watcher.poll)
                 if self._viewers:
                     left = clock() + self._linger
                 await asyncio.sleep(max(began + self._refresh - clock(), 0.0))
         finally:
             self._latest, self._polling = None, None
-        await asyncio.to_thread(self._watcher.rest)
+        await asyncio.to_thread(self._watcher.suspend)
 
-    async def _look(self, look: Callable[[], Picture]) -> None:
+    async def _poll_once(self, poll: Callable[[], DashboardSnapshot]) -> None:
         try:
-            self._latest = await asyncio.to_thread(look)
+            self._latest = await asyncio.to_thread(poll)
         except Exception as error:  # a look that fails costs that look alone
-            self._mishaps.note("look", error, "at live runs")
+            self._error_counter.record("look", error, "at live runs")
             return
-        self._tell()
+        self._notify()
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         self._changed.set()
         self._changed = asyncio.Event()

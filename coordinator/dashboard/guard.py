@@ -27,8 +27,8 @@ HEADERS = {
     "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
 }
-_OURS = re.compile(r"(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?", re.IGNORECASE)
-ASKING = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+_OWN_HOST = re.compile(r"(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?", re.IGNORECASE)
+LOGIN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>dreamfleet: token</title><style>body{{font:16px/1.5 system-ui,sans-serif;margin:15vh auto;max-width:26rem;
 padding:0 1rem;color-scheme:light dark}}input,button{{font:inherit;padding:.4rem .6rem}}</style>
 <h1>dreamfleet</h1><p>{text}</p><form method="get" action="/"><label>Token
@@ -75,33 +75,33 @@ class Guard:
         if self._token is None:
             return None
         given = QueryParams(scope["query_string"]).get("token")
-        if given is not None and equal(given, self._token):
+        if given is not None and constant_time_equal(given, self._token):
             answer = RedirectResponse("/", 303)  # without the token, which an address bar would show
-            answer.set_cookie(COOKIE, proof(self._token), httponly=True, samesite="lax", path="/")
+            answer.set_cookie(COOKIE, cookie_value(self._token), httponly=True, samesite="lax", path="/")
             return answer
-        if self._is_known(headers):
+        if self._is_authorised(headers):
             return None
         text = "This is not the token." if given is not None else "Who looks at these runs must know their token."
         told = {"www-authenticate": 'Bearer realm="dreamfleet"'}
-        return HTMLResponse(ASKING.format(text=escape(text)), 401, told)
+        return HTMLResponse(LOGIN_PAGE.format(text=escape(text)), 401, told)
 
-    def _is_known(self, headers: Mapping[str, str]) -> bool:
+    def _is_authorised(self, headers: Mapping[str, str]) -> bool:
         assert self._token is not None
         kind, _, told = headers.get("authorization", "").partition(" ")
         if kind.lower() == "bearer":
             # A header is read as Latin-1, and whoever holds a token of other letters writes it in UTF-8.
             travelled = told.strip().encode("latin-1", "replace").decode(errors="replace")
-            return any([equal(told.strip(), self._token), equal(travelled, self._token)])
+            return any([constant_time_equal(told.strip(), self._token), constant_time_equal(travelled, self._token)])
         try:
             cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
         except CookieError:
             return False
-        return cookie is not None and equal(cookie.value, proof(self._token))
+        return cookie is not None and constant_time_equal(cookie.value, cookie_value(self._token))
 
 
 def is_own_host(host: str) -> bool:
     """Whether a Host header names this computer, as nobody else's page can."""
-    return bool(_OURS.fullmatch(host))
+    return bool(_OWN_HOST.fullmatch(host))
 
 
 def is_foreign(headers: Mapping[str, str], path: str) -> bool:
@@ -114,11 +114,11 @@ def is_foreign(headers: Mapping[str, str], path: str) -> bool:
     return path != "/" or headers.get("sec-fetch-mode") != "navigate"
 
 
-def equal(given: str, wanted: str) -> bool:
+def constant_time_equal(given: str, wanted: str) -> bool:
     """Whether two texts are the same, in a time that tells nothing of where they differ."""
     return hmac.compare_digest(*(hashlib.sha256(each.encode(errors="replace")).digest() for each in (given, wanted)))
 
 
-def proof(token: str) -> str:
+def cookie_value(token: str) -> str:
     """What a browser keeps: it shows that the token was known, and is not it."""
     return hmac.new(token.encode(errors="replace"), b"dreamfleet dashboard", hashlib.sha256).hexdigest()

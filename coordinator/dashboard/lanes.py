@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from dreamfleet.common.status import WorkerStatus
+from dreamfleet.common.monitoring.status import WorkerStatus
 
 STRETCH = 5.0  # seconds of one character
 LENGTH = 60  # characters: five minutes
@@ -25,7 +25,7 @@ class Lanes:
     def __init__(self) -> None:
         self._stretches: deque[_Stretch] = deque(maxlen=LENGTH)
 
-    def take(self, workers: Sequence[WorkerStatus], now: float) -> None:
+    def update(self, workers: Sequence[WorkerStatus], now: float) -> None:
         """What was seen at `now`, in seconds of any clock."""
         began = now - now % STRETCH
         if self._stretches:
@@ -34,24 +34,24 @@ class Lanes:
                 self._stretches.append(_Stretch(began - behind * STRETCH))
         if not self._stretches or self._stretches[-1].began < began:
             self._stretches.append(_Stretch(began))
-        self._stretches[-1].states |= {each.worker: _state(each) for each in workers}
+        self._stretches[-1].states |= {each.worker: _sign_and_rate(each) for each in workers}
 
-    def told(self, workers: Sequence[WorkerStatus]) -> list[str]:
+    def render(self, workers: Sequence[WorkerStatus]) -> list[str]:
         """The lane of each of these workers, all equally long."""
         fastest = max((rate for each in self._stretches for _, rate in each.states.values()), default=0.0)
         signs = [
-            {worker: sign or _speed(rate, fastest) for worker, (sign, rate) in each.states.items()}
+            {worker: sign or _speed_digit(rate, fastest) for worker, (sign, rate) in each.states.items()}
             for each in self._stretches
         ]
         return ["".join(each.get(worker.worker, UNKNOWN) for each in signs).rjust(LENGTH) for worker in workers]
 
 
-def _state(worker: WorkerStatus) -> tuple[str, float]:
+def _sign_and_rate(worker: WorkerStatus) -> tuple[str, float]:
     if worker.state != "present":
         return (SILENT if worker.state == "silent" else LOST), 0.0
     rate = worker.steps_per_second / max(worker.slots, 1)
     return ("", rate) if rate > 0 else (IDLE, 0.0)
 
 
-def _speed(rate: float, fastest: float) -> str:
+def _speed_digit(rate: float, fastest: float) -> str:
     return str(min(max(round(9 * rate / fastest), 1), 9))

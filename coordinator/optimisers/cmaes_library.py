@@ -19,7 +19,7 @@ class CmaesOptimiser(ABC):
 
     requirement: ClassVar[str] = f"cmaes=={version('cmaes')}"
     options: ClassVar[Mapping[str, str]] = {}
-    kept: ClassVar[tuple[str, ...]]  # the attributes that are its state, without their underscore
+    state_names: ClassVar[tuple[str, ...]]  # the attributes that are its state, without their underscore
 
     def __init__(self, search: Search) -> None:
         self._search = search
@@ -64,9 +64,9 @@ class CmaesOptimiser(ABC):
 
     def state(self) -> State:
         """What an update reads, and the generator's state."""
-        return cmaes_state.dump(self._strategy, self.kept)
+        return cmaes_state.dump(self._strategy, self.state_names)
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a `state`."""
         self._strategy = self._build(self._search)
-        cmaes_state.restore(self._strategy, self.kept, state)
+        cmaes_state.restore(self._strategy, self.state_names, state)

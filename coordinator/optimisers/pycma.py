@@ -21,7 +21,7 @@ from dreamfleet.coordinator.optimisers.api import Search, State
 from dreamfleet.coordinator.optimisers.normals import Normals
 
 HISTORY = 100  # entries that stay of each of pycma's histories
-FAR = 1e60  # from one: a factor that is further away is brought back
+FURTHEST_FACTOR = 1e60  # from one: a factor that is further away is brought back
 
 
 class Pycma:
@@ -79,7 +79,11 @@ class Pycma:
         # Histories by which pycma would stop by itself, which nothing else reads: a state must not grow with the run.
         del self._strategy.fit.histbest[HISTORY:], self._strategy.fit.histmedian[HISTORY:]
         scaling = self._strategy.sigma_vec.scaling
-        if self._diagonal and (scaling.min() < 1 / FAR or scaling.max() > FAR) and self.sigma > 0:
+        if (
+            self._diagonal
+            and (scaling.min() < 1 / FURTHEST_FACTOR or scaling.max() > FURTHEST_FACTOR)
+            and self.sigma > 0
+        ):
             self._balance()
 
     def prepare(self) -> None:
@@ -95,7 +99,7 @@ class Pycma:
         arrays = dict(state)
         random = json.loads(str(arrays.pop("random")))
         self._begin(arrays["mean"].astype(np.float64))
-        if not pycma_state.untold(arrays):
+        if not pycma_state.is_before_first_tell(arrays):
             # pycma builds some of its parts at the first ask and tell; they must be there to be overwritten.
             self.ask()
             self.tell(np.arange(self._search.population, dtype=np.float64))

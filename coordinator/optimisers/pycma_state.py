@@ -57,7 +57,7 @@ def restore(strategy: Any, arrays: Mapping[str, NDArray[Any]]) -> None:
             _assign(owner, name, _value(path, about, arrays), written)
 
 
-def untold(arrays: Mapping[str, NDArray[Any]]) -> bool:
+def is_before_first_tell(arrays: Mapping[str, NDArray[Any]]) -> bool:
     """Whether the strategy was never told anything: it lacks the parts that the first tell makes."""
     return int(untag(json.loads(str(arrays["about"]))["countiter"])) == 0
 

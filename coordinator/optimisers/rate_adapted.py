@@ -26,7 +26,7 @@ class RateAdapted(CmaesOptimiser):
     >>> optimiser.tell(-np.square(candidates - 1).sum(axis=1))
     """
 
-    kept: ClassVar[tuple[str, ...]] = (
+    state_names: ClassVar[tuple[str, ...]] = (
         "mean", "sigma", "C", "p_sigma", "pc", "g", "Emean", "ESigma", "Vmean", "VSigma", "eta_mean", "eta_Sigma",
     )  # fmt: skip
 

@@ -22,7 +22,7 @@ class Separable(CmaesOptimiser):
     >>> optimiser.tell(-np.square(candidates - 1).sum(axis=1))
     """
 
-    kept: ClassVar[tuple[str, ...]] = ("mean", "sigma", "C", "p_sigma", "pc", "g")
+    state_names: ClassVar[tuple[str, ...]] = ("mean", "sigma", "C", "p_sigma", "pc", "g")
 
     def _build(self, search: Search) -> Any:
         if search.dimension < 2:

@@ -28,72 +28,72 @@ from typing import Any
 
 MARK = "dreamfleet-host "
 TICK = 0.1  # seconds between looks
-FIRST_WORD = 60.0  # seconds that a worker may take to say anything
-MOST_DRAIN = 900.0  # seconds that a drain is waited for
-AT_ONCE = ((signal.SIGTERM, 1.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 30.0))  # each with what it may take
-DRAINING = ((signal.SIGTERM, MOST_DRAIN),)
+START_TIMEOUT = 60.0  # seconds that a worker may take to say anything
+DRAIN_TIMEOUT = 900.0  # seconds that a drain is waited for
+STOP_AT_ONCE = ((signal.SIGTERM, 1.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 30.0))  # each with what it may take
+STOP_DRAINED = ((signal.SIGTERM, DRAIN_TIMEOUT),)
 LEAST_FREE = 700_000_000  # bytes that an environment takes while it is made
 LONGEST_TAIL = 8192  # bytes of a log in which its last line is looked for
-JOIN, LOG, STATE, WHOLE, MADE = "join", "log", "worker.json", "whole", "made"
+JOIN, LOG, STATE, COMPLETE, CREATED = "join", "log", "worker.json", "whole", "made"
 FOLDERS = ("environments", "workers", "cache")  # under the root
 JOIN_HERE = "{join}"  # a word that stands for the join file's path
-_HEAD = re.compile(r"^\S+ \S+ [A-Z]+ dreamfleet[\w.]*: |^dreamfleet: ")  # of a line of the log, or of a last word
-_RECORD = re.compile(rb"(?m)^(\d{4}-\S+ \S+ [A-Z]+ dreamfleet|\{)")  # a line of its log, as text or JSON
+_LOG_PREFIX = re.compile(r"^\S+ \S+ [A-Z]+ dreamfleet[\w.]*: |^dreamfleet: ")  # of a line of the log, or of a last word
+_LOG_RECORD = re.compile(rb"(?m)^(\d{4}-\S+ \S+ [A-Z]+ dreamfleet|\{)")  # a line of its log, as text or JSON
 
 
 class FailedError(Exception):
     """What cannot be done here; the text says why and what to do."""
 
 
-class GoneError(Exception):
+class DisconnectedError(Exception):
     """Whoever asked is not there any more."""
 
 
-class Line:
+class Channel:
     """Questions on stdin, which is never read further than was sent, and answers on stdout."""
 
     def __init__(self) -> None:
         self._waiting = b""
 
-    def question(self) -> dict[str, Any]:
+    def request(self) -> dict[str, Any]:
         """The next question; an empty line asks nothing but to be heard."""
         while b"\n" not in self._waiting:
-            self._hear()
+            self._read()
         text, _, self._waiting = self._waiting.partition(b"\n")
-        question: dict[str, Any] = json.loads(text or b"{}")
-        return question
+        request: dict[str, Any] = json.loads(text or b"{}")
+        return request
 
     def file(self, size: int) -> bytes:
         """A file of so many bytes that follows a question."""
         while len(self._waiting) < size:
-            self._hear()
+            self._read()
         data, self._waiting = self._waiting[:size], self._waiting[size:]
         return data
 
-    def pause(self, seconds: float = TICK) -> bool:
+    def wait_for_request(self, seconds: float = TICK) -> bool:
         """Wait so long, or until something is asked, which is then true; `GoneError` if nobody is there to ask."""
         if not self._waiting and select.select([0], [], [], seconds)[0]:
-            self._hear()
+            self._read()
         return bool(self._waiting)
 
-    def tell(self, kind: str, told: Any) -> None:
+    def send(self, kind: str, told: Any) -> None:
         """Answer; nobody may be there to read it."""
         with suppress(BrokenPipeError):
             print(MARK + json.dumps({kind: told}), flush=True)  # noqa: T201 - the answer
 
-    def _hear(self) -> None:
+    def _read(self) -> None:
         data = os.read(0, 1 << 20)
         if not data:
-            raise GoneError
+            raise DisconnectedError
         self._waiting += data
 
 
-class Place:
+class HostFolder:
     """The folder in which everything of a fleet's lies on this host."""
 
-    def __init__(self, text: str, line: Line) -> None:
+    def __init__(self, text: str, channel: Channel) -> None:
         self.root = Path(text).expanduser().absolute()
-        self._line = line
+        self._line = channel
 
     @property
     def caches(self) -> dict[str, str]:
@@ -101,18 +101,18 @@ class Place:
         return {"DREAMFLEET_CACHE": str(self.root / "cache"), "XDG_CACHE_HOME": str(self.root / "cache")}
 
     @property
-    def ours(self) -> bool:
+    def is_ours(self) -> bool:
         """Whether a command of ours has worked here: else what has our folders' names is somebody's own."""
-        return (self.root / MADE).exists() or any(self.root.glob(f"workers/*/{STATE}"))
+        return (self.root / CREATED).exists() or any(self.root.glob(f"workers/*/{STATE}"))
 
     def environment(self, name: str) -> Path:
         """Where an environment lies; it is whole when it holds `WHOLE`."""
         return self.root / "environments" / name
 
-    def whole(self, name: str) -> bool:
+    def is_complete(self, name: str) -> bool:
         """Whether an environment can be used: the Python that it was made of may be gone since."""
         folder = self.environment(name)
-        return (folder / WHOLE).exists() and (folder / "bin" / "python").exists()
+        return (folder / COMPLETE).exists() and (folder / "bin" / "python").exists()
 
     def worker(self, name: str) -> Path:
         """Where a worker's state, log and join file lie."""
@@ -128,9 +128,9 @@ class Place:
     def locked(self) -> Iterator[None]:
         """Inside, no other command changes anything here; one that is at work is waited for."""
         while True:
-            self._make()
+            self._create()
             with (self.root / "lock").open("w") as lock:
-                self._take(lock.fileno())
+                self._acquire(lock.fileno())
                 held = False
                 with suppress(FileNotFoundError):  # who held it may have removed it all
                     held = os.path.samestat(os.fstat(lock.fileno()), (self.root / "lock").stat())
@@ -142,36 +142,36 @@ class Place:
         """Leave nothing behind; a folder with other things in it stays, with these."""
         made = [self.root]
         with suppress(FileNotFoundError):
-            made = [Path(each) for each in json.loads((self.root / MADE).read_text())]
+            made = [Path(each) for each in json.loads((self.root / CREATED).read_text())]
         for name in FOLDERS:
             shutil.rmtree(self.root / name, ignore_errors=True)
-        for name in (MADE, "lock"):
+        for name in (CREATED, "lock"):
             (self.root / name).unlink(missing_ok=True)
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()
 
-    def _make(self) -> None:
+    def _create(self) -> None:
         missing = [each for each in (self.root, *self.root.parents) if not each.exists()]
-        if not self.ours and (strange := [each for each in FOLDERS if (self.root / each).exists()]):
+        if not self.is_ours and (strange := [each for each in FOLDERS if (self.root / each).exists()]):
             raise FailedError(f"{self.root} holds {strange[0]} of something else: name another --remote-dir")
         self.root.mkdir(parents=True, exist_ok=True)
-        if missing or not (self.root / MADE).exists():
-            (self.root / MADE).write_text(json.dumps([str(each) for each in missing]))
+        if missing or not (self.root / CREATED).exists():
+            (self.root / CREATED).write_text(json.dumps([str(each) for each in missing]))
 
-    def _take(self, lock: int) -> None:
+    def _acquire(self, lock: int) -> None:
         said = False
         while True:
             with suppress(BlockingIOError):
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
             if not said:
-                self._line.tell("say", "another command is at work there: waiting for it")
+                self._line.send("say", "another command is at work there: waiting for it")
             said = True
-            self._line.pause()
+            self._line.wait_for_request()
 
 
-def birth(pid: int) -> str:
+def process_start(pid: int) -> str:
     """When the process of this number began, by which it is told from a later one; empty where none runs."""
     try:
         facts = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -186,7 +186,7 @@ def birth(pid: int) -> str:
     return "" if facts[0] in "ZX" else f"{boot} {facts[19]}"  # proc_pid_stat(5): state, and the start in ticks
 
 
-class Found:
+class WorkerProcess:
     """A worker's state as it was written, and whether it still runs."""
 
     def __init__(self, folder: Path) -> None:
@@ -196,41 +196,41 @@ class Found:
             self.state = json.loads((folder / STATE).read_text())
 
     @property
-    def elsewhere(self) -> bool:
+    def is_elsewhere(self) -> bool:
         """Whether another host that shares this folder started it."""
         return bool(self.state) and self.state["node"] != platform.node()
 
     @property
-    def alive(self) -> bool:
+    def is_alive(self) -> bool:
         """Whether this very process runs."""
         with suppress(ChildProcessError):
             os.waitpid(-1, os.WNOHANG)  # of our own: one that ended is none
-        return bool(self.state) and not self.elsewhere and birth(self.state["pid"]) == self.state["birth"]
+        return bool(self.state) and not self.is_elsewhere and process_start(self.state["pid"]) == self.state["birth"]
 
     @property
-    def holder(self) -> int:
+    def tunnel_pid(self) -> int:
         """The process by whose tunnel it lives, as long as that runs; else 0."""
         pid, began = self.state.get("holder", (0, ""))
-        return pid if pid and birth(pid) == began else 0
+        return pid if pid and process_start(pid) == began else 0
 
-    def row(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """What is told of it."""
-        running = self.alive
+        running = self.is_alive
         age = time.time() - self.state["since"] if running else None
         return {"name": self.folder.name, "running": running, "slots": self.state.get("slots"), "age": age,
                 "digest": self.state.get("digest"), "last": last_line(self.folder / LOG)}  # fmt: skip
 
-    def end(self, line: Line, steps: tuple[tuple[signal.Signals, float], ...]) -> None:
+    def end(self, channel: Channel, steps: tuple[tuple[signal.Signals, float], ...]) -> None:
         """Ask it to leave, and wait until it has."""
         for number, seconds in steps:
-            if not self.alive:
+            if not self.is_alive:
                 return
             with suppress(ProcessLookupError):  # it leads a group, with the children that score for it
                 (os.killpg if number == signal.SIGKILL else os.kill)(self.state["pid"], number)
             deadline = time.monotonic() + seconds
-            while self.alive and time.monotonic() < deadline:
-                line.pause() if len(steps) == 1 else time.sleep(TICK)
-        if self.alive:
+            while self.is_alive and time.monotonic() < deadline:
+                channel.wait_for_request() if len(steps) == 1 else time.sleep(TICK)
+        if self.is_alive:
             raise FailedError(f"worker {self.folder.name} does not leave: end it with --now")
 
 
@@ -243,13 +243,13 @@ def last_line(log: Path) -> str:
     except FileNotFoundError:
         return ""
     said = [each.strip() for each in lines if each.strip()]
-    return _HEAD.sub("", said[-1]) if said else ""
+    return _LOG_PREFIX.sub("", said[-1]) if said else ""
 
 
-def look(question: dict[str, Any], line: Line) -> dict[str, Any]:
+def inspect_host(request: dict[str, Any], channel: Channel) -> dict[str, Any]:
     """What is there; nothing is changed."""
-    place = Place(question["root"], line)
-    there = next(each for each in (place.root, *place.root.parents) if each.exists())
+    host_folder = HostFolder(request["root"], channel)
+    there = next(each for each in (host_folder.root, *host_folder.root.parents) if each.exists())
     installed = None
     with suppress(importlib.metadata.PackageNotFoundError):
         installed = importlib.metadata.version("dreamfleet")
@@ -261,39 +261,39 @@ def look(question: dict[str, Any], line: Line) -> dict[str, Any]:
         "installed": installed,
         "venv": importlib.util.find_spec("venv") is not None and importlib.util.find_spec("ensurepip") is not None,
         "writable": os.access(there, os.W_OK),
-        "root": str(place.root),
+        "root": str(host_folder.root),
         "free": shutil.disk_usage(there).free,
-        "environments": [each for each in place.names("environments") if place.whole(each)],
-        "workers": [Found(place.worker(each)).row() for each in place.names("workers")],
+        "environments": [each for each in host_folder.names("environments") if host_folder.is_complete(each)],
+        "workers": [WorkerProcess(host_folder.worker(each)).describe() for each in host_folder.names("workers")],
     }
 
 
-def install(question: dict[str, Any], files: dict[str, bytes], line: Line) -> dict[str, Any]:
+def install(request: dict[str, Any], files: dict[str, bytes], channel: Channel) -> dict[str, Any]:
     """An environment of this name that is whole: it is made unless it is there."""
-    place = Place(question["root"], line)
-    folder = place.environment(question["environment"])
-    with place.locked():
-        if place.whole(question["environment"]):
+    host_folder = HostFolder(request["root"], channel)
+    folder = host_folder.environment(request["environment"])
+    with host_folder.locked():
+        if host_folder.is_complete(request["environment"]):
             return {"python": str(folder / "bin" / "python")}
         shutil.rmtree(folder, ignore_errors=True)  # an attempt that was interrupted
         parcel = folder / "parcel"
         parcel.mkdir(parents=True)
         for name, data in files.items():
             (parcel / Path(name).name).write_bytes(data)
-        line.tell("say", "makes its environment")
-        _call(place, sys.executable, "-m", "venv", str(folder))
+        channel.send("say", "makes its environment")
+        _call(host_folder, sys.executable, "-m", "venv", str(folder))
         python = str(folder / "bin" / "python")
-        line.tell("say", "installs the worker" + ("" if question["offline"] else ", from the package index"))
-        source = ("--no-index", "--find-links", ".") if question["offline"] else ("--constraint", "pins.txt")
+        channel.send("say", "installs the worker" + ("" if request["offline"] else ", from the package index"))
+        source = ("--no-index", "--find-links", ".") if request["offline"] else ("--constraint", "pins.txt")
         flags = ("--quiet", "--no-cache-dir", "--disable-pip-version-check", *source)
-        _call(place, python, "-m", "pip", "install", *flags, f"./{question['wheel']}[worker]", inside=parcel)
+        _call(host_folder, python, "-m", "pip", "install", *flags, f"./{request['wheel']}[worker]", inside=parcel)
         shutil.rmtree(parcel)
-        (folder / WHOLE).touch()
+        (folder / COMPLETE).touch()
     return {"python": python}
 
 
-def _call(place: Place, *command: str, inside: Path | None = None) -> None:
-    environment = {**os.environ, **place.caches}
+def _call(host_folder: HostFolder, *command: str, inside: Path | None = None) -> None:
+    environment = {**os.environ, **host_folder.caches}
     done = subprocess.run(
         command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, cwd=inside, env=environment
     )
@@ -312,32 +312,32 @@ def _call(place: Place, *command: str, inside: Path | None = None) -> None:
     )
 
 
-def start(question: dict[str, Any], files: dict[str, bytes], line: Line) -> dict[str, Any]:
+def start(request: dict[str, Any], files: dict[str, bytes], channel: Channel) -> dict[str, Any]:
     """Start a worker, unless the same one runs; another one of its name is drained first."""
-    place = Place(question["root"], line)
-    folder = place.worker(question["name"])
-    with place.locked():
-        found = Found(folder)
-        if found.alive and found.holder:
+    host_folder = HostFolder(request["root"], channel)
+    folder = host_folder.worker(request["name"])
+    with host_folder.locked():
+        found = WorkerProcess(folder)
+        if found.is_alive and found.tunnel_pid:
             raise FailedError("a worker of this name runs by the tunnel of another command: end that one first")
-        if found.alive and not question["held"] and found.state["digest"] == question["digest"]:
-            return {**found.row(), "outcome": "running"}
-        if found.elsewhere:
+        if found.is_alive and not request["held"] and found.state["digest"] == request["digest"]:
+            return {**found.describe(), "outcome": "running"}
+        if found.is_elsewhere:
             raise FailedError(
                 f"worker {folder.name} was started by {found.state['node']}, which shares this folder: give each host "
                 "a name of its own, or end that one first"
             )
-        outcome = "replaced" if found.alive else "started"
-        found.end(line, DRAINING)
+        outcome = "replaced" if found.is_alive else "started"
+        found.end(channel, STOP_DRAINED)
         folder.mkdir(parents=True, exist_ok=True)
         for name, data in files.items():
-            _keep(folder / name, data)
-        began = _launch(place, folder, question)
-    _await_word(began, folder, line)
-    return {**Found(folder).row(), "outcome": outcome}
+            _write_private(folder / name, data)
+        began = _launch(host_folder, folder, request)
+    _wait_for_log(began, folder, channel)
+    return {**WorkerProcess(folder).describe(), "outcome": outcome}
 
 
-def _keep(path: Path, data: bytes) -> None:
+def _write_private(path: Path, data: bytes) -> None:
     """Write a file that is whole or not there, for this user alone: no umask is trusted."""
     aside = path.with_name(f".{path.name}")
     with open(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
@@ -346,117 +346,119 @@ def _keep(path: Path, data: bytes) -> None:
     aside.replace(path)
 
 
-def _launch(place: Place, folder: Path, question: dict[str, Any]) -> subprocess.Popen[bytes]:
+def _launch(host_folder: HostFolder, folder: Path, request: dict[str, Any]) -> subprocess.Popen[bytes]:
     log = folder / LOG
     log.unlink(missing_ok=True)
     state = {
-        "digest": question["digest"],
-        "slots": question["slots"],
+        "digest": request["digest"],
+        "slots": request["slots"],
         "since": time.time(),
         "node": platform.node(),
     }
-    if question["held"]:
-        state["holder"] = [os.getpid(), birth(os.getpid())]
-    _keep(folder / STATE, b"{}")  # a disk that is full is so before anything runs
-    words = [question["python"], *(str(folder / JOIN) if each == JOIN_HERE else each for each in question["words"])]
+    if request["held"]:
+        state["holder"] = [os.getpid(), process_start(os.getpid())]
+    _write_private(folder / STATE, b"{}")  # a disk that is full is so before anything runs
+    words = [request["python"], *(str(folder / JOIN) if each == JOIN_HERE else each for each in request["words"])]
     with log.open("xb") as out:
         began = subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True, cwd=folder,
-            env={**os.environ, **place.caches, **question["env"]},
+            env={**os.environ, **host_folder.caches, **request["env"]},
         )  # fmt: skip
     try:
-        _keep(folder / STATE, json.dumps({**state, "pid": began.pid, "birth": birth(began.pid)}).encode())
+        _write_private(
+            folder / STATE, json.dumps({**state, "pid": began.pid, "birth": process_start(began.pid)}).encode()
+        )
     except OSError:
         began.kill()
         raise
     return began
 
 
-def _await_word(began: subprocess.Popen[bytes], folder: Path, line: Line) -> None:
+def _wait_for_log(began: subprocess.Popen[bytes], folder: Path, channel: Channel) -> None:
     """Until its log has begun, which a usage or a traceback does not; `FailedError` if it ended instead."""
-    deadline = time.monotonic() + FIRST_WORD
-    while began.poll() is None and not _RECORD.search((folder / LOG).read_bytes()) and time.monotonic() < deadline:
-        line.pause()
+    deadline = time.monotonic() + START_TIMEOUT
+    while began.poll() is None and not _LOG_RECORD.search((folder / LOG).read_bytes()) and time.monotonic() < deadline:
+        channel.wait_for_request()
     if began.poll():
         why = last_line(folder / LOG) or f"exit code {began.returncode}"
         raise FailedError(f"its worker ended at once: {why}")
 
 
-def follow(question: dict[str, Any], line: Line) -> dict[str, Any]:
+def follow(request: dict[str, Any], channel: Channel) -> dict[str, Any]:
     """A worker's log from its beginning, line by line, until it ended or something else is asked."""
-    found = Found(Place(question["root"], line).worker(question["name"]))
+    found = WorkerProcess(HostFolder(request["root"], channel).worker(request["name"]))
     rest = b""
     with (found.folder / LOG).open("rb") as log:
         while True:
-            over = not found.alive
+            over = not found.is_alive
             *lines, rest = (rest + log.read()).split(b"\n")
             for each in lines:
-                line.tell("line", each.decode(errors="replace"))
-            if over or line.pause():
-                return {**found.row(), "ended": over}
+                channel.send("line", each.decode(errors="replace"))
+            if over or channel.wait_for_request():
+                return {**found.describe(), "ended": over}
 
 
-def end(question: dict[str, Any], line: Line) -> dict[str, Any]:
+def end(request: dict[str, Any], channel: Channel) -> dict[str, Any]:
     """End one worker, or all, with what belongs to them; unless told to keep it, the rest too when none is left."""
-    place, ended = Place(question["root"], line), list[dict[str, Any]]()
-    if not place.ours:
+    host_folder, ended = HostFolder(request["root"], channel), list[dict[str, Any]]()
+    if not host_folder.is_ours:
         return {"ended": ended}
-    with place.locked():
-        for name in question["names"] or place.names("workers"):
-            found = Found(place.worker(name))
-            if found.elsewhere or not found.folder.exists():
+    with host_folder.locked():
+        for name in request["names"] or host_folder.names("workers"):
+            found = WorkerProcess(host_folder.worker(name))
+            if found.is_elsewhere or not found.folder.exists():
                 continue
-            ended += [found.row()]
-            if found.alive:
-                line.tell("say", f"worker {name} leaves")
-            found.end(line, AT_ONCE if question["now"] else DRAINING)
+            ended += [found.describe()]
+            if found.is_alive:
+                channel.send("say", f"worker {name} leaves")
+            found.end(channel, STOP_AT_ONCE if request["now"] else STOP_DRAINED)
             shutil.rmtree(found.folder)
-        if not place.names("workers") and not question["keep"]:
-            place.remove()
+        if not host_folder.names("workers") and not request["keep"]:
+            host_folder.remove()
     return {"ended": ended}
 
 
-def obey(question: dict[str, Any], line: Line) -> None:
+def handle_request(request: dict[str, Any], channel: Channel) -> None:
     """Do what is asked, and answer."""
-    files = {name: line.file(size) for name, size in question.get("files", [])}
+    files = {name: channel.file(size) for name, size in request.get("files", [])}
     tasks: dict[str, Callable[[], dict[str, Any]]] = {
-        "look": lambda: look(question, line),
-        "install": lambda: install(question, files, line),
-        "start": lambda: start(question, files, line),
-        "follow": lambda: follow(question, line),
-        "end": lambda: end(question, line),
+        "look": lambda: inspect_host(request, channel),
+        "install": lambda: install(request, files, channel),
+        "start": lambda: start(request, files, channel),
+        "follow": lambda: follow(request, channel),
+        "end": lambda: end(request, channel),
     }
-    where = question["root"]
+    where = request["root"]
     try:
-        line.tell("ok", tasks[question["do"]]())
+        channel.send("ok", tasks[request["do"]]())
     except FailedError as error:
-        line.tell("failed", str(error))
+        channel.send("failed", str(error))
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            line.tell("failed", f"no space left in {where}: make room there, or name another --remote-dir")
+            channel.send("failed", f"no space left in {where}: make room there, or name another --remote-dir")
         elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-            line.tell("failed", f"{error.filename or where} cannot be written there: name another --remote-dir")
+            channel.send("failed", f"{error.filename or where} cannot be written there: name another --remote-dir")
         else:
-            line.tell("failed", f"{error}")
+            channel.send("failed", f"{error}")
 
 
 def main() -> None:
     """Answer until nobody asks; a worker that lives by this connection then ends with it."""
     os.umask(0o077)
-    line, held = Line(), list[dict[str, Any]]()
-    line.tell("ok", {})
+    channel, held = Channel(), list[dict[str, Any]]()
+    channel.send("ok", {})
     try:
         while True:
-            if not (question := line.question()):
+            if not (request := channel.request()):
                 continue
-            if question.get("held"):
-                held.append(question)
-            obey(question, line)
-    except GoneError:
+            if request.get("held"):
+                held.append(request)
+            handle_request(request, channel)
+    except DisconnectedError:
         for each in held:
-            if Found(Place(each["root"], line).worker(each["name"])).holder == os.getpid():
+            if WorkerProcess(HostFolder(each["root"], channel).worker(each["name"])).tunnel_pid == os.getpid():
                 with suppress(FailedError, OSError):
-                    end({**each, "names": [each["name"]], "now": True, "keep": True}, line)
+                    end({**each, "names": [each["name"]], "now": True, "keep": True}, channel)
 
 
 if __name__ == "__main__":

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.config import load, option, read_table
+from dreamfleet.common.cli.config import load, option, read_table
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.keys import check_worker_name
-from dreamfleet.common.network import is_loopback
+from dreamfleet.common.protocol.keys import check_worker_name
+from dreamfleet.common.transport.network import is_loopback
 
 HOSTS = "host"  # [[host]] in a file
-TAKEN = ("--name", "--slots", "--connect", "--join")  # flags of a worker that are ours to give
+RESERVED_FLAGS = ("--name", "--slots", "--connect", "--join")  # flags of a worker that are ours to give
 MOST_SLOTS = 1024
 _ADDRESS = re.compile(r"(ssh://)?([^@\s]+@)?(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^@:\s/]+)(:\d+)?/?")
 
@@ -49,10 +49,10 @@ class SpawnConfig:
             raise UsageError(f"--wheelhouse {self.wheelhouse} holds no wheel: fill it with `pip download -d FOLDER`")
         if not self.remote_dir.strip("/ ") or self.remote_dir == "~":
             raise UsageError(f"--remote-dir {self.remote_dir!r}: name a folder of its own")
-        if not _words("ssh", self.ssh):
+        if not _split_flags("ssh", self.ssh):
             raise UsageError("--ssh: name the ssh client")
-        said = {word.partition("=")[0] for word in _words("worker-flags", self.worker_flags)}
-        if taken := [flag for flag in TAKEN if flag in said]:
+        said = {word.partition("=")[0] for word in _split_flags("worker-flags", self.worker_flags)}
+        if taken := [flag for flag in RESERVED_FLAGS if flag in said]:
             raise UsageError(f"--worker-flags: {', '.join(taken)} is given otherwise: see --help")
 
 
@@ -80,12 +80,12 @@ class Host:
     @property
     def flags(self) -> list[str]:
         """Further flags of its worker."""
-        return _words("worker-flags", self.spawn.worker_flags)
+        return _split_flags("worker-flags", self.spawn.worker_flags)
 
     @property
     def ssh(self) -> list[str]:
         """The ssh client with the user's own flags."""
-        return _words("ssh", self.spawn.ssh)
+        return _split_flags("ssh", self.spawn.ssh)
 
     @property
     def environment(self) -> dict[str, str]:
@@ -122,11 +122,11 @@ def read_hosts(rows: Sequence[Mapping[str, Any]], sources: Mapping[str, Any]) ->
         texts = {key: str(value) if isinstance(value, Path) else value for key, value in rest.items()}
         lists = {key: list(value) if isinstance(value, tuple) else value for key, value in texts.items()}
         spawn = load(SpawnConfig, "spawn", **{**sources, "file": {"spawn": {**table, **lists}}})
-        hosts.append(Host(about.name or name_of(about.address), about.address, spawn))
-    return told_apart(hosts)
+        hosts.append(Host(about.name or default_name(about.address), about.address, spawn))
+    return check_unique(hosts)
 
 
-def told_apart(hosts: list[Host]) -> list[Host]:
+def check_unique(hosts: list[Host]) -> list[Host]:
     """The same hosts; `UsageError` where there is none, or two of one name."""
     if not hosts:
         raise UsageError(f"no host is named: give user@host, or a file with [[{HOSTS}]] tables")
@@ -138,13 +138,13 @@ def told_apart(hosts: list[Host]) -> list[Host]:
     return hosts
 
 
-def name_of(address: str) -> str:
+def default_name(address: str) -> str:
     """What a host is called that is given by its address alone."""
     found = _ADDRESS.fullmatch(address)
     return re.sub(r"[^A-Za-z0-9.-]+", "-", found["host"] if found else address).strip("-.")[:63] or "worker"
 
 
-def _words(name: str, text: str) -> list[str]:
+def _split_flags(name: str, text: str) -> list[str]:
     try:
         return shlex.split(text)
     except ValueError as error:

@@ -15,7 +15,7 @@ from typing import Any
 
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
 from dreamfleet.coordinator.spawn.agent import MARK
-from dreamfleet.coordinator.spawn.failures import NO_PYTHON, explain
+from dreamfleet.coordinator.spawn.ssh_errors import NO_PYTHON, explain
 
 # The user's own flags stand before these, and ssh takes the first of each. Nobody is there to be asked for a password.
 OPTIONS = ("-T", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10", "-o", "ServerAliveInterval=15",
@@ -28,11 +28,11 @@ PATIENCE = 5.0  # seconds that ssh may take to end
 FORWARD = 30.0  # seconds until ssh says which port it was given, once the other side runs
 _PORT = re.compile(r"Allocated port (\d+) for remote forward to (\S+)")
 
-Hear = Callable[[str, str], None]
+OnMessage = Callable[[str, str], None]
 """What the agent says while it works: `say` or `line`, and the text."""
 
 
-def _unheard(_kind: str, _text: str) -> None:
+def _ignore_message(_kind: str, _text: str) -> None:
     """Nobody listens."""
 
 
@@ -43,10 +43,18 @@ class Connection:
         self._address = address
         program = (files("dreamfleet.coordinator.spawn") / "agent.py").read_bytes()
         tunnel = [word for each in forwards for word in ("-R", f"127.0.0.1:0:{each}")]
-        words = [*ssh, *OPTIONS, *(TUNNEL if forwards else ()), *tunnel, "--", address, _command(python, len(program))]
-        self._said: deque[str] = deque(maxlen=KEPT_LINES)
+        words = [
+            *ssh,
+            *OPTIONS,
+            *(TUNNEL if forwards else ()),
+            *tunnel,
+            "--",
+            address,
+            _remote_command(python, len(program)),
+        ]
+        self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
         self._ports: dict[str, int] = {}
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         try:
             self._popen = subprocess.Popen(  # noqa: S603 - the user's ssh client
                 words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
@@ -59,16 +67,18 @@ class Connection:
         self._listener.start()
         self._program = program
 
-    def begin(self) -> None:
+    def start_agent(self) -> None:
         """Have the agent run, which may be waited for: whoever waits can be ended by `close`."""
         self._send(self._program)
-        self._answer(_unheard)
+        self._answer(_ignore_message)
 
-    def ask(self, do: str, hear: Hear = _unheard, sent: Mapping[str, bytes] | None = None, **facts: Any) -> Any:
+    def ask(
+        self, do: str, on_message: OnMessage = _ignore_message, sent: Mapping[str, bytes] | None = None, **facts: Any
+    ) -> Any:
         """Have one thing done; `DreamfleetError` if it cannot be."""
         names = [(name, len(data)) for name, data in (sent or {}).items()]
         self._send(json.dumps({"do": do, "files": names, **facts}).encode() + b"\n", *(sent or {}).values())
-        return self._answer(hear)
+        return self._answer(on_message)
 
     def interrupt(self) -> None:
         """End a `follow` that is under way. From any thread."""
@@ -76,8 +86,8 @@ class Connection:
 
     def ports(self, forwards: Sequence[str]) -> list[int]:
         """The ports there of the tunnel's ends, in order."""
-        with self._news:
-            if not self._news.wait_for(lambda: self._ports.keys() >= set(forwards) or self._ended, FORWARD):
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._ports.keys() >= set(forwards) or self._ended, FORWARD):
                 raise ConnectionFailedError("ssh did not say which port its tunnel was given")
         if not self._ports.keys() >= set(forwards):
             raise self._failure()
@@ -104,7 +114,7 @@ class Connection:
                 self._popen.stdin.write(each)
             self._popen.stdin.flush()
 
-    def _answer(self, hear: Hear) -> Any:
+    def _answer(self, on_message: OnMessage) -> Any:
         """The next answer; lines without our mark are of the other side's shell."""
         assert self._popen.stdout is not None
         for line in self._popen.stdout:
@@ -115,29 +125,29 @@ class Connection:
                 return told
             if kind == "failed":
                 raise DreamfleetError(told)
-            hear(kind, told)
+            on_message(kind, told)
         raise self._failure()
 
     def _failure(self) -> ConnectionFailedError:
         with suppress(subprocess.TimeoutExpired):
             self._popen.wait(PATIENCE)
         self._listener.join(PATIENCE)
-        return ConnectionFailedError(explain(list(self._said), self._popen.poll(), self._address))
+        return ConnectionFailedError(explain(list(self._stderr_lines), self._popen.poll(), self._address))
 
     def _listen(self) -> None:
         assert self._popen.stderr is not None
         for line in self._popen.stderr:
             text = line.decode(errors="replace").rstrip()
-            with self._news:
-                self._said.append(text)
+            with self._changed:
+                self._stderr_lines.append(text)
                 if found := _PORT.search(text):
                     self._ports[found[2]] = int(found[1])
-                self._news.notify_all()
-        with self._news:
-            self._news.notify_all()
+                self._changed.notify_all()
+        with self._changed:
+            self._changed.notify_all()
 
 
-def _command(python: str, size: int) -> str:
+def _remote_command(python: str, size: int) -> str:
     """For whatever shell is there: run the agent, of so many bytes on stdin, in the first Python that is new enough.
 
     No line break and no exclamation mark, which a C shell would take for its own.

@@ -52,25 +52,25 @@ class Parcel:
 
     def environment(self, python: tuple[int, ...], machine: str) -> str:
         """The name of the environment: another one for whatever may make it differ."""
-        house = [f"{each.name} {each.stat().st_size}" for each in self._house()]
+        house = [f"{each.name} {each.stat().st_size}" for each in self._wheels()]
         text = "\n".join([self.wheel.sha256, self.pins if not house else "", *house, *map(str, python), machine])
         return f"{version(NAME)}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
     def files(self) -> dict[str, bytes]:
         """Every file that is sent, by name."""
-        house = {each.name: each.read_bytes() for each in self._house()}
+        house = {each.name: each.read_bytes() for each in self._wheels()}
         return {**house, "pins.txt": self.pins.encode(), self.wheel.name: self.wheel.data}
 
     def check_fits(self, machine: str) -> None:
         """`DreamfleetError` where the wheelhouse is one for other processors alone."""
-        tags = {each.stem.rpartition("-")[2] for each in self._house()} - {"any"}
+        tags = {each.stem.rpartition("-")[2] for each in self._wheels()} - {"any"}
         if tags and not any(machine in tag or "universal2" in tag for tag in tags):
             raise DreamfleetError(
                 f"its processor is {machine}, and {self.wheelhouse} holds wheels of {', '.join(sorted(tags))} alone: "
                 f"fill another one there, or by `pip download --platform manylinux_2_28_{machine} --only-binary :all:`"
             )
 
-    def _house(self) -> list[Path]:
+    def _wheels(self) -> list[Path]:
         return sorted(self.wheelhouse.glob("*.whl")) if self.wheelhouse else []
 
 

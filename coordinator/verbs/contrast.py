@@ -8,12 +8,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.listing import add_json, answer, print_rows
-from dreamfleet.coordinator.contrast.config import KINDS, RUN_FLAGS, SEEDS, Contrast, kinds_of
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
+from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
+from dreamfleet.coordinator.experiments.contrast.config import KINDS, RUN_FLAGS, SEEDS, Contrast, parse_kinds
 
 if TYPE_CHECKING:
-    from dreamfleet.coordinator.contrast.summary import Outcome
-    from dreamfleet.coordinator.contrast.trials import Trials
+    from dreamfleet.coordinator.experiments.contrast.summary import TrialResult
+    from dreamfleet.coordinator.experiments.contrast.trials import Trials
 
 SUMMARY = "train kinds of MDN-RNNs on equal data, several seeds each, evolve in each one's dream, and tell them apart"
 EXTRAS = ("train",)
@@ -39,37 +40,37 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"of every `coordinator`, whose preset is dream unless another is named (default {RUN_FLAGS})",
     )  # fmt: skip
     parser.add_argument("--local", type=int, help="scoring processes (default one a core)")
-    add_json(parser)
+    add_json_flag(parser)
 
 
+@interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
     """Do all trials that are left, and compare."""
-    from dreamfleet.common.holding import held
-    from dreamfleet.common.stopping import heeding_signals
-    from dreamfleet.coordinator.contrast.trials import LOCK, Trials
-    from dreamfleet.coordinator.iteration.evolving import Crew
-    from dreamfleet.coordinator.iteration.rounds import run_of
+    from dreamfleet.common.files.folder_lock import folder_lock
+    from dreamfleet.coordinator.experiments.contrast.trials import LOCK, Trials
+    from dreamfleet.coordinator.experiments.local_run import LocalFleet
+    from dreamfleet.coordinator.experiments.run_flags import parse_run_flags
 
-    contrast = Contrast(kinds_of(args.kind), tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
-    run_of(contrast.of_all, args.sources, "contrast")  # what is wrong with them is said now
+    contrast = Contrast(parse_kinds(args.kind), tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
+    parse_run_flags(contrast.common_run_flags, args.sources, "contrast")  # what is wrong with them is said now
     file = ("--config", str(args.config)) if args.config else ()
     for package in PACKAGES:
         if find_spec(package) is None:  # said now rather than after hours
             raise ModuleNotFoundError(name=package)
-    with held(args.out / LOCK, "contrast"), heeding_signals() as stop:
-        trials = Trials(contrast, args.data, args.out, lambda: Crew.of((), args.local, file, ()), stop)
-        outcomes = _do(trials, contrast)
-    _tell(args, outcomes)
+    with folder_lock(args.out / LOCK, "contrast"), stop_on_signals() as stop:
+        trials = Trials(contrast, args.data, args.out, lambda: LocalFleet.of((), args.local, file, ()), stop)
+        outcomes = _run_trials(trials, contrast)
+    _print_results(args, outcomes)
     return 0
 
 
-def _do(trials: Trials, contrast: Contrast) -> list[Outcome]:
+def _run_trials(trials: Trials, contrast: Contrast) -> list[TrialResult]:
     from rich.console import Console
 
     from dreamfleet.common.errors import StoppedError
 
     console = Console(stderr=True, highlight=False)
-    outcomes: list[Outcome] = []
+    outcomes: list[TrialResult] = []
     try:
         trials.begin()
         with console.status("") as shown:
@@ -81,23 +82,23 @@ def _do(trials: Trials, contrast: Contrast) -> list[Outcome]:
     return outcomes
 
 
-def _tell(args: argparse.Namespace, outcomes: list[Outcome]) -> None:
-    from dreamfleet.coordinator.contrast import summary
+def _print_results(args: argparse.Namespace, outcomes: list[TrialResult]) -> None:
+    from dreamfleet.coordinator.experiments.contrast import summary
 
     found, means = list(summary.differences(outcomes)), summary.means(outcomes)
     if args.json:
         parts = {
             "trials": [asdict(each) for each in outcomes],
             "means": [asdict(each) for each in means],
-            "differences": [{"kind": k, "figure": f, **asdict(d), "clear": d.clear} for k, f, d in found],
+            "differences": [{"kind": k, "figure": f, **asdict(d), "clear": d.is_significant} for k, f, d in found],
         }
-        answer(args, "", **parts)
+        print_answer(args, "", **parts)
         return
     rows = summary.rows(outcomes)
-    print_rows(rows, right=tuple(rows[0])[1:-1], least_first=("reward loss", "after 50", "AUC after 10", "parameters"))
+    print_rows(rows, right=tuple(rows[0])[1:-1], drop_order=("reward loss", "after 50", "AUC after 10", "parameters"))
     print()
     for each in means:
         label = "score in reality" if each.figure == summary.SCORE else each.figure.replace("_", " ")
-        print(f"{each.kind}, {label}: {each.told} over {each.seeds} seeds")
+        print(f"{each.kind}, {label}: {each.text} over {each.seeds} seeds")
     first = outcomes[0].kind
-    print("\n".join(("", *(summary.told(kind, first, figure, each) for kind, figure, each in found))))
+    print("\n".join(("", *(summary.describe_difference(kind, first, figure, each) for kind, figure, each in found))))

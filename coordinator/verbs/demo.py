@@ -7,9 +7,10 @@ import os
 from datetime import datetime
 from importlib.util import find_spec
 
-from dreamfleet.common.config import add_flags, load
-from dreamfleet.common.site import offer
-from dreamfleet.coordinator.demo import Demo, DemoConfig
+from dreamfleet.common.cli.config import add_flags, load
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.host.stop_signals import interrupted_by_signals
+from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig
 
 SUMMARY = "evolve a controller on this machine in minutes, judge it, plot it and record its drive"
 EXTRAS = ("worker", "views")
@@ -18,10 +19,11 @@ EXTRAS = ("worker", "views")
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--run", dest="run_name", help="name of the run (default: demo and the time)")
-    offer(parser, "runs_dir")
+    add_global_flags(parser, "runs_dir")
     add_flags(parser, DemoConfig)
 
 
+@interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
     """Play it."""
     for package in ("av", "gymnasium", "matplotlib", "onnxruntime"):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dreamfleet.common.config import add_flags, load
-from dreamfleet.common.listing import add_json
-from dreamfleet.common.site import read_file
-from dreamfleet.coordinator.spawn import many
+from dreamfleet.common.cli.config import add_flags, load
+from dreamfleet.common.cli.global_config import read_config_file
+from dreamfleet.common.cli.output import add_json_flag
+from dreamfleet.coordinator.spawn import parallel
 from dreamfleet.coordinator.spawn.command import exit_code, show_rows
-from dreamfleet.coordinator.spawn.config import HOSTS, Host, SpawnConfig, name_of, read_hosts, told_apart
+from dreamfleet.coordinator.spawn.config import HOSTS, Host, SpawnConfig, check_unique, default_name, read_hosts
 
 SUMMARY = "end the workers that spawn and up started: they finish what runs, and nothing of them is left there"
 EXTRAS = ()
@@ -24,7 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--now", action="store_true", help="do not wait for what they score")
     parser.add_argument("--keep", action="store_true", help="leave environments and world models for the next time")
     add_flags(parser, SpawnConfig, only=("ssh", "remote_dir", "remote_python"))
-    add_json(parser)
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -32,11 +32,11 @@ def run(args: argparse.Namespace) -> int:
     path = Path(args.hosts[0])
     of_file = len(args.hosts) == 1 and (path.suffix == ".toml" or path.is_file())
     if of_file:
-        file = read_file(path)
+        file = read_config_file(path)
         hosts = read_hosts(file.get(HOSTS, []), {**args.sources, "file": file})
     else:
         spawn = load(SpawnConfig, "spawn", **args.sources)
-        hosts = told_apart([Host(name_of(each), each, spawn) for each in args.hosts])
-    rows = many.end(hosts, all_workers=not of_file, now=args.now, keep=args.keep)
+        hosts = check_unique([Host(default_name(each), each, spawn) for each in args.hosts])
+    rows = parallel.end(hosts, all_workers=not of_file, now=args.now, keep=args.keep)
     show_rows(args, rows)
     return exit_code(rows)

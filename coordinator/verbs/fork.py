@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from dreamfleet.common.errors import UsageError
 
 if TYPE_CHECKING:
-    from dreamfleet.coordinator.config import RunConfig
+    from dreamfleet.coordinator.settings.config import RunConfig
 
 SUMMARY = "start a new run from another one's mean, step size, temperature and stage; other settings may change"
 EXTRAS = ()
@@ -17,7 +17,7 @@ EXTRAS = ()
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from dreamfleet.coordinator.verbs.coordinator import add_settings
+    from dreamfleet.coordinator.settings.run_setup import add_settings
 
     parser.add_argument("source", metavar="RUN", help="the run to begin from; it is only read")
     parser.add_argument("--run", dest="run_name", help="name of the new run (default RUN-fork)")
@@ -26,36 +26,45 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the new run until it ends."""
-    from dreamfleet.common.runs import open_run
-    from dreamfleet.common.terms import terms_of
-    from dreamfleet.coordinator.config import settings_of
-    from dreamfleet.coordinator.schedule import remaining
-    from dreamfleet.coordinator.start import SUBSPACE, kept_subspace, latest, start_of
-    from dreamfleet.coordinator.verbs.coordinator import serve
+    from dreamfleet.common.runs.run_folder import open_run
+    from dreamfleet.common.runs.scoring_params import scoring_params_of
+    from dreamfleet.coordinator.settings.config import config_values
+    from dreamfleet.coordinator.settings.schedule import remaining_settings
+    from dreamfleet.coordinator.settings.start import (
+        SUBSPACE_FACT,
+        latest_mean_and_sigma,
+        start_from_run,
+        stored_subspace,
+    )
+    from dreamfleet.coordinator.verbs.coordinator import serve_new_run
 
     with open_run(args.runs_dir, args.source) as stored:
-        start, (_, sigma) = start_of(stored), latest(stored)
-        terms = terms_of(stored, len(stored.history()))
-        present = {**remaining(stored.settings, terms.stage), "sigma0": sigma, "temperature": terms.spec.temperature}
-        settings = {**settings_of(stored.settings, stored.bundle_path), **present}
-        if not terms.stage.whole:
-            settings["searched"] = kept_subspace(stored.fact(SUBSPACE), stored.settings, stored.path)
+        start, (_, sigma) = start_from_run(stored), latest_mean_and_sigma(stored)
+        scoring_params = scoring_params_of(stored, len(stored.history()))
+        present = {
+            **remaining_settings(stored.settings, scoring_params.stage),
+            "sigma0": sigma,
+            "temperature": scoring_params.spec.temperature,
+        }
+        settings = {**config_values(stored.settings, stored.bundle_path), **present}
+        if not scoring_params.stage.whole:
+            settings["searched"] = stored_subspace(stored.fact(SUBSPACE_FACT), stored.settings, stored.path)
     if {"environment", "normalise"} & args.given:
         settings.pop("task_options", None)  # described anew, and refused if that makes another world of it
     if "optimiser" in args.given and "optimiser_options" not in args.given:
         settings.pop("optimiser_options", None)  # they are the other one's
     args.run_name = args.run_name or f"{args.source}-fork"
-    return serve(args, settings, start, lambda config: _elsewhere(config, settings, sigma))
+    return serve_new_run(args, settings, start, lambda config: _adapt_to_subspace(config, settings, sigma))
 
 
-def _elsewhere(config: RunConfig, before: dict[str, Any], sigma: float) -> RunConfig:
+def _adapt_to_subspace(config: RunConfig, before: dict[str, Any], sigma: float) -> RunConfig:
     """The fork's configuration, of which the source's step `sigma` means nothing in another subspace."""
-    searched, old = config.searched, before.get("searched")
-    if (searched and searched.sha256) == (old and old.sha256):
+    loaded_subspace, old = config.loaded_subspace, before.get("searched")
+    if (loaded_subspace and loaded_subspace.sha256) == (old and old.sha256):
         return config
     stages = config.stages
     if config.sigma0 == sigma and not (stages and stages[0].sigma0):
         raise UsageError("another subspace than the run's makes a step something else: give --sigma0 too")
-    if searched is None and stages == before["stages"]:  # inherited ones have nothing left to leave
+    if loaded_subspace is None and stages == before["stages"]:  # inherited ones have nothing left to leave
         return replace(config, stages=tuple(replace(each, whole=False) for each in stages))
     return config

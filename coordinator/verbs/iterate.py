@@ -8,27 +8,28 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.config import add_flags, given, load
+from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.cli.config import add_flags, given, load
+from dreamfleet.common.cli.global_config import add_global_flags, load_credentials
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.files import is_file
-from dreamfleet.common.listing import add_json, answer, print_rows
-from dreamfleet.common.network import Network
-from dreamfleet.common.site import joined, offer
-from dreamfleet.common.variants import Variant
-from dreamfleet.coordinator.config import DEFAULT_BUNDLE, NetworkConfig, RunConfig
-from dreamfleet.coordinator.iteration.config import IterateConfig
+from dreamfleet.common.files.regular_files import is_file
+from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
+from dreamfleet.common.transport.network import Network
+from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
+from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, NetworkConfig, RunConfig
 
 if TYPE_CHECKING:
-    from dreamfleet.common.stopping import Stop
-    from dreamfleet.coordinator.iteration.evolving import Crew
-    from dreamfleet.coordinator.iteration.iteration import Iteration
-    from dreamfleet.coordinator.iteration.layout import Layout
-    from dreamfleet.coordinator.iteration.ledger import Ledger
+    from dreamfleet.common.host.stop_signals import Stop
+    from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
+    from dreamfleet.coordinator.experiments.iteration.ledger import IterationLedger
+    from dreamfleet.coordinator.experiments.iteration.runner import Iteration
+    from dreamfleet.coordinator.experiments.local_run import LocalFleet
 
 SUMMARY = "make world models and evolve in their dreams in turn, each learning from what the last one's means drove"
 EXTRAS = ("train", "views")
 PACKAGES = ("gymnasium", "matplotlib", "onnx", "onnxruntime", "safetensors", "torch")
-NOT_COMMON = ("preset", "schedule", "bundle", "searched")  # to the rounds' runs, of all settings
+VARYING = ("preset", "schedule", "bundle", "searched")  # to the rounds' runs, of all settings
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -37,9 +38,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--redo", metavar="ROUND/PHASE", help="first forget this phase and all behind it, such as 2/mdnrnn"
     )
-    add_json(parser)
+    add_json_flag(parser)
     listen = "workers of any host find the rounds' runs here (default: none do)"
-    offer(parser, "listen", "join", texts={"listen": listen, "join": "a coordinator's join file, for the rounds' runs"})
+    add_global_flags(
+        parser, "listen", "join", texts={"listen": listen, "join": "a coordinator's join file, for the rounds' runs"}
+    )
     add_flags(parser, NetworkConfig, only=["insecure"])
     add_flags(parser, IterateConfig)
     parser.add_argument(
@@ -48,49 +51,55 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+@interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
     """Go on until all rounds are finished, and tell what came of them."""
-    from dreamfleet.common.holding import held
-    from dreamfleet.common.stopping import heeding_signals
-    from dreamfleet.coordinator.iteration.layout import Layout
+    from dreamfleet.common.files.folder_lock import folder_lock
+    from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 
     for package in PACKAGES:
         if find_spec(package) is None:  # said now rather than after hours
             raise ModuleNotFoundError(name=package)
-    layout = Layout(args.data)
-    with held(layout.lock, "iteration"), heeding_signals() as stop:
-        iteration = _open(args, layout, stop)
-        _go_on(iteration, layout)
-    _tell(args, layout, iteration.ledger)
+    layout = IterationFolder(args.data)
+    with folder_lock(layout.lock, "iteration"), stop_on_signals() as stop:
+        iteration = _open_iteration(args, layout, stop)
+        _run_phases(iteration, layout)
+    _print_results(args, layout, iteration.ledger)
     return 0
 
 
-def _open(args: argparse.Namespace, layout: Layout, stop: Stop) -> Iteration:
-    from dreamfleet.coordinator.iteration.iteration import Iteration
-    from dreamfleet.coordinator.iteration.ledger import Ledger
-    from dreamfleet.coordinator.iteration.phases import find_init
-    from dreamfleet.coordinator.iteration.plan import INIT, Phase
-    from dreamfleet.coordinator.iteration.rounds import run_of
+def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Stop) -> Iteration:
+    from dreamfleet.coordinator.experiments.iteration.ledger import IterationLedger
+    from dreamfleet.coordinator.experiments.iteration.phases import find_init
+    from dreamfleet.coordinator.experiments.iteration.plan import INIT, Phase
+    from dreamfleet.coordinator.experiments.iteration.runner import Iteration
+    from dreamfleet.coordinator.experiments.run_flags import parse_run_flags
 
-    begun = Ledger.load(layout.ledger)
+    begun = IterationLedger.load(layout.ledger)
     config = load(IterateConfig, "iterate", base=begun.settings if begun else None, **args.sources)
     if is_file(Path(config.init)):
         config = replace(config, init=str(Path(config.init).resolve()))
     # Until an iteration has what it goes on from, nothing was made, and all may change.
     new = begun is None or (not begun.entries and bool(config.init))
-    more = _flags_before(args)
-    first, limits = run_of([*more, *config.flags_of_run(1)], args.sources, "iterate")
-    later, _ = run_of([*more, *config.flags_of_run(2)], args.sources, "iterate")  # what is wrong with them is said now
-    settings = {**asdict(first), **asdict(limits), **dict.fromkeys(NOT_COMMON)}
+    more = _common_run_flags(args)
+    first, limits = parse_run_flags([*more, *config.flags_of_run(1)], args.sources, "iterate")
+    later, _ = parse_run_flags(
+        [*more, *config.flags_of_run(2)], args.sources, "iterate"
+    )  # what is wrong with them is said now
+    settings = {**asdict(first), **asdict(limits), **dict.fromkeys(VARYING)}
     if new:
         for run in (first, later):
             _check_run(config, run, layout)
-    ledger = Ledger.begin(config, settings) if begun is None or new else begun.take(config, settings, layout.root)
+    ledger = (
+        IterationLedger.begin(config, settings)
+        if begun is None or new
+        else begun.with_settings(config, settings, layout.root)
+    )
     if config.local == 0 and not args.listen:
         raise UsageError("nobody would score: give --local slots here, or --listen for workers of other hosts")
-    Network(args.listen, credentials=joined(args, ("coordinator",))).check_open(insecure=_insecure(args))
+    Network(args.listen, credentials=load_credentials(args, ("coordinator",))).check_open(insecure=_insecure(args))
     iteration = Iteration(
-        layout, config, ledger, lambda: _crew(args, config, more, settings["task"]), stop, _reached(args)
+        layout, config, ledger, lambda: _local_fleet(args, config, more, settings["task"]), stop, _network_flags(args)
     )
     if args.redo:
         if (phase := Phase.of(args.redo)).name == INIT:
@@ -101,7 +110,7 @@ def _open(args: argparse.Namespace, layout: Layout, stop: Stop) -> Iteration:
     return iteration
 
 
-def _flags_before(args: argparse.Namespace) -> tuple[str, ...]:
+def _common_run_flags(args: argparse.Namespace) -> tuple[str, ...]:
     """What a round's coordinator is told before `--run-flags`: the file, and the preset where nobody names one."""
     sources = args.sources
     named = "preset" in given(RunConfig, "run", sources["file"], sources["environment"])
@@ -109,11 +118,11 @@ def _flags_before(args: argparse.Namespace) -> tuple[str, ...]:
     return (*file, *(() if named else ("--preset", "dream")))
 
 
-def _check_run(config: IterateConfig, run: RunConfig, layout: Layout) -> None:
+def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -> None:
     """Whether a round's run could be begun: in the shipped world model, or in what the iteration goes on from."""
-    from dreamfleet.common.store import find_bundle
-    from dreamfleet.coordinator.iteration.phases import find_init
-    from dreamfleet.coordinator.start import find_start
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.coordinator.experiments.iteration.phases import find_init
+    from dreamfleet.coordinator.settings.start import find_start
 
     run = replace(run, recorded=0.0)  # no bundle need hold such states yet
     if not config.init:
@@ -122,26 +131,26 @@ def _check_run(config: IterateConfig, run: RunConfig, layout: Layout) -> None:
         if is_file(Path(config.init)) and Path(config.init).is_relative_to(layout.root.resolve()):
             raise UsageError(f"--init {config.init} lies in the iteration's own folder: copy it elsewhere first")
         start, (_, bundle) = find_start(config.init, layout.runs), find_init(config.init, layout.runs)
-        settings = (start.under(run) if config.go_on else run).settings(bundle)
+        settings = (start.apply_to(run) if config.go_on else run).settings(bundle)
         if config.go_on:
             start.check(settings)
-    if config.go_on and Variant.of(settings.task.options).feedback == "last":
+    if config.go_on and Variant.from_json(settings.task.options).feedback == "last":
         raise UsageError(
             "--go-on fits a controller to the next model, and one with feedback=last cannot be: leave one out"
         )
 
 
-def _crew(args: argparse.Namespace, config: IterateConfig, more: tuple[str, ...], task: str) -> Crew:
-    from dreamfleet.coordinator.iteration.evolving import Crew
+def _local_fleet(args: argparse.Namespace, config: IterateConfig, more: tuple[str, ...], task: str) -> LocalFleet:
+    from dreamfleet.coordinator.experiments.local_run import LocalFleet
 
     own = ("--task", task) if ":" in task else ()
-    return Crew.of(args.listen, config.local, more, own, args.site.join, insecure=_insecure(args))
+    return LocalFleet.of(args.listen, config.local, more, own, args.global_config.join, insecure=_insecure(args))
 
 
-def _reached(args: argparse.Namespace) -> tuple[str, ...]:
+def _network_flags(args: argparse.Namespace) -> tuple[str, ...]:
     """The flags of where workers of other hosts come to."""
     listen = ("--listen", *args.listen) if args.listen else ()
-    join = () if args.site.join is None else ("--join", str(args.site.join))
+    join = () if args.global_config.join is None else ("--join", str(args.global_config.join))
     return (*listen, *join, *(("--insecure",) if _insecure(args) else ()))
 
 
@@ -150,13 +159,13 @@ def _insecure(args: argparse.Namespace) -> bool:
     return load(NetworkConfig, "network", **args.sources).insecure
 
 
-def _go_on(iteration: Iteration, layout: Layout) -> None:
+def _run_phases(iteration: Iteration, layout: IterationFolder) -> None:
     from rich.console import Console
     from rich.markup import escape
 
-    from dreamfleet.coordinator.iteration.ledger import Entry
-    from dreamfleet.coordinator.iteration.plan import Phase
-    from dreamfleet.coordinator.iteration.summary import line
+    from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase
+    from dreamfleet.coordinator.experiments.iteration.plan import Phase
+    from dreamfleet.coordinator.experiments.iteration.summary import format_entry
 
     console = Console(stderr=True, highlight=False)
     if finished := iteration.ledger.finished:
@@ -164,34 +173,34 @@ def _go_on(iteration: Iteration, layout: Layout) -> None:
     with console.status("") as shown:
         doing = ""
 
-        def before(phase: Phase) -> None:
+        def on_begin(phase: Phase) -> None:
             nonlocal doing
             doing = f"round {phase.round}: {phase.name}"
             shown.update(escape(f"{doing}; {layout.round(phase.round) / 'logs'} tells how far"))
 
-        def hear(line: str) -> None:
+        def on_line(line: str) -> None:
             shown.update(escape(f"{doing}  {line}"))
 
-        def after(entry: Entry) -> None:
-            console.print(line(entry), markup=False, soft_wrap=True)
+        def on_finished(entry: FinishedPhase) -> None:
+            console.print(format_entry(entry), markup=False, soft_wrap=True)
 
-        iteration.go_on(before, after, hear)
+        iteration.run_remaining(on_begin, on_finished, on_line)
 
 
-def _tell(args: argparse.Namespace, layout: Layout, ledger: Ledger) -> None:
-    from dreamfleet.coordinator.iteration import summary
+def _print_results(args: argparse.Namespace, layout: IterationFolder, ledger: IterationLedger) -> None:
+    from dreamfleet.coordinator.experiments.iteration import summary
 
-    told = summary.rounds(layout, ledger)
+    told = summary.describe_rounds(layout, ledger)
     # Behind the last finished round one may be in its midst, with a model that no gate has judged yet.
     counts = next(each["evolved_in"] for each in reversed(told) if each["evolved_in"] is not None)
-    best, model = summary.best(told), str(layout.bundle(counts))
+    best, model = summary.best_round(told), str(layout.bundle(counts))
     if args.json:
-        answer(args, "", data=layout.root, rounds=told, best=best and best["round"], model=model)
+        print_answer(args, "", data=layout.root, rounds=told, best=best and best["round"], model=model)
         return
-    rows = summary.rows(told)
+    rows = summary.table_rows(told)
     print_rows(rows, right=tuple(rows[0])[1:])
     print(f"world model: {model}")
     if init := ledger.settings.get("init"):
         print(f"it began with {init}, which was not judged on these tracks: `dreamfleet compare` tells which is better")
     if best is not None:
-        print(f"best controller: round {best['round']}'s, {summary.score(best['score'])}: {best['controller']}")
+        print(f"best controller: round {best['round']}'s, {summary.format_score(best['score'])}: {best['controller']}")

@@ -6,11 +6,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from dreamfleet.common.config import add_flags
-from dreamfleet.common.keys import check_run_name
-from dreamfleet.common.listing import add_json
-from dreamfleet.common.site import offer
-from dreamfleet.coordinator.config import NetworkConfig
+from dreamfleet.common.cli.config import add_flags
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag
+from dreamfleet.common.protocol.keys import check_run_name
+from dreamfleet.coordinator.settings.config import NetworkConfig
 
 SUMMARY = "begin the run again that a controller came from, by its receipt, and compare what it reports, to the bit"
 EXTRAS = ()
@@ -22,28 +22,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--run", dest="run_name", help="the new run, or one to go on with (default CONTROLLER-again)")
     parser.add_argument("--optimiser", metavar="MODULE:ATTRIBUTE", help="an optimiser of one's own that the run had")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
-    offer(parser, "runs_dir")
-    add_json(parser)
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
     add_flags(parser, NetworkConfig)
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve the run until it has as many generations; exit 1 if it then reports another controller."""
-    from dreamfleet.common.shelf import bundle_for, find_controller
-    from dreamfleet.coordinator.repetition import Repetition
-    from dreamfleet.coordinator.verbs.coordinator import Outcome, request_of, serve_request
+    from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+    from dreamfleet.coordinator.settings.rerun import Rerun
+    from dreamfleet.coordinator.verbs.coordinator import ExitReport, build_request, serve_request
 
     controller, beside = find_controller(args.controller, args.runs_dir)
-    again = Repetition.of(controller, bundle_for(controller, args.bundle, beside))
+    again = Rerun.of(controller, find_bundle_of(controller, args.bundle, beside))
     again.check_optimiser(args.optimiser)
     folder = args.runs_dir / check_run_name(args.run_name or f"{Path(args.controller).stem}-again")
     config, kept = again.plan(folder)
-    if again.doubt:
-        print(f"note: {again.doubt}", file=sys.stderr)
-    request = request_of(args, folder.name, config, again.limits, kept, again.start if config else None)
+    if again.expected_difference:
+        print(f"note: {again.expected_difference}", file=sys.stderr)
+    request = build_request(args, folder.name, config, again.limits, kept, again.start if config else None)
 
-    def judge() -> Outcome:
+    def on_ended() -> ExitReport:
         found = again.compare(folder)
-        return Outcome(f"; {found.told}", {"same": found.same, "why": found.why}, 0 if found.same else 1)
+        return ExitReport(f"; {found.summary}", {"same": found.same, "why": found.why}, 0 if found.same else 1)
 
-    return serve_request(args, request, judge=judge)
+    return serve_request(args, request, on_ended=on_ended)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import JournalError
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.runs import ARCHIVE, check_single, open_run, run_lock, translated
-from dreamfleet.common.site import offer
+from dreamfleet.common.runs.run_folder import ARCHIVE, check_movable, open_run, reporting_folder_errors, run_lock
 
 SUMMARY = "move a run that nobody serves into the archive"
 EXTRAS = ()
@@ -16,8 +16,8 @@ EXTRAS = ()
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("run_name", metavar="RUN", help="name of the run")
-    offer(parser, "runs_dir")
-    add_json(parser)
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -26,9 +26,9 @@ def run(args: argparse.Namespace) -> int:
     source, target = args.runs_dir / args.run_name, args.runs_dir / ARCHIVE / args.run_name
     if target.exists():
         raise JournalError(f"{target} exists; rename or delete it first")
-    check_single(source)
-    with run_lock(source), translated(source):
+    check_movable(source)
+    with run_lock(source), reporting_folder_errors(source):
         target.parent.mkdir(exist_ok=True)
         source.rename(target)
-    answer(args, f"archived as {target}; move it back to use it again", run=args.run_name, archived=target)
+    print_answer(args, f"archived as {target}; move it back to use it again", run=args.run_name, archived=target)
     return 0

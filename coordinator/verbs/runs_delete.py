@@ -6,10 +6,10 @@ import argparse
 import shutil
 import sys
 
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.runs import check_single, open_run, run_lock, translated
-from dreamfleet.common.site import offer
+from dreamfleet.common.runs.run_folder import check_movable, open_run, reporting_folder_errors, run_lock
 
 SUMMARY = "delete a run that nobody serves, with its journal, controller and videos"
 EXTRAS = ()
@@ -18,8 +18,8 @@ EXTRAS = ()
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("run_name", metavar="RUN", help="name of the run")
-    offer(parser, "runs_dir")
-    add_json(parser)
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
     parser.add_argument("--yes", action="store_true", help="do not ask")
 
 
@@ -32,11 +32,11 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError("nobody is there to confirm: give --yes")
         said = input(f"delete run {args.run_name} with its {generations} generations? [y/N] ")
         if said.strip().lower() not in ("y", "yes"):
-            answer(args, "kept", run=args.run_name, deleted=None)
+            print_answer(args, "kept", run=args.run_name, deleted=None)
             return 1
     folder = args.runs_dir / args.run_name
-    check_single(folder)
-    with run_lock(folder), translated(folder):
+    check_movable(folder)
+    with run_lock(folder), reporting_folder_errors(folder):
         shutil.rmtree(folder)
-    answer(args, f"deleted {folder}", run=args.run_name, deleted=folder)
+    print_answer(args, f"deleted {folder}", run=args.run_name, deleted=folder)
     return 0

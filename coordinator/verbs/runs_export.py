@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.site import offer
+from dreamfleet.common.runs.run_folder import open_run
 
 SUMMARY = "write a run's generations, candidates, evaluations and confirmed score as CSV, Parquet or TensorBoard events"
 EXTRAS = ()
@@ -23,20 +23,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     kinds.add_argument("--tensorboard", dest="kind", action="store_const", const="tensorboard",
                        help="an event file with curves over generations")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder to write in (default RUN-csv and the like)")
-    offer(parser, "runs_dir")
-    add_json(parser)
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Write, and print what was written."""
-    from dreamfleet.coordinator.export import export_csv, export_parquet, export_tensorboard
+    from dreamfleet.coordinator.analysis.export import export_csv, export_parquet, export_tensorboard
 
     kinds = {"csv": export_csv, "parquet": export_parquet, "tensorboard": export_tensorboard}
     folder = args.out or Path(f"{args.run_name}-{args.kind}")
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is no folder: name one")
-    with open_run(args.runs_dir, args.run_name) as stored, stored.at_one_moment():
+    with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
         written = kinds[args.kind](stored, folder)
     text = "\n".join(map(str, written)) if written else f"run {args.run_name} has no row yet: nothing was written"
-    answer(args, text, run=args.run_name, files=written)
+    print_answer(args, text, run=args.run_name, files=written)
     return 0

@@ -7,10 +7,10 @@ import json
 import sys
 from pathlib import Path
 
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_rows
 from dreamfleet.common.errors import JournalError
-from dreamfleet.common.listing import add_json, print_rows
-from dreamfleet.common.runs import ARCHIVE, RunFolder, run_paths
-from dreamfleet.common.site import offer
+from dreamfleet.common.runs.run_folder import ARCHIVE, RunFolder, run_paths
 
 SUMMARY = "list the runs on this disk"
 EXTRAS = ()
@@ -19,26 +19,26 @@ LEAST_FIRST = ("created", "classes", "task", "mean", "evaluated")  # what a narr
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    offer(parser, "runs_dir")
+    add_global_flags(parser, "runs_dir")
     parser.add_argument("--archived", action="store_true", help="list the archived ones instead")
-    add_json(parser)
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print a line a run; a damaged journal is a line too."""
     runs_dir = args.runs_dir / ARCHIVE if args.archived else args.runs_dir
-    rows = [_row(path) for path in run_paths(runs_dir)]
+    rows = [_run_row(path) for path in run_paths(runs_dir)]
     if args.json:
         print(json.dumps(rows, indent=2))
         return 0
     if not rows:
         print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME", file=sys.stderr)
         return 0
-    print_rows(rows, right=("generations", "mean", "evaluated", "confirmed", "classes"), least_first=LEAST_FIRST)
+    print_rows(rows, right=("generations", "mean", "evaluated", "confirmed", "classes"), drop_order=LEAST_FIRST)
     return 0
 
 
-def _row(path: Path) -> dict[str, object]:
+def _run_row(path: Path) -> dict[str, object]:
     try:
         with RunFolder(path) as run:
             history, evaluations, confirmed = run.history(), run.evaluations(), run.confirmation()

@@ -6,18 +6,18 @@ import argparse
 import sys
 from pathlib import Path
 
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.saving import check_out
-from dreamfleet.common.site import offer
+from dreamfleet.common.files.atomic_write import check_output_path
+from dreamfleet.common.runs.run_folder import open_run
 
 SUMMARY = (
     "draw runs' evaluated scores over environment steps and core-hours, or one run's fitness over generations, as is "
     "done of one that has no evaluated mean yet"
 )
 EXTRAS = ("views",)
-NEAR = 0.1  # of the first published mark's steps, from which on marks are drawn: shorter runs would be squeezed
+NEAR_SHARE = 0.1  # of the first published mark's steps, from which on marks are drawn: shorter runs would be squeezed
 LEARNING, FITNESS = "learning.png", "fitness.png"
 
 
@@ -26,25 +26,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_names", metavar="RUN", nargs="+", help="names of runs")
     parser.add_argument("--fitness", action="store_true", help="draw what one run's candidates scored, in any case")
     parser.add_argument("--out", type=Path, help=f"a PNG or SVG to write (default {LEARNING}, or {FITNESS})")
-    offer(parser, "runs_dir")
-    add_json(parser)
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Draw, and print where it lies."""
-    from dreamfleet.coordinator.plot import KINDS
+    from dreamfleet.coordinator.analysis.plot import KINDS
 
-    fitness = args.fitness or _unevaluated(args)
+    fitness = args.fitness or _has_no_evaluation(args)
     out = args.out or Path(FITNESS if fitness else LEARNING)
     if out.suffix not in KINDS:
         raise UsageError(f"--out {out}: give a name that ends in {' or '.join(KINDS)}")
-    check_out(out)
+    check_output_path(out)
     (_draw_fitness if fitness else _draw_learning)(args, out)
-    answer(args, str(out), picture=out, runs=args.run_names)
+    print_answer(args, str(out), picture=out, runs=args.run_names)
     return 0
 
 
-def _unevaluated(args: argparse.Namespace) -> bool:
+def _has_no_evaluation(args: argparse.Namespace) -> bool:
     """Whether it is one run without any evaluated mean: then its fitness is all that there is."""
     if len(args.run_names) > 1:
         return False
@@ -53,7 +53,7 @@ def _unevaluated(args: argparse.Namespace) -> bool:
 
 
 def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
-    from dreamfleet.coordinator.plot import plot_fitness
+    from dreamfleet.coordinator.analysis.plot import plot_fitness
 
     if len(args.run_names) > 1:
         raise UsageError("--fitness is of one run: name one")
@@ -66,8 +66,8 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
-    from dreamfleet.coordinator.learning import CAR_RACING, PAPER, LearningCurve
-    from dreamfleet.coordinator.plot import plot_learning
+    from dreamfleet.coordinator.analysis.learning import CAR_RACING, PAPER_SCORES, LearningCurve
+    from dreamfleet.coordinator.analysis.plot import plot_learning
 
     curves = []
     for name in dict.fromkeys(args.run_names):
@@ -77,5 +77,5 @@ def _draw_learning(args: argparse.Namespace, out: Path) -> None:
     if len(worlds) > 1:
         worlds_told = ", ".join(worlds)
         print(f"note: these runs are of the worlds {worlds_told}: their heights do not compare", file=sys.stderr)
-    near = max(each.total.steps for each in curves) >= NEAR * PAPER[0].steps
-    plot_learning(curves, PAPER if near and worlds == [CAR_RACING] else (), out)
+    near = max(each.total.steps for each in curves) >= NEAR_SHARE * PAPER_SCORES[0].steps
+    plot_learning(curves, PAPER_SCORES if near and worlds == [CAR_RACING] else (), out)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from dreamfleet.common.config import load
+from dreamfleet.common.cli.config import load
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.spawn import command
-from dreamfleet.coordinator.spawn.config import Host, SpawnConfig, name_of, told_apart
+from dreamfleet.coordinator.spawn.config import Host, SpawnConfig, check_unique, default_name
 
 SUMMARY = "start a worker on other hosts over ssh: installed there, handed its join file, running on by itself"
 EXTRAS = ()
@@ -25,4 +25,4 @@ def run(args: argparse.Namespace) -> int:
     if args.name is not None and len(args.hosts) > 1:
         raise UsageError("--name is one worker's: for several hosts write a file, for `dreamfleet up`")
     spawn = load(SpawnConfig, "spawn", **args.sources)
-    return command.run(args, told_apart([Host(args.name or name_of(each), each, spawn) for each in args.hosts]))
+    return command.run(args, check_unique([Host(args.name or default_name(each), each, spawn) for each in args.hosts]))

@@ -14,7 +14,7 @@ from threading import Event
 
 from distributed import Client, Worker, WorkerPlugin
 
-from dreamfleet.common.processes import command, leash
+from dreamfleet.common.host.processes import command, parent_death_command
 
 
 class Scoring(WorkerPlugin):
@@ -27,7 +27,9 @@ class Scoring(WorkerPlugin):
 
     def setup(self, worker: Worker) -> None:
         """In Dask's worker, as it begins or as the plugin comes."""
-        self.process = subprocess.Popen([*leash(), *command("worker", "--slots", worker.state.nthreads, *self.words)])
+        self.process = subprocess.Popen(
+            [*parent_death_command(), *command("worker", "--slots", worker.state.nthreads, *self.words)]
+        )
 
     async def teardown(self, worker: Worker) -> None:  # noqa: ARG002 - as Dask calls it
         """What runs is finished first."""

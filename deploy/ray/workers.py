@@ -14,7 +14,7 @@ from threading import Event
 import ray
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from dreamfleet.common.processes import command
+from dreamfleet.common.host.processes import command
 
 LOOK = 5.0  # seconds from one look at the cluster's nodes to the next
 

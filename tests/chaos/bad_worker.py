@@ -15,13 +15,13 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-from dreamfleet.common.client import Client
-from dreamfleet.worker.bench.naps import NAPS
+from dreamfleet.common.monitoring.client import Client
+from dreamfleet.worker.bench.sleep_tasks import SLEEP_TASK
 from tests.support.bundles import write_random_bundle
 from tests.support.hosts import new_host
 from tests.support.processes import processes_in
 
-NAPPING = ("--task", NAPS, "--population", "8", "--episodes", "2")  # 16 naps of 50 ms
+NAPPING = ("--task", SLEEP_TASK, "--population", "8", "--episodes", "2")  # 16 naps of 50 ms
 DREAMING = ("--preset", "dream", "--population", "16", "--episodes", "4", "--horizon", "200")
 BADS = ("slow_link", "slow_core", "flapping")
 BLOCKS, SECONDS, SETTLING = 5, 20.0, 6.0
@@ -109,7 +109,7 @@ def _ending(process):
 def measure(folder, kinds, dreaming, blocks, seconds):
     """The medians of each kind, and their ratio: how many times slower a generation becomes."""
     figures = {}
-    settings, tasks = (DREAMING, ()) if dreaming else (NAPPING, ("--task", NAPS))
+    settings, tasks = (DREAMING, ()) if dreaming else (NAPPING, ("--task", SLEEP_TASK))
     bundle = write_random_bundle(folder / "random.zip").path
     for kind in kinds:
         with new_host() as host, processes_in(folder / kind) as processes, busy_core(kind == "slow_core"):

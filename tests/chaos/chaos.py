@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.runs.run_folder import open_run
 from tests.chaos.fleet import EPISODES, POPULATION, Fleet, accepted
 from tests.chaos.kinds import KINDS
 from tests.support import tasks

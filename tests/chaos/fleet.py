@@ -10,7 +10,7 @@ from itertools import count
 from pathlib import Path
 
 from dreamfleet.common.errors import JournalError
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.runs.run_folder import open_run
 from tests.support.relay import Relay
 
 POPULATION, EPISODES = 16, 4

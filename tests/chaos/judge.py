@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from dreamfleet.common.controller import Controller
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.seeds import TEST
-from dreamfleet.common.store import find_bundle
-from dreamfleet.common.stored import best_of
-from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.runs.records import best_evaluation
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.seeds import TEST
 from tests.support.processes import processes_in
 
 SETTINGS = {
@@ -50,11 +50,11 @@ def evolve(processes, seed):
 
 def drive(controller):
     """Scores on the fresh tracks, in this process."""
-    from dreamfleet.worker.scoring.agents import spec_for
+    from dreamfleet.worker.scoring.agents import make_evaluation_spec
     from dreamfleet.worker.scoring.scorer import Scorer
 
     bundle = find_bundle(SETTINGS["bundle"])
-    scorer = Scorer(spec_for(controller, bundle), bundle)
+    scorer = Scorer(make_evaluation_spec(controller, bundle), bundle)
     return [scorer.score("evaluate", controller.parameters, seed).fitness for seed in TRACKS]
 
 
@@ -67,7 +67,7 @@ def judge(seed):
         name = evolve(processes, seed)
         evolved = time.monotonic()
         with open_run(processes.runs, name) as run:
-            told, lucky = run.confirmation(), best_of(run.evaluations())
+            told, lucky = run.confirmation(), best_evaluation(run.evaluations())
             controller = Controller.load(run.controller_path)
     scores = np.array(drive(controller))
     error = float(scores.std(ddof=1) / math.sqrt(len(scores)))

@@ -1,6 +1,6 @@
 import pytest
 
-from dreamfleet.common.printable import plural, printable, setting
+from dreamfleet.common.printable import format_setting, plural, printable
 
 
 @pytest.mark.parametrize(
@@ -23,4 +23,4 @@ def test_of_one_there_is_one():
 
 
 def test_settings_are_told_as_people_write_them():
-    assert [setting(each) for each in (True, False, ("numpy", "cma"), 0.1)] == ["yes", "no", "numpy, cma", "0.1"]
+    assert [format_setting(each) for each in (True, False, ("numpy", "cma"), 0.1)] == ["yes", "no", "numpy, cma", "0.1"]

@@ -1,7 +1,7 @@
 """A run whose means are evaluated: its jobs are finished in any order, and its coordinator is killed anywhere."""
 
-from dreamfleet.common.messages import Result, ResultBatch
-from tests.coordinator.test_run import Bench
+from dreamfleet.common.protocol.messages import Result, ResultBatch
+from tests.coordinator.run.test_run import Bench
 
 EVERY = 2  # generations from one evaluation to the next
 
@@ -38,7 +38,7 @@ class Evaluated(Bench):
         found = {}
         while self.run.ended is None:
             self.fetch()
-            found.update({job.generation: job.terms for job in self.given if job.kind == "score"})
+            found.update({job.generation: job.overrides for job in self.given if job.kind == "score"})
             self.finish(choose(self))
             after()
         return found
@@ -49,7 +49,7 @@ class Evaluated(Bench):
         def deliver(name, result):
             fate = chance.random()
             batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,))
-            self.run.exchange.results(name, batch, self.now)
+            self.run.worker_protocol.handle_results(name, batch, self.now)
             self.run.advance(self.now)
             if fate > 0.2 or self.run.ended is not None:
                 self.run.commit()

@@ -15,7 +15,6 @@ from tests.support.processes import DEADLINE, environment
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 BIN = Path(sys.executable).parent
-pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.fixture

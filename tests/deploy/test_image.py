@@ -26,7 +26,8 @@ INSTRUCTION = re.compile(r"^([A-Z]+)\s+(.*)$", re.DOTALL)
 pytestmark = [
     pytest.mark.long,
     pytest.mark.timeout(1800),
-    pytest.mark.skipif(os.geteuid() != 0 or shutil.which("debootstrap") is None, reason="needs root and debootstrap"),
+    pytest.mark.skipif(os.geteuid() != 0, reason="needs root"),
+    pytest.mark.needs_programs("debootstrap"),
 ]
 
 

@@ -16,10 +16,10 @@ import pytest
 import yaml
 from cloudcoil.models.keda import v1alpha1 as keda
 
-from dreamfleet.common import cli
-from dreamfleet.common.metrics import exposition
+from dreamfleet.common.cli import command_line
+from dreamfleet.common.monitoring.prometheus import exposition
 from tests.support import tasks
-from tests.support.processes import environment
+from tests.support.processes import DEADLINE, environment
 from tests.support.samples import STATUS
 
 ROOT = Path(__file__).parents[2]
@@ -43,13 +43,13 @@ def documents(path):
 
 def understood(verb, words):
     """Whether the verb knows these words; an unknown one exits."""
-    (point,) = (each for each in entry_points(group=cli.GROUP) if each.name == verb)
-    cli.parser_of(verb, point.load()).parse_all([str(each) for each in words])
+    (point,) = (each for each in entry_points(group=command_line.GROUP) if each.name == verb)
+    command_line.build_parser(verb, point.load()).parse_all([str(each) for each in words])
 
 
 def test_the_linters_are_content():
     checked(BIN / "hadolint", "--failure-threshold", "style", DEPLOY / "Containerfile")
-    checked(BIN / "shellcheck", *DEPLOY.rglob("*.sh"))
+    checked(BIN / "shellcheck", *DEPLOY.rglob("*.sh"), ROOT / ".ci" / "run")
     checked(BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", DEPLOY / "compose.yaml")
 
 
@@ -105,7 +105,7 @@ def test_workers_are_scaled_by_metrics_that_are_there():
     assert all(f'{name}{{run="night"}}' in told for name in names)
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd")
+@pytest.mark.needs_programs("systemd-analyze")
 @pytest.mark.parametrize("unit", UNITS, ids=lambda path: path.stem)
 def test_systemd_takes_the_units_and_finds_them_shut(unit, tmp_path):
     text = unit.read_text()
@@ -159,12 +159,12 @@ def test_one_command_begins_a_run_and_goes_on_with_it(processes, random_bundle):
         while "incarnation 1" not in begun.stderr.readline():
             assert begun.poll() is None
         begun.send_signal(signal.SIGTERM)
-        assert begun.wait(60) == 130
+        assert begun.wait(DEADLINE) == 130
         begun.stderr.read()
     with subprocess.Popen(words, env=surroundings, stderr=subprocess.PIPE, text=True) as again:
         processes.worker("--run", "night", "--task", tasks.TOY, "--exit-when-done")
         said = again.stderr.read()
-        assert again.wait(60) == 0, said
+        assert again.wait(DEADLINE) == 0, said
     assert "incarnation 2" in said
     assert "generation 2: mean" in said
 

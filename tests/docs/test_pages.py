@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.cli import GROUP
+from dreamfleet.common.cli.command_line import GROUP
 
 HERE = Path(__file__).parents[2]
 PAGES = sorted(path for folder in (".", "docs", "deploy") for path in (HERE / folder).glob("*.md"))

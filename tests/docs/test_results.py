@@ -4,9 +4,9 @@ import subprocess
 
 import pytest
 
-from dreamfleet.common.judgement import read_judgement
-from dreamfleet.common.seeds import TEST
-from dreamfleet.common.shelf import bundle_for, find_controller
+from dreamfleet.common.runs.evaluation_report import read_evaluation_report
+from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+from dreamfleet.common.runs.seeds import TEST
 from tests.support.processes import DEADLINE, ROOT
 
 RECORDS = sorted((ROOT / "docs" / "results").glob("*.json"))
@@ -14,12 +14,12 @@ RECORDS = sorted((ROOT / "docs" / "results").glob("*.json"))
 
 @pytest.mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
 def test_a_record_is_of_a_controller_that_ships_and_the_page_tells_it(path, tmp_path):
-    found = read_judgement(path)
+    found = read_evaluation_report(path)
     controller, _ = find_controller(found.name, tmp_path)
     assert (found.name, found.controller) == (path.stem, controller.sha256)
-    assert found.bundle == bundle_for(controller, None).sha256
-    assert set(found.evaluated.seeds) <= set(TEST)
-    assert f"{found.evaluated.mean:.1f} ± {found.evaluated.error:.1f}" in (ROOT / "docs" / "results.md").read_text()
+    assert found.bundle == find_bundle_of(controller, None).sha256
+    assert set(found.results.seeds) <= set(TEST)
+    assert f"{found.results.mean:.1f} ± {found.results.error:.1f}" in (ROOT / "docs" / "results.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,4 @@ def endpoint():
 @pytest.fixture
 def hosts(tmp_path):
     with ssh_hosts(tmp_path) as found:
-        if found is None:
-            pytest.skip("there is no sshd here")
         yield found

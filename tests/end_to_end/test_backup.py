@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.runs import BUNDLE, JOURNAL, ROLLOUTS, open_run
-from dreamfleet.common.store import find_bundle
-from dreamfleet.coordinator import backup
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.runs.run_folder import BUNDLE, JOURNAL, ROLLOUTS, open_run
+from dreamfleet.coordinator.storage import backup
 from tests.end_to_end.test_same_bits import GENERATIONS, SETTINGS, outcome
 
-pytestmark = pytest.mark.timeout(300)
 FLAGS = (*SETTINGS, "--evaluate-every", 0, "--collect-every", 1, "--collect-episodes", 1)
 
 
@@ -23,7 +22,7 @@ def back_up(processes, to, name="test"):
 def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, tmp_path):
     whole = processes.coordinator(*FLAGS, name="whole")
     worker = processes.worker("--run", "whole")
-    assert whole.finish(120)[0] == 0
+    assert whole.finish()[0] == 0
     worker.end()
 
     safe = tmp_path / "safe"
@@ -46,7 +45,7 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
     assert code == 0, err
     resumed = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs)
     processes.worker("--run", "test")
-    assert resumed.finish(120)[0] == 0
+    assert resumed.finish()[0] == 0
     assert outcome(processes, "test") == outcome(processes, "whole")
     assert len(list((processes.runs / "test" / ROLLOUTS).iterdir())) == GENERATIONS
 
@@ -58,7 +57,7 @@ def finished(processes):
         "--task", "gym:CartPole-v1", "--population", 4, "--generations", 2, "--evaluate-every", 0, "--horizon", 20
     )
     processes.worker("--run", "test")
-    assert coordinator.finish(120)[0] == 0
+    assert coordinator.finish()[0] == 0
     return processes.runs / "test"
 
 
@@ -114,7 +113,7 @@ def test_a_call_that_is_interrupted_leaves_the_earlier_copy(processes, finished,
 def test_a_world_model_is_copied_too(processes, tmp_path):
     coordinator = processes.coordinator(*SETTINGS, "--generations", 1, "--evaluate-every", 0)
     processes.worker("--run", "test")
-    assert coordinator.finish(120)[0] == 0
+    assert coordinator.finish()[0] == 0
     assert back_up(processes, tmp_path / "safe")[0] == 0
     copied = tmp_path / "safe" / "test" / BUNDLE
     assert copied.read_bytes() == find_bundle("tiny").path.read_bytes()
@@ -123,13 +122,13 @@ def test_a_world_model_is_copied_too(processes, tmp_path):
 def test_two_at_once_leave_a_whole_copy(processes, finished, tmp_path, monkeypatch):
     safe = tmp_path / "safe"
     assert back_up(processes, safe)[0] == 0
-    unserved, said = backup._unserved, []
+    unserved, said = backup._hold_target, []
 
     def meanwhile(target):
         said.append(back_up(processes, safe))
         return unserved(target)
 
-    monkeypatch.setattr(backup, "_unserved", meanwhile)
+    monkeypatch.setattr(backup, "_hold_target", meanwhile)
     with open_run(processes.runs, "test") as source:
         backup.back_up(source, safe / "test")
     assert [(code, "is at work" in err) for code, _, err in said] == [(2, True)]

@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dreamfleet.common.controller import Controller, ControllerShape
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from tests.support import tasks
-from tests.support.processes import command, environment
-
-pytestmark = pytest.mark.timeout(120)
+from tests.support.processes import DEADLINE, command, environment
 
 
 def complains(processes, *arguments, says):
@@ -134,7 +132,7 @@ def test_a_full_stdout_is_one_line(processes, odd, more):
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             command("runs", "list", "--runs-dir", odd, *more), env=environment(processes.cache), stdout=full,
-            stderr=subprocess.PIPE, check=False, text=True, timeout=60,
+            stderr=subprocess.PIPE, check=False, text=True, timeout=DEADLINE,
         )  # fmt: skip
     assert done.returncode == 1
     assert done.stderr.splitlines() == ["dreamfleet: what this verb prints could not be written: no space left"]

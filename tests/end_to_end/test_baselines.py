@@ -9,9 +9,8 @@ import pytest
 from dreamfleet.worker.baselines.presets import find_preset
 from dreamfleet.worker.baselines.train import CHECKPOINT, CURVE, train_drqn
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
-from dreamfleet.worker.training.flags import changed
+from dreamfleet.worker.training.config_flags import apply_flags
 
-pytestmark = pytest.mark.timeout(120)
 EPISODES, TUPLES = 12, ("channels", "kernels", "strides")
 SETTINGS = {
     "channels": 2, "kernels": 8, "strides": 8, "hidden": 4, "steps": 60, "random_episodes": 2, "batch": 2,
@@ -23,7 +22,7 @@ def finish(folder):
     """Train to the end, here."""
     args = argparse.Namespace(**{name: [value] if name in TUPLES else value for name, value in SETTINGS.items()})
     preset = find_preset("learning")
-    train_drqn(folder, changed(preset.agent, args), changed(preset.learning, args))
+    train_drqn(folder, apply_flags(preset.agent, args), apply_flags(preset.learning, args))
 
 
 def state(folder):

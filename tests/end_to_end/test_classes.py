@@ -7,15 +7,14 @@ import sys
 
 import pytest
 
-from dreamfleet.common import keys
-from dreamfleet.common.codec import encode_json
-from dreamfleet.common.messages import HelloRequest
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import encode_json
+from dreamfleet.common.protocol.messages import HelloRequest
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.transport.session import Network, open_session
 from tests.support import tasks
-from tests.support.processes import environment
+from tests.support.processes import DEADLINE, environment
 
-pytestmark = pytest.mark.timeout(300)
 OTHER = "riscv64 other"
 ODD = ("env", f"{tasks.ROUNDING}=1")  # a host on which a sum comes out otherwise, in its last bit
 GO_ON = "coordinator", "--resume", "test", "--generations", 2
@@ -37,9 +36,9 @@ def stranger(processes, tmp_path):
     """Starts a worker on a host that says something else of itself, and computes the same."""
     script, started = tmp_path / "stranger.py", []
     script.write_text(
-        "import sys\nimport dreamfleet.worker.service.admission as admission, dreamfleet.worker.service.post as post\n"
+        "import sys\nfrom dreamfleet.worker.service import admission, sender as post\n"
         f"admission.fingerprint = post.fingerprint = lambda *_: {OTHER!r}\n"
-        "from dreamfleet.common.cli import main\n"
+        "from dreamfleet.common.cli.command_line import main\n"
         "if __name__ == '__main__':\n    sys.exit(main(sys.argv[1:]))\n"  # its children import it too
     )
 
@@ -63,11 +62,11 @@ def one_after_the_other(processes, settings, first, second):
     """The first worker scores generation 0, the second one generation 1."""
     coordinator = processes.coordinator(*settings, "--generations", 1)
     started = first()
-    assert coordinator.finish(120)[0] == 0
+    assert coordinator.finish()[0] == 0
     getattr(started, "popen", started).kill()  # else it would score the next generation too
     coordinator = processes.start(*GO_ON, "--runs-dir", processes.runs)
     second()
-    assert coordinator.finish(120)[0] == 0
+    assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
         return run.classes
 
@@ -76,15 +75,15 @@ def test_a_strangers_hello_keeps_nobody_out_of_a_strict_run(processes, settings)
     coordinator = processes.coordinator(*settings, "--generations", 1, "--strict")
     hello = HelloRequest(keys.PROTOCOL_VERSION, keys.PROTOCOL_VERSION, "0", "gone/00000001", (tasks.ROUNDED,), OTHER, 1)
     with open_session(Network(connect=(processes.endpoint,))) as session:
-        (reply,) = session.get(keys.hello("test"), payload=encode_json(hello), timeout=30)
+        (reply,) = session.get(keys.hello("test"), payload=encode_json(hello), timeout=DEADLINE)
         assert b'"accepted": true' in reply.ok.payload.to_bytes()
     own(processes)
-    assert coordinator.finish(120)[0] == 0
+    assert coordinator.finish()[0] == 0
 
 
 def test_hosts_that_compute_the_same_are_of_one_class_whatever_they_say_of_themselves(processes, settings, stranger):
     classes = one_after_the_other(processes, (*settings, "--strict"), stranger, lambda: own(processes))
-    assert classes.told == "one class: to the bit"
+    assert classes.description == "one class: to the bit"
     assert len(classes.largest[0].fingerprints) == 2
     assert OTHER in classes.largest[0].fingerprints
 
@@ -93,7 +92,7 @@ def test_hosts_that_compute_the_same_are_of_one_class_whatever_they_say_of_thems
 def test_a_strict_run_refuses_another_class_and_goes_on_strict_until_it_is_told_otherwise(processes, settings):
     coordinator = processes.coordinator(*settings, "--generations", 1, "--strict")
     first = own(processes)
-    assert coordinator.finish(120)[0] == 0
+    assert coordinator.finish()[0] == 0
     first.end()  # else it would score the next generation
     resumed = *GO_ON, "--runs-dir", processes.runs
     coordinator = processes.start(*resumed)
@@ -104,9 +103,9 @@ def test_a_strict_run_refuses_another_class_and_goes_on_strict_until_it_is_told_
     coordinator = processes.start(*resumed, "--mixed")
     coordinator.wait_for("--mixed is deprecated")
     own(processes, inside=ODD)
-    assert coordinator.finish(120)[0] == 0
+    assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
-        assert run.classes.told == "mixed: 2 classes, 50.0%, 50.0% of results"
+        assert run.classes.description == "mixed: 2 classes, 50.0%, 50.0% of results"
         assert json.loads(run.fact("network"))["strict"] is False
 
 
@@ -132,7 +131,7 @@ def test_status_runs_show_and_list_tell_of_what_classes_the_results_are(processe
 
 
 def product(where):
-    done = subprocess.run([*where, sys.executable, "-c", PRODUCT], capture_output=True, check=True, timeout=60)
+    done = subprocess.run([*where, sys.executable, "-c", PRODUCT], capture_output=True, check=True, timeout=DEADLINE)
     return hashlib.sha256(done.stdout).hexdigest()
 
 
@@ -144,13 +143,13 @@ def test_another_kernel_of_openblas_is_another_class_whose_results_are_replayed_
     settings = ("--task", "gym:BipedalWalker-v3", "--population", 4, "--episodes", 2, "--horizon", 100, "--sigma0", 1.0,
                 "--evaluate-every", 0)  # fmt: skip
     classes = one_after_the_other(processes, settings, lambda: processes.worker(inside=OTHER_KERNEL), processes.worker)
-    assert classes.told == "mixed: 2 classes, 50.0%, 50.0% of results"
+    assert classes.description == "mixed: 2 classes, 50.0%, 50.0% of results"
 
     def replayed(candidate, where=(), *more):
         replay = processes.start(
             "replay", "test", "--runs-dir", processes.runs, "--candidate", candidate, *more, inside=where
         )
-        code, out = replay.finish(60)
+        code, out = replay.finish()
         return code, out, "".join(replay.lines)
 
     code, out, err = replayed("1/0")

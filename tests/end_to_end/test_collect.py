@@ -7,20 +7,19 @@ import signal
 import numpy as np
 import pytest
 
-from dreamfleet.common import keys
-from dreamfleet.common.codec import decode, encode
-from dreamfleet.common.messages import MAX_PART, UploadPart
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.seeds import collection_seed
-from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import decode, encode
+from dreamfleet.common.protocol.messages import MAX_PART, UploadPart
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.seeds import collection_seed
+from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
-from dreamfleet.worker.training.dataset import episodes, load_pictures
+from dreamfleet.worker.training.data.dataset import episode_paths, load_pictures
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
 
-pytestmark = pytest.mark.timeout(240)
 GENERATIONS, DRIVES = 4, 3
 
 
@@ -82,7 +81,7 @@ def test_a_coordinator_killed_in_mid_upload_asks_again(processes, settings):
 
     first = processes.coordinator(*settings, "--task", tasks.HEAVY, name="test")
     with open_session(Network(connect=(processes.endpoint,))) as session:
-        heard = session.declare_subscriber(keys.any_worker("upload", "test"))
+        heard = session.declare_subscriber(keys.all_workers("upload", "test"))
         processes.worker("--run", "test", "--task", tasks.HEAVY)
         part = decode(UploadPart, heard.recv().payload.to_bytes())
         assert part.total > 3 * MAX_PART
@@ -133,8 +132,8 @@ def test_drives_of_the_real_car_are_episodes_that_a_data_set_takes_in_once(proce
         assert code == 0, err
         assert f"{new} episodes, {30 * new} frames new, of 2" in out
     with open_run(processes.runs, "test") as run:
-        assert [path.read_bytes() for path in run.rollouts()] == [path.read_bytes() for path in episodes(data)]
-    for path in episodes(data):
+        assert [path.read_bytes() for path in run.rollouts()] == [path.read_bytes() for path in episode_paths(data)]
+    for path in episode_paths(data):
         pictures = load_pictures(path)
         assert pictures.shape == (30, *preprocessing.shape)
         assert pictures.dtype == np.uint8

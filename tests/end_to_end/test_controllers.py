@@ -2,10 +2,8 @@
 
 import pytest
 
-from dreamfleet.common.controller import Controller
-from dreamfleet.common.runs import open_run
-
-pytestmark = pytest.mark.timeout(240)
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.runs.run_folder import open_run
 
 
 @pytest.mark.slow

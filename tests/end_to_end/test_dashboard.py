@@ -17,13 +17,12 @@ from statistics import median
 
 import pytest
 
-from dreamfleet.common.processes import command
+from dreamfleet.common.host.processes import command
 from tests.support import tasks
 from tests.support.browser import PATIENCE, chromium, tab
-from tests.support.processes import free_port
+from tests.support.processes import DEADLINE, free_port
 from tests.support.served import WORKER, serving, snapshot
 
-pytestmark = pytest.mark.timeout(240)
 RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
 TOKEN = "correct horse battery"
 LEFT_OUT = ("Failed to load resource", "net::ERR")  # what a browser says by itself of a server that is gone
@@ -355,7 +354,8 @@ def test_what_cannot_be_served_is_one_line(processes):
 
 def test_without_its_packages_it_names_the_extra():
     hidden = (
-        "import sys; sys.modules.update({'plotly': None}); from dreamfleet.common.cli import main; sys.exit(main())"
+        "import sys; sys.modules.update({'plotly': None}); "
+        "from dreamfleet.common.cli.command_line import main; sys.exit(main())"
     )
     done = subprocess.run(
         [sys.executable, "-P", "-c", hidden, "dashboard", "--port", "0"], capture_output=True, text=True, check=False
@@ -366,16 +366,16 @@ def test_without_its_packages_it_names_the_extra():
 
 def test_it_leaves_at_once_although_pages_are_open(processes):
     with dashboard(processes, "--port", 0) as started:
-        stream = urllib.request.urlopen(f"{started.address}live", timeout=30)
+        stream = urllib.request.urlopen(f"{started.address}live", timeout=DEADLINE)
         assert stream.readline().startswith(b"event: hello")
         assert "digest" in json.loads(stream.readline().removeprefix(b"data: "))
         started.popen.send_signal(signal.SIGTERM)
-        assert started.popen.wait(10) is not None
+        assert started.popen.wait(DEADLINE) is not None
         with pytest.raises(urllib.error.URLError):
-            urllib.request.urlopen(started.address, timeout=5)
+            urllib.request.urlopen(started.address, timeout=DEADLINE)
 
 
-def told(port, request, deadline=120):
+def told(port, request, deadline=DEADLINE):
     """What the server says to these bytes until it closes the connection, or the head alone of what goes on."""
     with socket.create_connection(("127.0.0.1", port), timeout=deadline) as connection:
         connection.sendall(request)
@@ -389,7 +389,7 @@ def test_clients_that_are_no_browsers_neither_stop_it_nor_see_more(processes):
     with dashboard(processes, "--port", 0) as started, ExitStack() as stack:
         port = int(started.address.split(":")[-1].strip("/"))
         host = b"\r\nHost: 127.0.0.1\r\n"
-        half = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=120)) for _ in range(50)]
+        half = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=DEADLINE)) for _ in range(50)]
         for each in half:
             each.sendall(b"GET / HTTP/1.1\r\nHost: 127")
         for request, code in (
@@ -408,5 +408,5 @@ def test_clients_that_are_no_browsers_neither_stop_it_nor_see_more(processes):
             assert said.split()[1:2] == [code], (request[:60], said[:200])
             assert b"root:" not in said
         assert all(each.recv(1) == b"" for each in half), "half a request is not waited for"
-        with urllib.request.urlopen(started.address, timeout=60) as answer:
+        with urllib.request.urlopen(started.address, timeout=DEADLINE) as answer:
             assert answer.status == 200

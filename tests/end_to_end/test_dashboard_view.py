@@ -11,7 +11,6 @@ import pytest
 from tests.support import tasks
 from tests.support.browser import PATIENCE, chromium, tab
 
-pytestmark = pytest.mark.timeout(240)
 PICTURE = "[data-part=view-picture]:not([hidden])"
 WHOM = "[data-part=view-whom]"
 HIDE = "hidden => { Object.defineProperty(document, 'hidden', {value: hidden, configurable: true}); " \

@@ -7,12 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.cli import main
-from dreamfleet.common.controller import Controller
-from dreamfleet.common.runs import open_run
-from dreamfleet.coordinator.demo import Demo, DemoConfig, median_drive, stages
-
-pytestmark = pytest.mark.timeout(300)
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig, median_drive, plan_runs
 
 
 @pytest.mark.parametrize(
@@ -35,7 +33,7 @@ def test_its_video_shows_the_median_track(drives, expected):
     ],
 )
 def test_both_stages_search_in_the_features_that_ship_for_its_world_model(config, subspace, steps):
-    found = stages(config, "demo", Path("runs"))
+    found = plan_runs(config, "demo", Path("runs"))
     assert [each.flags["sigma0"] for each in found] == steps
     assert [each.flags.get("subspace") for each in found] == [subspace] * len(steps)
     assert all(("covariance" in each.flags) == bool(subspace) for each in found), "full in few dimensions"
@@ -45,7 +43,7 @@ def test_both_stages_search_in_the_features_that_ship_for_its_world_model(config
 def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
     code, out, err = processes.call(
         "demo", "--run", "demo", "--runs-dir", processes.runs, "--port", processes.port, "--bundle", random_bundle.path,
-        "--dream-minutes", 0.02, "--minutes", 0.02, "--horizon", 30, "--tracks", 1, "--population", 4, timeout=250,
+        "--dream-minutes", 0.02, "--minutes", 0.02, "--horizon", 30, "--tracks", 1, "--population", 4,
     )  # fmt: skip
     assert code == 0, err
     with open_run(processes.runs, "demo-dream") as dream, open_run(processes.runs, "demo") as real:

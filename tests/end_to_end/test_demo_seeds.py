@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.runs.run_folder import open_run
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 

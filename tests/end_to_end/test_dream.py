@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import DREAM, write_bundle
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.terms import terms_of
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.scoring_params import scoring_params_of
 from tests.support import tasks
 from tests.support.bundles import states, write_random_bundle
 
-pytestmark = pytest.mark.timeout(300)
 GENERATIONS, POPULATION, EPISODES = 4, 8, 3
 HEATED_GENERATIONS = 14
 
@@ -39,13 +38,13 @@ def outcome(processes, name):
 def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bundle):
     coordinator = begin(processes, random_bundle, "alone")
     worker = processes.worker("--run", "alone")
-    assert coordinator.finish(200)[0] == 0
+    assert coordinator.finish()[0] == 0
     worker.end()
     coordinator = begin(processes, random_bundle, "three")
     workers = [processes.worker("--run", "three", "--name", f"w{number}") for number in range(3)]
     coordinator.wait_for("generation 0: mean")
     os.kill(workers[1].popen.pid, signal.SIGKILL)
-    assert coordinator.finish(200)[0] == 0
+    assert coordinator.finish()[0] == 0
     alone = outcome(processes, "alone")
     assert alone == outcome(processes, "three")
     assert [generation for generation, _ in alone[2]] == [1, 3]
@@ -62,7 +61,7 @@ def test_dreams_that_begin_at_recorded_states_are_the_same_whoever_dreams(proces
     for name, workers, flags in (("alone", 1, ("--recorded", 0.5)), ("two", 2, ("--recorded", 0.5)), ("plain", 1, ())):
         coordinator = begin(processes, bundle, name, *flags)
         crew = [processes.worker("--run", name, "--name", f"w{number}") for number in range(workers)]
-        assert coordinator.finish(200)[0] == 0, "".join(coordinator.lines)
+        assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
         for each in crew:
             each.end()
     alone = outcome(processes, "alone")
@@ -103,7 +102,7 @@ def heated_outcome(processes, name):
     with open_run(processes.runs, name) as run:
         places = [(g, i) for g in range(HEATED_GENERATIONS) for i in range(POPULATION)]
         told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
-        temperatures = [terms_of(run, g).spec.temperature for g in range(HEATED_GENERATIONS)]
+        temperatures = [scoring_params_of(run, g).spec.temperature for g in range(HEATED_GENERATIONS)]
         return told, run.evaluations(), temperatures
 
 
@@ -134,11 +133,11 @@ def test_a_heated_run_whose_coordinator_is_killed_raises_at_the_same_generations
 
 
 def test_a_world_model_without_a_dream_is_refused_by_its_worker(processes, random_bundle, tmp_path):
-    parts = {name: random_bundle.read(name) for name in random_bundle.manifest.parts if name != DREAM}
+    parts = {name: random_bundle.read(name) for name in random_bundle.manifest.parts if name != DREAM_GRAPH}
     old = write_bundle(tmp_path / "old.zip", replace(random_bundle.manifest, parts={}), parts)
     begin(processes, old, "old")
     worker = processes.worker("--run", "old")
-    code, _ = worker.finish(60)
+    code, _ = worker.finish()
     assert code == 1
     assert any("from before dreams" in line for line in worker.lines)
 
@@ -174,7 +173,7 @@ def test_a_run_that_dreams_then_mixes_then_drives_gives_the_same_bits_through_ki
     worker = processes.worker("--run", "calm", "--slots", 2)
     coordinator.wait_for("stage 2 of 3 (60 steps, 8 x 4 episodes, 50% of them driven, a new search with step size 0.2)")
     coordinator.wait_for("stage 3 of 3 (60 steps, 8 x 2 episodes, all driven, the search goes on)")
-    assert coordinator.finish(200)[0] == 0
+    assert coordinator.finish()[0] == 0
     worker.end()
     coordinator = staged(processes, random_bundle, "night")
     for number in range(2):
@@ -185,7 +184,7 @@ def test_a_run_that_dreams_then_mixes_then_drives_gives_the_same_bits_through_ki
         coordinator = processes.start(
             "coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint,
         )  # fmt: skip
-    assert coordinator.finish(200)[0] == 0
+    assert coordinator.finish()[0] == 0
     told = []
     for name in ("calm", "night"):
         with open_run(processes.runs, name) as run:

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.controller import Controller
-from dreamfleet.common.fingerprint import fingerprint
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.runs.run_folder import open_run
 
-pytestmark = pytest.mark.timeout(300)
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 CONTINUED = json.loads((FIXTURES / "continued.json").read_text())
 NAMES = sorted(CONTINUED)
@@ -58,7 +57,7 @@ def test_they_go_on_as_the_version_that_wrote_them_would(processes, runs, name):
         "--generations", expected["generations"], *loosened,
     )  # fmt: skip
     processes.worker("--run", name, "--exit-when-done")
-    code, _ = coordinator.finish(120)
+    code, _ = coordinator.finish()
     assert code == 0, "".join(coordinator.lines)
     with open_run(runs, name) as run:
         assert len(run.history()) == expected["generations"]

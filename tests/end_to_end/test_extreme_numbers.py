@@ -2,10 +2,8 @@
 
 import pytest
 
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
-
-pytestmark = pytest.mark.timeout(120)
 
 
 @pytest.mark.parametrize("task", [tasks.EXPLODING, tasks.ENDLESS])

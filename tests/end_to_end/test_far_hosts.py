@@ -12,10 +12,10 @@ from contextlib import ExitStack, closing, contextmanager
 
 import pytest
 
-from dreamfleet.common.authority import Authority
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.security.authority import Authority
 from tests.support import tasks
-from tests.support.hosts import new_host
+from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import free_port, processes_in
 from tests.support.relay import Relay
 
@@ -71,8 +71,7 @@ class FarFleet:
 def far_fleet(processes):
     with ExitStack() as stack:
         cables = [stack.enter_context(new_host()) for _ in range(1 + HOSTS)]
-        if None in cables:
-            pytest.skip("network namespaces need root and iproute2")
+        require_hosts(*cables)
         fleet = FarFleet(processes, cables)
         stack.callback(fleet.close)
         yield fleet

@@ -13,14 +13,14 @@ from contextlib import ExitStack
 
 import pytest
 
-from dreamfleet.common.authority import Authority
-from dreamfleet.common.client import Client
-from dreamfleet.common.credentials import read_join
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.session import Network
+from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.security.authority import Authority
+from dreamfleet.common.security.credentials import read_join_file
+from dreamfleet.common.transport.session import Network
 from dreamfleet.coordinator.spawn.parcel import pack_wheel
 from tests.support.disks import small_disk
-from tests.support.hosts import new_host
+from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import free_port
 from tests.support.sshd import new_key
 
@@ -87,8 +87,7 @@ def test_three_hosts_score_soon_after_one_command_and_another_leaves_nothing(
     """A wheelhouse serves hosts that reach nothing but us; an index, this host under three names."""
     with ExitStack() as stack:
         cables = [stack.enter_context(new_host()) for _ in NAMES] if source == "wheelhouse" else []
-        if None in cables:
-            pytest.skip("network namespaces need root and iproute2")
+        require_hosts(*cables)
         near = [each.address for each in cables] or ["127.0.0.1"]
         where = [{"address": each.own, "inside": each.inside} for each in cables] or [{}] * len(NAMES)
         there = [hosts.add(name, path=BARE, modules="", **how) for name, how in zip(NAMES, where, strict=True)]
@@ -100,7 +99,7 @@ def test_three_hosts_score_soon_after_one_command_and_another_leaves_nothing(
             authority.issue("coordinator", "home", tmp_path / "home.join", hosts=near)
             authority.issue("worker", "lab", tmp_path / "lab.join", connect=endpoints)
             authority.issue("operator", "me", tmp_path / "me.join", connect=endpoints)
-            mine = read_join(tmp_path / "me.join")
+            mine = read_join_file(tmp_path / "me.join")
         network = Network(connect=(endpoints[0],), credentials=mine)
         reach = f'join = "{tmp_path}/lab.join"\n' if secured else f"connect = {json.dumps(endpoints)}\n"
         rows = "".join(f'[[host]]\naddress = "{name}"\n' for name in NAMES)

@@ -6,12 +6,10 @@ import subprocess
 
 import pytest
 
-from dreamfleet.common.processes import command
+from dreamfleet.common.host.processes import command
 from tests.support import tasks
-from tests.support.processes import environment
+from tests.support.processes import DEADLINE, environment
 
-pytestmark = pytest.mark.timeout(180)
-PATIENCE = 60
 WORKER = ("worker", "--slots", 1, "--task")
 
 
@@ -63,14 +61,14 @@ def coordinator(processes, bundle, task, generations, *more):
 def test_a_run_ends_although_nobody_reads_what_its_processes_log(processes, random_bundle, frozen):
     run = frozen(*coordinator(processes, random_bundle, tasks.TOY, 5))
     worker = frozen(*WORKER, tasks.TOY, "--connect", processes.endpoint, "--exit-when-done", "--log-level", "debug")
-    assert run.wait(PATIENCE) == 0
-    assert worker.wait(PATIENCE) == 0
+    assert run.wait(DEADLINE) == 0
+    assert worker.wait(DEADLINE) == 0
 
 
 def test_a_task_that_prints_without_end_scores_although_nobody_reads_it(processes, random_bundle, frozen):
     run = frozen(*coordinator(processes, random_bundle, tasks.CHATTY, 2))
     frozen(*WORKER, tasks.CHATTY, "--connect", processes.endpoint, stdout=True)
-    assert run.wait(PATIENCE) == 0
+    assert run.wait(DEADLINE) == 0
 
 
 def test_who_is_not_read_still_hears_that_it_shall_leave(processes, random_bundle, frozen):
@@ -79,17 +77,17 @@ def test_who_is_not_read_still_hears_that_it_shall_leave(processes, random_bundl
     while not (status := processes.status()) or status["generations"] < 1:
         pass
     worker.send_signal(signal.SIGTERM)
-    assert worker.wait(PATIENCE) == 0
+    assert worker.wait(DEADLINE) == 0
     run.send_signal(signal.SIGTERM)
-    assert run.wait(PATIENCE) == 130
+    assert run.wait(DEADLINE) == 130
 
 
 @pytest.mark.slow
 def test_an_answer_that_nobody_reads_waits_and_a_signal_ends_it(processes, random_bundle, frozen):
     run = frozen(*coordinator(processes, random_bundle, tasks.TOY, 1, "--json"), stdout=True)
     worker = frozen(*WORKER, tasks.TOY, "--connect", processes.endpoint, "--exit-when-done")
-    assert worker.wait(PATIENCE) == 0, "the run has ended"
+    assert worker.wait(DEADLINE) == 0, "the run has ended"
     with pytest.raises(subprocess.TimeoutExpired):
         run.wait(2)
     run.send_signal(signal.SIGTERM)
-    assert run.wait(PATIENCE) == -signal.SIGTERM
+    assert run.wait(DEADLINE) == -signal.SIGTERM

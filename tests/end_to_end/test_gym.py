@@ -6,9 +6,9 @@ import time
 import numpy as np
 import pytest
 
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.runs.run_folder import open_run
+from tests.support.processes import DEADLINE
 
-pytestmark = pytest.mark.timeout(300)
 NORMAL = ("--normalise", "--population", 32, "--episodes", 4, "--evaluation-episodes", 16)
 LEARNT = {  # settings, generations, and the mean over 50 unseen seeds that is to be passed
     "lander": (("--task", "gym:LunarLander-v3", *NORMAL, "--sigma0", 0.3), 80, 200),
@@ -76,7 +76,7 @@ def test_a_worker_that_lacks_the_environment_says_so_and_the_run_waits(processes
     assert "'tests.support.tasks:Toy'" in err
     assert "install the package" in err
     coordinator.wait_for("refused worker")
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + DEADLINE
     while "refused" not in (status := processes.status()):  # a status is from up to a moment before
         assert time.monotonic() < deadline
     assert status["state"] == "waiting for workers"

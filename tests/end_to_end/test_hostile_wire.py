@@ -8,16 +8,15 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from dreamfleet.common import keys
-from dreamfleet.common.codec import decode_json, encode, encode_json
-from dreamfleet.common.messages import MAX_MESSAGE, ControlReply, HelloReply
-from dreamfleet.common.session import Network, open_session
-from dreamfleet.common.status import PARTS
+from dreamfleet.common.monitoring.status import PARTS
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import decode_json, encode, encode_json
+from dreamfleet.common.protocol.messages import MAX_MESSAGE, ControlReply, HelloReply
+from dreamfleet.common.transport.session import Network, open_session
 from tests.support import tasks
 from tests.support.mutations import mutations
+from tests.support.processes import DEADLINE
 from tests.support.samples import JSON, MSGPACK
-
-pytestmark = pytest.mark.timeout(120)
 
 
 @pytest.mark.slow
@@ -33,7 +32,7 @@ def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, 
                 session.put(
                     key, payload, congestion_control=zenoh.CongestionControl.BLOCK
                 )  # else a busy host loses some
-        replies = list(session.get(keys.hello("test"), payload=b"let me in", timeout=5))
+        replies = list(session.get(keys.hello("test"), payload=b"let me in", timeout=DEADLINE))
         assert b'"accepted": false' in replies[0].ok.payload.to_bytes()
         assert not list(session.get(keys.bundle("test", "ab" * 32), timeout=1))
     while sum((dropped := processes.status()["dropped"]).values()) < 16:
@@ -104,7 +103,7 @@ HELLO = replace(JSON["hello-request"], tasks=(tasks.SLOW_TOY,), slots=1, **SPOKE
 
 def say(session, key, payload=None):
     """The one answer to a query."""
-    (reply,) = list(session.get(key, payload=payload, timeout=5))
+    (reply,) = list(session.get(key, payload=payload, timeout=DEADLINE))
     return reply.ok.payload.to_bytes()
 
 
@@ -146,9 +145,9 @@ def test_every_query_is_answered_whatever_it_asks_for(processes, random_bundle):
         for text in STRANGE:
             asked = f"?offset={text};limit={text};length={text};generation={text}"
             for part in PARTS:
-                (reply,) = session.get(keys.status("test", part) + asked, timeout=5)
+                (reply,) = session.get(keys.status("test", part) + asked, timeout=DEADLINE)
                 assert b'"run": "test"' in reply.ok.payload.to_bytes(), (part, text[:20])
-            (reply,) = session.get(keys.bundle("test", random_bundle.sha256) + asked, timeout=5)
+            (reply,) = session.get(keys.bundle("test", random_bundle.sha256) + asked, timeout=DEADLINE)
             assert reply.ok is not None or b"whole numbers" in reply.err.payload.to_bytes(), text[:20]
     assert processes.status()["state"] == "waiting for workers"
 

@@ -4,19 +4,18 @@ import time
 
 import pytest
 
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
-from tests.support.hosts import new_host
+from tests.support.hosts import new_host, require_hosts
+from tests.support.processes import DEADLINE
 
-pytestmark = pytest.mark.timeout(300)
 GENERATIONS, POPULATION = 16, 8
 
 
 @pytest.fixture
 def hosts():
     with new_host() as first, new_host() as second:
-        if second is None:
-            pytest.skip("network namespaces need root and iproute2")
+        require_hosts(first, second)
         yield first, second
 
 
@@ -49,14 +48,14 @@ def test_a_host_that_is_cut_off_costs_no_bit_and_comes_back(processes, hosts, ra
     hosts[0].unplug()
     coordinator.wait_for("is silent")
     hosts[0].plug()
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + DEADLINE
     while slots(processes) < len(hosts):
         assert time.monotonic() < deadline, "the host came back and its worker did not"
-    code, _ = coordinator.finish(120)
+    code, _ = coordinator.finish()
     assert code == 0
 
     alone = processes.coordinator(*settings, name="alone")
     processes.worker("--run", "alone", "--task", tasks.SLOW_TOY, "--slots", 4)
-    code, _ = alone.finish(120)
+    code, _ = alone.finish()
     assert code == 0
     assert fitness(processes, "two") == fitness(processes, "alone")

@@ -12,30 +12,29 @@ from threading import Event
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.controller import Controller
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.stopping import never
-from dreamfleet.common.store import find_bundle
-from dreamfleet.common.subspace import Subspace
-from dreamfleet.common.variants import Variant
-from dreamfleet.coordinator.iteration.commands import Commands
-from dreamfleet.coordinator.iteration.config import IterateConfig
-from dreamfleet.coordinator.iteration.layout import Layout
-from dreamfleet.coordinator.iteration.ledger import Entry, Ledger
-from dreamfleet.coordinator.iteration.phases import Phases
-from dreamfleet.coordinator.iteration.plan import Phase
-from dreamfleet.coordinator.iteration.process import ask
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.subspace import Subspace
+from dreamfleet.common.host.stop_signals import never_stop
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.coordinator.experiments.iteration.commands import Commands
+from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
+from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
+from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
+from dreamfleet.coordinator.experiments.iteration.phases import PhaseRunner
+from dreamfleet.coordinator.experiments.iteration.plan import Phase
+from dreamfleet.coordinator.experiments.verb_process import run_for_json
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 from tests.support.drives import write_drives
-from tests.support.processes import processes_in
+from tests.support.processes import DEADLINE, processes_in
 from tests.support.variants import controller_of
 
-pytestmark = [pytest.mark.timeout(600), pytest.mark.slow]
+pytestmark = pytest.mark.slow
 EYES = VAEConfig(latent=4, channels=(2, 2, 2, 2))
-SECONDS = 300  # that an iteration may take
 RUN = (
     "--generations 2 --population 4 --episodes 1 --horizon 10 --evaluate-every 1 --evaluation-episodes 1"
     " --confirm-episodes 0"
@@ -58,7 +57,7 @@ def words(folder, *more):
 
 def hashes(layout):
     """Of all that follows from the settings. A run's files name it, a checkpoint's head has its words in any order."""
-    made = [each for entry in Ledger.load(layout.ledger).entries for each in entry.made]
+    made = [each for entry in IterationLedger.load(layout.ledger).entries for each in entry.made]
     return {
         each.path: each.sha256 for each in made if not each.path.startswith("runs/") and "safetensors" not in each.path
     }
@@ -79,7 +78,7 @@ def left(folder):
 
 def until(true, process=None):
     """Look until it is so; a process that ends meanwhile ends the waiting."""
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + DEADLINE
     while not true():
         assert time.monotonic() < deadline, "it never came to be"
         assert process is None or process.popen.poll() is None, process.lines
@@ -98,15 +97,15 @@ def one_thread():
 def undisturbed(one_thread, tmp_path_factory):
     """The folder of an iteration that nobody disturbed, and what it answered; read only."""
     with processes_in(tmp_path_factory.mktemp("iterate")) as processes:
-        layout = Layout(processes.folder / "data")
-        code, out, err = processes.call(*words(layout.root, "--json"), timeout=SECONDS)
+        layout = IterationFolder(processes.folder / "data")
+        code, out, err = processes.call(*words(layout.root, "--json"))
         assert code == 0, err
         yield layout, json.loads(out), err
 
 
 def test_each_round_makes_a_model_from_all_drives_and_evolves_in_its_dream(undisturbed):
     layout, told, err = undisturbed
-    ledger = Ledger.load(layout.ledger)
+    ledger = IterationLedger.load(layout.ledger)
     assert list(ledger.finished) == PHASES
     assert [each["drives"] for each in told["rounds"]] == [3, 6]
     for number in (1, 2):
@@ -116,7 +115,7 @@ def test_each_round_makes_a_model_from_all_drives_and_evolves_in_its_dream(undis
         assert {"reconstruction_error", "nats_per_dimension"} <= bundle.manifest.provenance["quality"].keys()
         with open_run(layout.runs, layout.run_name(number)) as run:
             assert run.spec.task == "dream"
-            assert run.spec.bundle == Bundle.open(layout.bundle(ledger.kept(number))).sha256
+            assert run.spec.bundle == Bundle.open(layout.bundle(ledger.model_round(number))).sha256
             assert run.settings.seed == number
             assert told["rounds"][number - 1]["score"]["mean"] == max(each.mean for each in run.evaluations())
     lines = [line for line in err.splitlines() if line.startswith("round ")]
@@ -124,11 +123,11 @@ def test_each_round_makes_a_model_from_all_drives_and_evolves_in_its_dream(undis
 
 
 def test_a_rounds_dreams_may_begin_where_its_drives_were(processes):
-    layout = Layout(processes.folder / "data")
+    layout = IterationFolder(processes.folder / "data")
     flags = ("--rounds", 1, "--drive-steps", 24, "--run-flags", f"{RUN} --recorded 0.5")
-    code, _, err = processes.call(*words(layout.root, *flags), timeout=SECONDS)
+    code, _, err = processes.call(*words(layout.root, *flags))
     assert code == 0, err
-    assert Bundle.open(layout.bundle(1)).recorded == 3 * 4, "all that lies behind each drive's first steps"
+    assert Bundle.open(layout.bundle(1)).recorded_count == 3 * 4, "all that lies behind each drive's first steps"
     with open_run(layout.runs, layout.run_name(1)) as run:
         assert (run.spec.task, run.spec.recorded) == ("dream", 0.5)
 
@@ -142,21 +141,21 @@ def test_the_encoder_stays_and_what_evolved_drives_for_the_next_model(undisturbe
     with open_run(layout.runs, "round-01") as run:
         reported = Controller.load(run.controller_path)
         other = next(each for each in (0, 1) if each != reported.provenance["generation"])
-        vectors = [reported.parameters, run.evaluated(other)]
+        vectors = [reported.parameters, run.evaluated_mean(other)]
     for row, vector in enumerate(vectors):
         pilot = Controller.load(layout.means(1) / f"{row}.npz")
         assert (pilot.parameters == vector).all()
         assert pilot.bundle == one.sha256
-    (words,) = Ledger.load(layout.ledger).entry(2, "drive").commands
+    (words,) = IterationLedger.load(layout.ledger).entry(2, "drive").commands
     assert f"--noise 0.3 --controller {layout.means(1) / '0.npz'} {layout.means(1) / '1.npz'} " in " ".join(words)
 
 
 def test_a_gate_that_can_measure_nothing_refuses_nothing_and_says_so(undisturbed):
     layout, _, err = undisturbed
-    gate = Ledger.load(layout.ledger).entry(2, "gate")
+    gate = IterationLedger.load(layout.ledger).entry(2, "gate")
     assert gate.figures["kept"]
     assert "kept: nothing was measured of both" in err
-    told = json.loads(layout.measured(2).read_text())
+    told = json.loads(layout.gate_file(2).read_text())
     assert told["old"] == told["new"]
     assert told["new"]["probe"]["failed"].startswith("a probe needs two drives on the road at least")
 
@@ -170,29 +169,35 @@ def gate(layout, new, drives=write_drives, **changes):
         shutil.copyfile(source, place)
     drives(layout.root)
     config = IterateConfig(**changes)
-    ledger = Ledger.begin(config, {}).add(Entry(1, "bundle", 0, 0.0, "")).add(Entry(2, "bundle", 0, 0.0, ""))
-    phases = Phases(Commands(config, layout, ledger), None, lambda words, log: ask(words, log, never), never)
+    ledger = (
+        IterationLedger.begin(config, {})
+        .add(FinishedPhase(1, "bundle", 0, 0.0, ""))
+        .add(FinishedPhase(2, "bundle", 0, 0.0, ""))
+    )
+    phases = PhaseRunner(
+        Commands(config, layout, ledger), None, lambda words, log: run_for_json(words, log, never_stop), never_stop
+    )
     return phases.do(Phase(2, "gate")).figures
 
 
 def test_a_model_that_knows_clearly_less_is_refused(tmp_path):
     small = {"vae": VAEConfig(latent=2, channels=(2, 2, 2, 2)), "rnn": MDNRNNConfig(latent=2, hidden=2)}
     ignorant = write_random_bundle(tmp_path / "ignorant.zip", **small)
-    figures = gate(Layout(tmp_path / "data"), ignorant.path, gate_drives=3, gate_losses=0)
+    figures = gate(IterationFolder(tmp_path / "data"), ignorant.path, gate_drives=3, gate_losses=0)
     assert not figures["kept"]
     assert figures["old"]["knows"]["value"] > 0.4 > figures["new"]["knows"]["value"]
     assert figures["why"].endswith("refused, clearly worse in knows")
 
 
 def test_a_driver_that_cannot_be_fitted_leaves_losses_unmeasured(tmp_path):
-    layout = Layout(tmp_path / "data")
+    layout = IterationFolder(tmp_path / "data")
     small = {"vae": VAEConfig(latent=2, channels=(2, 2, 2, 2)), "rnn": MDNRNNConfig(latent=2, hidden=2)}
     ignorant = write_random_bundle(tmp_path / "ignorant.zip", **small)
     figures = gate(layout, ignorant.path, drives=lost_drives, gate_drives=0, gate_losses=4)
     assert figures["kept"]
     assert figures["why"] == "kept: nothing was measured of both"
-    assert "none of the 2 drives keeps to its road" in layout.measured(2).read_text()
-    assert not layout.moved(2).exists()
+    assert "none of the 2 drives keeps to its road" in layout.gate_file(2).read_text()
+    assert not layout.refitted(2).exists()
 
 
 def lost_drives(folder):
@@ -203,10 +208,10 @@ def lost_drives(folder):
 
 
 def test_the_same_model_loses_the_road_as_often_on_the_same_drives(tmp_path):
-    layout = Layout(tmp_path / "data")
+    layout = IterationFolder(tmp_path / "data")
     figures = gate(layout, find_bundle("tiny").path, gate_drives=0, gate_losses=4)
     assert figures["kept"]
-    assert Controller.load(layout.moved(2)).bundle == find_bundle("tiny").sha256
+    assert Controller.load(layout.refitted(2)).bundle == find_bundle("tiny").sha256
     assert figures["new"] == figures["old"]
     assert abs(figures["old"]["loses"]["value"]) <= 1
 
@@ -232,9 +237,9 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
 
 
 def test_a_later_round_searches_what_its_model_foretells(processes):
-    layout = Layout(processes.folder / "data")
+    layout = IterationFolder(processes.folder / "data")
     flags = ("--go-on", "--subspace", "--drive-steps", 150, "--own-drives", 6, "--drives", 6, "--gate-drives", 0)
-    code, _, err = processes.call(*words(layout.root, "--noise", 1, *flags), timeout=SECONDS)
+    code, _, err = processes.call(*words(layout.root, "--noise", 1, *flags))
     assert code == 0, err
     with open_run(layout.runs, layout.run_name(1)) as run:
         assert not run.settings.subspace
@@ -256,13 +261,13 @@ def pilot(tmp_path_factory):
 
 
 def test_an_iteration_goes_on_from_a_controller_and_its_world_model(processes, pilot):
-    layout = Layout(processes.folder / "data")
+    layout = IterationFolder(processes.folder / "data")
     flags = ("--rounds", 1, "--init", pilot, "--vae", "keep", "--go-on")
     mdnrnn = "--updates 3 --batch 2 --latent 4 --hidden 4 --validate-every 1 --done --lost 4"
     words_of_it = words(layout.root, *flags, "--mdnrnn-flags", mdnrnn, "--json")
-    code, out, err = processes.call(*words_of_it, timeout=SECONDS)
+    code, out, err = processes.call(*words_of_it)
     assert code == 0, err
-    ledger, begun = Ledger.load(layout.ledger), Bundle.open(pilot.with_name("bundle.zip"))
+    ledger, begun = IterationLedger.load(layout.ledger), Bundle.open(pilot.with_name("bundle.zip"))
     first = ("collect", "drive", "vae", "encode", "mdnrnn", "bundle", "gate", "evolve")
     assert list(ledger.finished) == [Phase(0, "init"), *(Phase(1, name) for name in first)]
     assert Controller.load(layout.optimum(0)).sha256 == Controller.load(pilot).sha256
@@ -272,14 +277,14 @@ def test_an_iteration_goes_on_from_a_controller_and_its_world_model(processes, p
     assert made.manifest.provenance["episodes"] == 5, "random drives, and the controller's own"
     with open_run(layout.runs, layout.run_name(1)) as run:
         assert str(layout.start(1)) in run.fact("start")
-    assert json.loads(out)["model"] == str(layout.bundle(ledger.kept(1)))
+    assert json.loads(out)["model"] == str(layout.bundle(ledger.model_round(1)))
 
     away = pilot.rename(pilot.with_name("away.npz"))
     code, _, err = processes.call("iterate", "--data", layout.root, "--redo", "0/init")
     assert "no controller" in err
     assert layout.bundle(1).exists(), "nothing goes before it is known to be there"
     away.rename(pilot)
-    undone = processes.call("iterate", "--data", layout.root, "--redo", "0/init", "--rounds", 1, timeout=SECONDS)
+    undone = processes.call("iterate", "--data", layout.root, "--redo", "0/init", "--rounds", 1)
     assert undone[0] == 0, undone[2]
     assert hashes(layout)["rounds/01/round-1.zip"] == made.sha256
 
@@ -300,7 +305,7 @@ def test_until_it_has_what_it_goes_on_from_flags_may_be_mended(processes, pilot)
 
 
 def test_a_controller_that_cannot_be_fitted_is_refused_at_once(processes, pilot):
-    bundle = Bundle.open(pilot.with_name("bundle.zip")).under(None, Variant(feedback="last"))
+    bundle = Bundle.open(pilot.with_name("bundle.zip")).with_controllers(None, Variant(feedback="last"))
     (processes.folder / "bundle.zip").write_bytes(pilot.with_name("bundle.zip").read_bytes())
     controller_of(bundle).save(processes.folder / "seeing.npz")
     flags = ("--init", processes.folder / "seeing.npz", "--go-on")
@@ -378,16 +383,16 @@ def disturb(processes, layout, phases):
         until(lambda phase=phase: (layout.root / BEGUN[phase]).exists(), process)
         kill(process, layout)
         process = processes.start(*words(layout.root))
-        process.wait_for(f"round {phase.round}  {phase.name} ", timeout=120)
+        process.wait_for(f"round {phase.round}  {phase.name} ")
         kill(process, layout)
-    code, out, err = processes.call(*words(layout.root, "--json"), timeout=SECONDS)
+    code, out, err = processes.call(*words(layout.root, "--json"))
     assert code == 0, err
     return json.loads(out)
 
 
 def test_killed_it_goes_on_to_the_same_models(undisturbed, processes):
     whole, told, _ = undisturbed
-    layout = Layout(processes.folder / "data")
+    layout = IterationFolder(processes.folder / "data")
     again = disturb(processes, layout, [Phase(1, "evolve"), Phase(2, "mdnrnn")])
     assert hashes(layout) == hashes(whole)
     assert [each["sha256"] for each in again["rounds"]] == [each["sha256"] for each in told["rounds"]]
@@ -398,14 +403,14 @@ def test_killed_it_goes_on_to_the_same_models(undisturbed, processes):
 @pytest.mark.timeout(1800)
 def test_killed_in_every_phase_it_goes_on_to_the_same_models(undisturbed, processes):
     whole, _, _ = undisturbed
-    layout = Layout(processes.folder / "data")
+    layout = IterationFolder(processes.folder / "data")
     disturb(processes, layout, PHASES)
     assert hashes(layout) == hashes(whole)
-    assert list(Ledger.load(layout.ledger).finished) == PHASES
+    assert list(IterationLedger.load(layout.ledger).finished) == PHASES
 
 
 def test_one_iteration_works_in_a_folder_and_ctrl_c_ends_all_that_it_started(processes):
-    layout = Layout(processes.folder / "data")
+    layout = IterationFolder(processes.folder / "data")
     process = processes.start(*words(layout.root))
     until((layout.root / "episodes").exists, process)
     code, _, err = processes.call(*words(layout.root))
@@ -413,18 +418,18 @@ def test_one_iteration_works_in_a_folder_and_ctrl_c_ends_all_that_it_started(pro
     assert f"another iteration works in {layout.root}: stop it first" in err
     process.popen.send_signal(signal.SIGINT)
     assert process.finish()[0] == 130
-    assert "what is finished is kept, and goes on with: " in process.last_words()
+    assert "what is finished is kept, and goes on with: " in process.last_line()
     assert not left(layout.root)
 
 
 def test_damage_is_said_and_made_good(undisturbed, processes):
     whole, _, _ = undisturbed
-    layout = Layout(processes.folder / "data")
+    layout = IterationFolder(processes.folder / "data")
     shutil.copytree(whole.root, layout.root, symlinks=True)
     layout.bundle(2).write_bytes(b"")
     code, _, err = processes.call("iterate", "--data", layout.root)
     assert code == 1
     assert err.strip().splitlines()[-1].startswith(f"dreamfleet: {layout.bundle(2)} is not what was made: put it back")
-    code, _, err = processes.call("iterate", "--data", layout.root, "--redo", "2/bundle", timeout=SECONDS)
+    code, _, err = processes.call("iterate", "--data", layout.root, "--redo", "2/bundle")
     assert code == 0, err
     assert hashes(layout) == hashes(whole)

@@ -7,21 +7,19 @@ from contextlib import ExitStack
 
 import pytest
 
-from dreamfleet.common import keys
-from dreamfleet.common.client import Client
-from dreamfleet.common.codec import encode
 from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
-from dreamfleet.common.live import LiveView
-from dreamfleet.common.messages import ViewFrame
-from dreamfleet.common.parts import read_parts
-from dreamfleet.common.processes import command
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.shelf import find_mean
+from dreamfleet.common.host.processes import command
+from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.monitoring.live import LiveView
+from dreamfleet.common.monitoring.mjpeg import read_parts
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import encode
+from dreamfleet.common.protocol.messages import ViewFrame
+from dreamfleet.common.runs.lookup import find_evaluated_mean
+from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 from tests.support.processes import DEADLINE, environment
 from tests.support.samples import MSGPACK
-
-pytestmark = pytest.mark.timeout(150)
 
 
 @pytest.fixture
@@ -117,7 +115,7 @@ def test_fifty_views_one_of_which_never_looks_leave_the_run_as_it_is(processes, 
         for view in views:
             view.next(0.0)  # it subscribes
         assert [len(sights(view, 2)) for view in views[1:]] == [2] * 49
-        while not views[1].over:
+        while not views[1].is_over:
             views[1].next(0.1)
         assert (views[1].status.state, views[1].status.why) == ("ended", "1 generation")
         assert watched.finish()[0] == 0
@@ -191,10 +189,10 @@ def test_an_old_generations_mean_is_found_in_the_journal_and_one_that_was_not_ev
     assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
         (evaluated, *_) = (each.generation for each in run.evaluations())
-        mean, beside = find_mean("test", processes.runs, evaluated)
-        assert (mean.parameters == run.evaluated(evaluated)).all()
+        mean, beside = find_evaluated_mean("test", processes.runs, evaluated)
+        assert (mean.parameters == run.evaluated_mean(evaluated)).all()
         assert (mean.bundle, beside) == (random_bundle.sha256, run.bundle_path)
     with pytest.raises(
         JournalError, match=f"generation 77 of run test was not evaluated; those that were: {evaluated}"
     ):
-        find_mean("test", processes.runs, 77)
+        find_evaluated_mean("test", processes.runs, 77)

@@ -5,13 +5,11 @@ import shlex
 
 import pytest
 
-from dreamfleet.common import keys
-from dreamfleet.common.session import Network, open_session
-from dreamfleet.coordinator.answers import answer
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.coordinator.service.status_json import answer
 from tests.support import tasks
 from tests.support.served import snapshot
-
-pytestmark = pytest.mark.timeout(120)
 
 
 @pytest.mark.slow

@@ -8,14 +8,12 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from tests.support import tasks
-from tests.support.processes import free_port
+from tests.support.processes import DEADLINE, free_port
 from tests.support.served import serving, snapshot
-
-pytestmark = pytest.mark.timeout(120)
 
 
 def read(port, path="/metrics"):
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=10) as answer:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=DEADLINE) as answer:
         text = answer.read().decode()
     return {sample.name: sample for family in text_string_to_metric_families(text) for sample in family.samples}
 
@@ -54,9 +52,9 @@ def test_the_dashboard_answers_for_every_live_run_whoever_knows_the_token(proces
         )
         address = re.search(r"http://\S+", page.wait_for("the dashboard is at")).group()
         with pytest.raises(urllib.error.HTTPError, match="401"):
-            urllib.request.urlopen(f"{address}metrics", timeout=30)
+            urllib.request.urlopen(f"{address}metrics", timeout=DEADLINE)
         asked = urllib.request.Request(f"{address}metrics", headers={"Authorization": "Bearer correct horse battery"})
-        with urllib.request.urlopen(asked, timeout=30) as answer:
+        with urllib.request.urlopen(asked, timeout=DEADLINE) as answer:
             text = answer.read().decode()
     found = {each.name: each.samples for each in text_string_to_metric_families(text)}
     assert [each.labels["run"] for each in found["dreamfleet_generation"]] == ["lucid", "night"]

@@ -6,13 +6,11 @@ import time
 
 import pytest
 
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.transport.session import Network, open_session
 from tests.support import tasks
-from tests.support.processes import free_port
+from tests.support.processes import DEADLINE, free_port
 from tests.support.relay import Relay
-
-pytestmark = pytest.mark.timeout(120)
 
 
 @pytest.fixture
@@ -34,7 +32,7 @@ def link(*endpoints):
 
 
 def ended(*coordinators):
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + DEADLINE
     while time.monotonic() < deadline:
         if found := [each for each in coordinators if each.popen.poll() is not None]:
             return found
@@ -52,9 +50,7 @@ def test_of_two_on_routers_that_are_linked_later_the_newcomer_leaves_and_the_oth
     for each in (first, second):
         each.wait_for("generation 0: mean")
     with link(first_at, second_at):
-        began = time.monotonic()
         assert ended(first, second) == [second]
-        assert time.monotonic() - began < 3
         assert second.finish()[0] == 1
         assert "another coordinator serves a run test on this network" in second.lines[-1]
         first.wait_for(": mean", times=2)

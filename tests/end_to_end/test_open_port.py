@@ -8,11 +8,9 @@ import socket
 
 import pytest
 
-from dreamfleet.common.session import Network
+from dreamfleet.common.transport.session import Network
 from tests.support import tasks
 from tests.support.attacks import OPEN, SETTINGS, attacking, outcome
-
-pytestmark = pytest.mark.timeout(180)
 
 
 def connects_without_end(evil, number):
@@ -29,7 +27,7 @@ def harmed(processes, random_bundle, *actions):
     coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
     with attacking(Network(connect=(processes.endpoint,)), *actions) as evil:
         processes.worker("--task", tasks.SLOW_TOY, "--name", "own")
-        assert coordinator.finish(120)[0] == 0
+        assert coordinator.finish()[0] == 0
     assert not evil.steered
     return evil, coordinator
 

@@ -5,11 +5,10 @@ import signal
 import numpy as np
 import pytest
 
-from dreamfleet.common.runs import open_run
-from dreamfleet.coordinator.start import latest
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.coordinator.settings.start import latest_mean_and_sigma
 from tests.support import tasks
 
-pytestmark = pytest.mark.timeout(120)
 OWN = "tests.support.optimisers:ParentsAndChildren"
 
 
@@ -45,10 +44,10 @@ def test_a_run_of_another_optimiser_is_continued_and_forked_to_one_of_ones_own(p
     processes.worker("--task", tasks.SLOW_TOY, "--run", "whole-fork")
     assert fork.finish()[0] == 0
     with open_run(processes.runs, "whole") as one, open_run(processes.runs, "whole-fork") as other:
-        before, sigma = latest(one)
+        before, sigma = latest_mean_and_sigma(one)
         assert other.history()[0].sigma == sigma
         assert (other.settings.optimiser, other.settings.optimiser_options) == (OWN, ("parents=1",))
-        mean, _ = latest(other)
+        mean, _ = latest_mean_and_sigma(other)
         assert np.abs(mean - before).max() < 6 * sigma
 
 

@@ -8,13 +8,12 @@ import sys
 import numpy as np
 import pytest
 
-from dreamfleet.common.controller import Controller
-from dreamfleet.common.receipt import receipt_of
-from dreamfleet.common.runs import CONTROLLER, open_run
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.runs.run_folder import CONTROLLER, open_run
+from dreamfleet.common.runs.run_provenance import read_run_provenance
 from tests.support import tasks
 from tests.support.processes import DEADLINE, ROOT
 
-pytestmark = pytest.mark.timeout(300)
 STAGES = """
 [[stage]]
 generations = 2
@@ -62,9 +61,9 @@ def test_a_run_is_repeated_to_the_bit_through_a_kill(processes, first, random_bu
     before, after = Controller.load(first), Controller.load(processes.runs / "kept-again" / CONTROLLER)
     assert after.sha256 == before.sha256
     assert after.provenance["validation_mean"] == before.provenance["validation_mean"]
-    assert receipt_of(after).start == receipt_of(before).start
+    assert read_run_provenance(after).start == read_run_provenance(before).start
     with open_run(processes.runs, "kept-again") as run:
-        assert len(run.history()) == receipt_of(before).generations
+        assert len(run.history()) == read_run_provenance(before).generations
         assert len(run.settings.stages) == 2
 
 

@@ -7,11 +7,9 @@ import subprocess
 
 import pytest
 
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
-from tests.support.processes import environment, free_port
-
-pytestmark = pytest.mark.timeout(120)
+from tests.support.processes import DEADLINE, environment, free_port
 
 
 @pytest.fixture
@@ -41,7 +39,8 @@ def test_the_hint_of_a_run_that_was_left_is_a_whole_command_with_its_limits_and_
     worker, said = stopped(processes, settings, "--generations", 6, "--strict")
     command = said.split("continue it with: ")[1]
     done = subprocess.run(
-        command, shell=True, env=environment(processes.cache), capture_output=True, check=False, text=True, timeout=100,
+        command, shell=True, env=environment(processes.cache), capture_output=True, check=False, text=True,
+        timeout=DEADLINE,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "ended after 6 generations" in done.stdout

@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dreamfleet.common.runs import open_run
-from dreamfleet.coordinator.start import latest
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.coordinator.settings.start import latest_mean_and_sigma
 from tests.support import tasks
-from tests.support.processes import free_port
-
-pytestmark = pytest.mark.timeout(120)
+from tests.support.processes import DEADLINE, free_port
 
 
 @pytest.fixture
@@ -91,7 +89,9 @@ def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
     assert ours["worker_list"][0]["state"] == "present"
     tool = Path(sys.executable).parent / "zenoh"
     command = [tool, "--mode", "client", "--connect", processes.endpoint, "get", "-s", "dreamfleet/v2/test/status"]
-    done = subprocess.run([*command, "--decoder", "json"], capture_output=True, check=False, text=True, timeout=60)
+    done = subprocess.run(
+        [*command, "--decoder", "json"], capture_output=True, check=False, text=True, timeout=DEADLINE
+    )
     theirs = json.loads(
         done.stdout.strip().splitlines()[-1].split(":", 1)[-1] if done.stdout[:1] != "{" else done.stdout
     )
@@ -174,7 +174,7 @@ def test_a_fork_begins_where_its_run_was_and_may_change_what_is_frozen(processes
     processes.worker("--task", tasks.TOY, "--run", "test-fork")
     assert fork.finish()[0] == 0
     with open_run(processes.runs, "test") as one, open_run(processes.runs, "test-fork") as other:
-        before, sigma = latest(one)
+        before, sigma = latest_mean_and_sigma(one)
         start = other.history()[0]
         assert other.settings.population == 6
         assert start.sigma == pytest.approx(sigma)
@@ -248,6 +248,6 @@ def test_on_a_small_busy_fleet_an_evaluation_is_finished_within_two_generations(
     )  # fmt: skip
     for name in ("a", "b"):
         processes.worker("--task", tasks.SLOW_TOY, "--name", name)
-    coordinator.wait_for("evaluation of generation 1's mean", timeout=200)
+    coordinator.wait_for("evaluation of generation 1's mean")
     assert not any("generation 3: mean" in line for line in coordinator.lines)
-    assert coordinator.finish(100)[0] == 0
+    assert coordinator.finish()[0] == 0

@@ -4,11 +4,9 @@ import os
 import signal
 
 import numpy as np
-import pytest
 
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.runs.run_folder import open_run
 
-pytestmark = pytest.mark.timeout(300)
 GENERATIONS, POPULATION, EPISODES = 4, 6, 2
 SETTINGS = (
     "--bundle", "tiny", "--population", POPULATION, "--episodes", EPISODES, "--horizon", 30,
@@ -31,7 +29,7 @@ def outcome(processes, name):
 def run_alone(processes):
     coordinator = processes.coordinator(*SETTINGS, "--evaluate-every", 0, name="alone")
     worker = processes.worker("--run", "alone")
-    code, _ = coordinator.finish(120)
+    code, _ = coordinator.finish()
     assert code == 0
     worker.end()
     return outcome(processes, "alone")
@@ -45,7 +43,7 @@ def run_with_a_death(processes):
     while (generation := processes.statuses()[0].generation).episodes_done == generation.episodes:
         pass  # between two generations
     os.kill(workers[1].popen.pid, signal.SIGKILL)
-    code, _ = coordinator.finish(120)
+    code, _ = coordinator.finish()
     assert code == 0
     return outcome(processes, "three")
 

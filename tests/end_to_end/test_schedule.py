@@ -4,14 +4,13 @@ import json
 
 import pytest
 
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.stages import begun_stages, stages_of
-from dreamfleet.common.terms import terms_of
-from dreamfleet.coordinator.plot import plot_fitness
-from dreamfleet.worker.inspection.curves import fitness
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.scoring_params import scoring_params_of
+from dreamfleet.common.runs.stages import begun_stages, stages_of
+from dreamfleet.coordinator.analysis.plot import plot_fitness
+from dreamfleet.worker.inspection.curve_sections import fitness_section
 from tests.support import tasks
 
-pytestmark = pytest.mark.timeout(300)
 GENERATIONS, BEGUN, SIZES = 8, [0, 4, 6], [5] * 4 + [7] * 4
 STAGES = """
 [[stage]]
@@ -100,7 +99,7 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
     picture = processes.folder / "fitness.png"
     with open_run(processes.runs, "night") as run:
         plot_fitness(run, picture)
-        text = fitness(run).text
+        text = fitness_section(run).text
     assert "4, then 7, then 10 steps an episode" in text
     assert picture.stat().st_size > 1000
 
@@ -111,7 +110,7 @@ def test_a_live_run_tells_its_stage_and_a_fork_begins_with_it(processes, begin):
     coordinator.wait_for("generation 4: mean")
     coordinator.end()
     with open_run(processes.runs, "night") as run:
-        stage = terms_of(run, len(run.history())).stage
+        stage = scoring_params_of(run, len(run.history())).stage
     forked = processes.start(
         "fork", "night", "--runs-dir", processes.runs, "--run", "other", "--listen", processes.endpoint, "--beat", 0.2,
         "--generations", 1,

@@ -7,13 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.client import Client
-from dreamfleet.common.credentials import read_join
+from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.security.credentials import read_join_file
 from tests.support.access import begin, until, work
 from tests.support.attacks import CLAIMED, RUN, SECURED, SETTINGS, attacking, outcome, steers_by_name
-
-pytestmark = pytest.mark.timeout(300)
-
 
 # What arrives of each, and is counted: nothing of who only looks or steers; of a worker what it says in its own name.
 ARRIVES = {
@@ -32,7 +29,7 @@ def test_all_at_once_change_no_bit(processes, access, endpoint, random_bundle, u
     ears = access.network("coordinator", endpoint)
     with attacking(access.network(who, endpoint), *actions, ears=ears) as evil:
         work(processes, access, endpoint, "first", RUN, "--name", "own")
-        assert coordinator.finish(120)[0] == 0
+        assert coordinator.finish()[0] == 0
     assert outcome(processes) == unharmed, "\n".join(coordinator.lines)
     assert not evil.steered
     assert not evil.asked
@@ -72,7 +69,7 @@ def break_off(where, count):
 
 def show_nothing(where, count, access):
     """Handshakes without a certificate."""
-    context = ssl.create_default_context(cadata=read_join(access.path("viewer")).ca)
+    context = ssl.create_default_context(cadata=read_join_file(access.path("viewer")).ca)
     context.check_hostname = False
     for _ in range(count):
         try:
@@ -96,7 +93,6 @@ def open_files(process):
 
 
 @pytest.mark.long
-@pytest.mark.timeout(600)
 def test_ten_thousand_connections_that_prove_nothing_keep_nobody_out_for_long(
     processes, access, endpoint, random_bundle, unharmed
 ):
@@ -111,8 +107,8 @@ def test_ten_thousand_connections_that_prove_nothing_keep_nobody_out_for_long(
         show_nothing(where, 20, access)
         assert open_files(coordinator) > before
         assert viewer.status().state == "waiting for workers"  # who is in, stays in
-        work(processes, access, endpoint, "first", RUN, "--name", "own").wait_for("joined", timeout=240)
-        assert coordinator.finish(120)[0] == 0
+        work(processes, access, endpoint, "first", RUN, "--name", "own").wait_for("joined")
+        assert coordinator.finish()[0] == 0
     for link in held:
         link.close()
     assert outcome(processes) == unharmed
@@ -129,4 +125,4 @@ def test_strangers_take_no_descriptor_for_good(processes, access, endpoint, rand
         link.close()
     until(lambda: open_files(coordinator) <= before, "descriptors do not come back")
     work(processes, access, endpoint, "first").wait_for("joined")
-    assert coordinator.finish(120)[0] == 0
+    assert coordinator.finish()[0] == 0

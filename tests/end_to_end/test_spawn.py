@@ -12,16 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.authority import Authority
-from dreamfleet.coordinator.spawn.agent import birth
+from dreamfleet.common.security.authority import Authority
+from dreamfleet.coordinator.spawn.agent import process_start
 from dreamfleet.coordinator.spawn.parcel import pack_wheel
 from tests.support import tasks
 from tests.support.disks import small_disk
-from tests.support.hosts import new_host
+from tests.support.hosts import new_host, require_hosts
+from tests.support.processes import DEADLINE
 from tests.support.sshd import closed_port, new_key
 
-pytestmark = pytest.mark.timeout(300)
-PATIENCE = 120
 BARE = "/usr/local/bin:/usr/bin:/bin"  # where no dreamfleet is installed
 TOY = ("--task", tasks.TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0)
 
@@ -40,7 +39,7 @@ def write_file(processes, hosts, *names, more=""):
     return path
 
 
-def told(processes, *arguments, code=0, patience=PATIENCE):
+def told(processes, *arguments, code=0, patience=DEADLINE):
     """The rows that a verb tells, by host."""
     done, out, err = processes.call(*arguments, "--json", timeout=patience)
     assert done == code, err
@@ -52,14 +51,14 @@ def state(host, name=None):
 
 
 def await_that(happens, why):
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + DEADLINE
     while not happens():
         assert time.monotonic() < deadline, why
         time.sleep(0.1)
 
 
 def runs(pid):
-    return bool(birth(pid))  # a dead process whose parent has not heard of it runs no more
+    return bool(process_start(pid))  # a dead process whose parent has not heard of it runs no more
 
 
 def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(processes, hosts):
@@ -72,7 +71,7 @@ def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(proc
     first = told(processes, "up", file)
     assert {name: row["state"] for name, row in first.items()} == {"a": "started", "b": "started"}
     pids = [state(host)["pid"] for host in (a, b)]
-    coordinator.wait_for("generation 1: mean", timeout=PATIENCE)
+    coordinator.wait_for("generation 1: mean")
     await_that(lambda: processes.status()["slots"] == 2, "two workers never joined")
 
     again = told(processes, "up", file)
@@ -94,22 +93,22 @@ def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_t
     coordinator = processes.coordinator(*TOY, "--generations", 10**6)
     spawn = ("spawn", "a", "--connect", processes.endpoint, *words(hosts, "--worker-flags", f"--task {tasks.TOY}"))
     command = processes.start(*spawn)
-    command.wait_for("reaches its coordinator through this command", timeout=PATIENCE)
+    command.wait_for("reaches its coordinator through this command")
     pid = state(a)["pid"]
-    coordinator.wait_for("generation 1: mean", timeout=PATIENCE)
+    coordinator.wait_for("generation 1: mean")
 
     refused = told(processes, *spawn, code=1)["a"]
     assert "by the tunnel of another command" in refused["what"]
 
     command.popen.send_signal(signal.SIGINT)
-    code, out = command.finish(PATIENCE)
+    code, out = command.finish()
     assert code == 0, "".join(command.lines)
     assert "left" in out
     assert not runs(pid)
     assert not (a.root() / "workers" / "a").exists()
 
     command = processes.start(*spawn)
-    command.wait_for("reaches its coordinator through this command", timeout=PATIENCE)
+    command.wait_for("reaches its coordinator through this command")
     pid = state(a)["pid"]
     command.popen.kill()
     os.killpg(command.popen.pid, signal.SIGKILL)
@@ -122,16 +121,16 @@ def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(pro
     flags = ("--connect", processes.endpoint, "--no-tunnel", "--follow")
     own = ("--worker-flags", f"--task {tasks.TOY} --exit-when-done")
     command = processes.start("spawn", "a", *words(hosts, *flags, *own))
-    coordinator.wait_for("generation 1: mean", timeout=PATIENCE)
+    coordinator.wait_for("generation 1: mean")
     command.popen.send_signal(signal.SIGINT)
-    code, out = command.finish(PATIENCE)
+    code, out = command.finish()
     assert code == 0
     assert "goes on without this command" in out
     assert runs(state(a)["pid"])
 
     command = processes.start("spawn", "a", *words(hosts, *flags, *own))
     coordinator.popen.send_signal(signal.SIGTERM)
-    code, out = command.finish(PATIENCE)
+    code, out = command.finish()
     assert code == 0
     assert "a | " in out
     assert "joined run test" in out
@@ -142,7 +141,7 @@ def test_two_commands_at_once_start_one_worker(processes, hosts):
     a = hosts.add("a")
     file = write_file(processes, hosts, "a", more="tunnel = false")
     both = [processes.start("up", file, "--json") for _ in range(2)]
-    states = [json.loads(each.finish(PATIENCE)[1])["hosts"][0]["state"] for each in both]
+    states = [json.loads(each.finish()[1])["hosts"][0]["state"] for each in both]
     assert sorted(states) == ["running", "started"]
     pid = state(a)["pid"]
     told(processes, "down", file, "--now")
@@ -194,7 +193,7 @@ def test_ctrl_c_while_hosts_are_brought_up_ends_the_command_and_not_what_others_
     command = processes.start("spawn", "a", "--ssh", hosts.ssh, "--remote-python", slow)
     await_that(asked.exists, "the host was never asked")
     command.popen.send_signal(signal.SIGINT)
-    assert command.finish(PATIENCE)[0] == 130
+    assert command.finish()[0] == 130
     assert "the same command goes on" in command.lines[-1]
 
 
@@ -238,8 +237,7 @@ def test_three_hosts_install_from_wheels_alone_one_of_them_after_it_was_killed_a
         check=True,
     )
     with new_host() as x, new_host() as y, new_host() as z:
-        if z is None:
-            pytest.skip("network namespaces need root and iproute2")
+        require_hosts(x, y, z)
         cables = {"x": x, "y": y, "z": z}
         there = [
             hosts.add(name, address=cable.own, inside=cable.inside, path=BARE, modules="")

@@ -6,11 +6,10 @@ import socket
 import numpy as np
 import pytest
 
-from dreamfleet.common.controller import Controller, ControllerShape
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 
-pytestmark = pytest.mark.timeout(120)
 SIGMA = 0.01
 
 

@@ -8,14 +8,12 @@ import sys
 
 import pytest
 
-from dreamfleet.common.client import Client
-from dreamfleet.common.controller import Controller
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ConnectionFailedError, ControllerError
-from dreamfleet.common.runs import open_run
+from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.verbs import status
 from tests.support import tasks
-
-pytestmark = pytest.mark.timeout(120)
 
 
 @pytest.fixture
@@ -152,4 +150,4 @@ def test_a_terminal_that_cannot_draw_over_a_line_has_lines_as_a_pipe_has(monkeyp
     controller, device = os.openpty()
     with open(controller, "rb"), open(device, "w") as stdout:  # noqa: PTH123 - descriptors
         monkeypatch.setattr(sys, "stdout", stdout)
-        assert status._redraws() == redraws
+        assert status._can_redraw() == redraws

@@ -7,11 +7,9 @@ import av
 import pytest
 
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
-from dreamfleet.worker.training.collect import present
+from dreamfleet.worker.training.data.collect import existing_episodes
 from tests.support import tasks
 from tests.support.drives import write_drives
-
-pytestmark = pytest.mark.timeout(120)
 
 
 @pytest.fixture(params=[signal.SIGINT, signal.SIGTERM])
@@ -72,10 +70,10 @@ def test_a_recording_can_be_played(processes, tmp_path, number):
 def test_a_collection_keeps_its_episodes_and_counts_them(processes, tmp_path, number):
     flags = ("--episodes", 1000, "--jobs", 2)
     collecting = processes.start("collect", "--data", tmp_path, *flags)
-    said = stopped(collecting, number, lambda: len(present(tmp_path)) >= 2)
-    kept = len(present(tmp_path))
+    said = stopped(collecting, number, lambda: len(existing_episodes(tmp_path)) >= 2)
+    kept = len(existing_episodes(tmp_path))
     assert f"stopped: {tmp_path} keeps {kept} new episodes, {kept} of 1000 in all; the same command goes on" in said
-    assert [path.name for path in (tmp_path / "episodes").iterdir() if path not in present(tmp_path)] == []
+    assert [path.name for path in (tmp_path / "episodes").iterdir() if path not in existing_episodes(tmp_path)] == []
 
 
 def test_a_coordinator_that_waits_for_a_worker_says_so_once(processes, random_bundle):

@@ -5,12 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from dreamfleet.common.controller import Controller
-from dreamfleet.common.runs import CONTROLLER, open_run
-from dreamfleet.common.subspace import SearchSpace, Subspace
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.subspace import SearchSpace, Subspace
+from dreamfleet.common.runs.run_folder import CONTROLLER, open_run
 from tests.support import tasks
 
-pytestmark = pytest.mark.timeout(300)
 STAGES = """
 [[stage]]
 generations = 3

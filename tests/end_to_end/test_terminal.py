@@ -1,21 +1,17 @@
 """`status --watch` in a real terminal of 80 columns and 24 lines, beside a real fleet."""
 
 import shlex
-import shutil
 import subprocess
 import time
 import uuid
 
 import pytest
 
-from dreamfleet.common.processes import command
+from dreamfleet.common.host.processes import command
 from tests.support import tasks
 from tests.support.processes import DEADLINE, environment
 
-pytestmark = [
-    pytest.mark.timeout(120),
-    pytest.mark.skipif(shutil.which("tmux") is None, reason="tmux is not installed"),
-]
+pytestmark = pytest.mark.needs_programs("tmux")
 NAMES = [f"a-host-of-thirty-letters-x{number:04d}" for number in range(2)]
 
 

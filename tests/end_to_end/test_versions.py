@@ -17,22 +17,20 @@ import msgpack
 import pytest
 import zenoh
 
-from dreamfleet.common import keys
-from dreamfleet.common.classes import class_of
-from dreamfleet.common.client import Client
-from dreamfleet.common.fingerprint import fingerprint
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.host_classes import class_from_fingerprint
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.transport.session import Network, open_session
 from tests.support import tasks
-from tests.support.processes import ROOT, processes_in
+from tests.support.processes import DEADLINE, ROOT, processes_in
 
-pytestmark = pytest.mark.timeout(180)
 GOLDEN = ROOT / "tests" / "common" / "golden"
 GENERATIONS, POPULATION = 3, 4
 SETTINGS = ("--task", tasks.TOY, "--population", POPULATION, "--episodes", 1, "--evaluate-every", 0,
             "--generations", GENERATIONS)  # fmt: skip
 OLD, SINCE = "old/0a1b2c3d", {"protocol_min": 2, "protocol_max": 2}
-PATIENCE = 60  # seconds
 
 
 def packed(name):
@@ -57,7 +55,7 @@ class OldWorker:
         """What is answered to its hello."""
         request = {**document("hello-request"), "worker": OLD, "tasks": [tasks.TOY], "fingerprint": fingerprint(),
                    "slots": 1, **changes}  # fmt: skip
-        (reply,) = self._session.get("dreamfleet/hello/test", payload=json.dumps(request), timeout=PATIENCE)
+        (reply,) = self._session.get("dreamfleet/hello/test", payload=json.dumps(request), timeout=DEADLINE)
         return json.loads(reply.ok.payload.to_bytes())
 
     def join(self):
@@ -119,7 +117,7 @@ def test_a_worker_of_this_protocols_first_version_is_welcomed_given_jobs_and_its
         fitness = [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
         (share,) = run.classes.largest
     assert fitness == [[0.0, 1.0, 2.0, 3.0]] * GENERATIONS
-    assert (share.results, share.host_class) == (GENERATIONS * POPULATION, class_of(fingerprint()))
+    assert (share.results, share.host_class) == (GENERATIONS * POPULATION, class_from_fingerprint(fingerprint()))
 
 
 def test_a_worker_joins_if_this_protocol_is_among_those_that_it_speaks_and_else_is_told_what_to_do(processes):
@@ -138,7 +136,7 @@ def test_a_worker_joins_if_this_protocol_is_among_those_that_it_speaks_and_else_
 
 
 def await_that(happens, why):
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + DEADLINE
     while not happens():
         assert time.monotonic() < deadline, why
         time.sleep(0.05)
@@ -156,7 +154,7 @@ def version_of(commit, folder):
 def first_of_this_protocol():
     """The commit that this version of the protocol began with."""
     said = f"^PROTOCOL_VERSION = {keys.PROTOCOL_VERSION}$"
-    log = subprocess.run(["git", "-C", ROOT, "log", "--format=%H", "-G", said, "--", "common/keys.py"],
+    log = subprocess.run(["git", "-C", ROOT, "log", "--format=%H", "-G", said, "--", "common/protocol/keys.py"],
                          check=False, capture_output=True, text=True)  # fmt: skip
     if not (found := log.stdout.split()):
         pytest.skip("the history of this repository is not here")
@@ -177,7 +175,7 @@ def scored(processes, coordinators, workers):
     """What a run of a coordinator and a worker of these versions comes to."""
     coordinator = processes.coordinator(*SETTINGS, root=coordinators)
     processes.worker("--task", tasks.TOY, "--run", "test", root=workers)
-    assert coordinator.finish(PATIENCE)[0] == 0, "".join(coordinator.lines)
+    assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
     with open_run(processes.runs, "test") as run:
         return [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 
-from dreamfleet.common.messages import TAG_BYTES
-from dreamfleet.coordinator.fleet import Fleet, Send
-from dreamfleet.coordinator.run import Run
-from dreamfleet.coordinator.wanted import WantedJobs
-from dreamfleet.worker.service.backlog import KEPT_VECTORS
+from dreamfleet.common.protocol.messages import TAG_BYTES
+from dreamfleet.coordinator.dispatch.fleet import Fleet, OutgoingBatch
+from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
+from dreamfleet.coordinator.run.run import Run
+from dreamfleet.worker.service.backlog import MAX_UNUSED_VECTORS
 from tests.simulation.violation import Violation
 from tests.simulation.worker import Worker
 
@@ -27,7 +27,7 @@ def check_coordinator(fleet: Fleet) -> None:
     queued = _queued(jobs)
     named = set(queued)
     _require(len(named) == len(queued), "the queue names a job twice")
-    in_slack = 0
+    is_background = 0
     for digest, each in jobs.items():
         holders = each.holders
         _require(each.queued == (digest in named), "a job and the queue disagree on whether it is queued")
@@ -36,16 +36,16 @@ def check_coordinator(fleet: Fleet) -> None:
         for holder in holders:
             _require(holder in members, "a job is held by no member")
             _require(digest in members[holder].leases, "a holder has no lease")
-        in_slack += each.in_slack and bool(holders)
+        is_background += each.is_background and bool(holders)
     for name, member in members.items():
         _require(name == member.identity, "a member has another's name")
         for digest, lease in member.leases.items():
-            _require(lease.absent <= MOST_ABSENCES, "a lease outlives beats that do not show it")
+            _require(lease.absent_beats <= MOST_ABSENCES, "a lease outlives beats that do not show it")
             _require(digest in jobs, "a lease is on a job that nobody wants")
             _require(name in jobs[digest].holders, "a lease is on a job that it does not hold")
         _require(not (member.silent and member.leases), "a silent worker holds leases")
         _require(all(number <= member.number for number in member.unseen), "a batch is unseen that was not sent")
-    _require(jobs._in_slack == in_slack, "what fills the slack is miscounted")
+    _require(jobs._background_held == is_background, "what fills the slack is miscounted")
     _require(jobs._tags.keys() == {digest[:TAG_BYTES] for digest in jobs}, "tags are not those of the wanted jobs")
     _require(jobs._failing.keys() <= jobs.keys(), "a job fails that nobody wants")
     _require(not jobs._accepted.keys() & jobs.keys(), "an accepted job is wanted still")
@@ -60,7 +60,7 @@ def check_opening(fleet: Fleet, run: Run) -> None:
     )
 
 
-def check_credit(fleet: Fleet, send: Send) -> None:
+def check_credit(fleet: Fleet, send: OutgoingBatch) -> None:
     """A batch with new work fits the credit of its worker; one that is sent again was within it then."""
     member = fleet.members[send.identity]
     if send.content.work and send.number == member.number and member.unseen[send.number].times == 1:
@@ -80,7 +80,7 @@ class Sendings:
         """It was awake for so long."""
         self._awake += seconds
 
-    def sent(self, fleet: Fleet, send: Send) -> None:
+    def sent(self, fleet: Fleet, send: OutgoingBatch) -> None:
         """A batch has left."""
         batch = id(fleet.members[send.identity]), send.number
         self._last[batch] = self._awake
@@ -95,7 +95,7 @@ class Sendings:
             for number in member.unseen if member.present else ():
                 batch = id(member), number
                 quiet = self._awake - max(self._last.get(batch, self._awake), free)
-                link = member.record.delivery(sum(sent.content.size for sent in member.unseen.values()))
+                link = member.host_stats.transfer_seconds(sum(sent.content.size for sent in member.unseen.values()))
                 patience = (SENT_AGAIN_WITHIN + link) * min(2 ** (self._times[batch] - 1), MOST_PATIENCE)
                 _require(quiet <= patience, "a batch that was not seen is not sent again", "promptness")
 
@@ -113,7 +113,7 @@ def check_worker(worker: Worker, now: float) -> None:
             if job.digest not in turn.unwanted]  # fmt: skip
     _require(len(held) == len(set(held)), "a worker scores a job in two slots at once", "waste")
     vectors, queued = len(worker.backlog._vectors), len(worker.backlog.queued)
-    _require(vectors <= queued + KEPT_VECTORS, "a worker keeps vectors that no job needs", "memory")
+    _require(vectors <= queued + MAX_UNUSED_VECTORS, "a worker keeps vectors that no job needs", "memory")
     for digest in worker.outbox.digests if worker.nonce is not None and not worker.asking else ():
         quiet = now - worker.told_at.get(digest, now)
         _require(quiet <= REPEATED_WITHIN, "a result without a verdict is not repeated", "promptness")
@@ -121,19 +121,19 @@ def check_worker(worker: Worker, now: float) -> None:
 
 def check_rest(fleet: Fleet, run: Run) -> None:
     """After the last verdict nothing is left of anything but what waits for the run to be resumed."""
-    _require(not fleet.leased, "a paused fleet holds leases", "memory")
+    _require(not fleet.lease_count, "a paused fleet holds leases", "memory")
     for member in fleet.members.values():
         _require(not member.unseen, f"{member.identity} has batches that are not seen", "memory")
         _require(not member.verdicts and not member.cancels, f"{member.identity} is owed words", "memory")
-    _require(len(run.slack.collections.uploads) == 0, "an upload is open that nobody sends", "memory")
+    _require(len(run.background_jobs.rollout_collections.uploads) == 0, "an upload is open that nobody sends", "memory")
 
 
 def check_end(fleet: Fleet, run: Run) -> None:
     """An ended run wants nothing."""
-    _require(not fleet.jobs and fleet.leased == 0, "an ended run wants jobs", "memory")
+    _require(not fleet.jobs and fleet.lease_count == 0, "an ended run wants jobs", "memory")
     _require(not _queued(fleet.jobs), "queued at the end")
     _require(not fleet.jobs._tags and not fleet.jobs._failing, "an ended run keeps books", "memory")
-    _require(len(run.slack.collections.uploads) == 0, "an upload is open at the end", "memory")
+    _require(len(run.background_jobs.rollout_collections.uploads) == 0, "an upload is open at the end", "memory")
 
 
 def at_rest(fleet: Fleet, run: Run) -> bool:
@@ -145,8 +145,8 @@ def at_rest(fleet: Fleet, run: Run) -> bool:
     return True
 
 
-def _queued(jobs: WantedJobs) -> list[bytes]:
-    return [digest for *_, digest in (*jobs._queue, *jobs._spare) if digest in jobs]
+def _queued(jobs: PendingJobs) -> list[bytes]:
+    return [digest for *_, digest in (*jobs._queue, *jobs._background_queue) if digest in jobs]
 
 
 def _require(holds: bool, otherwise: str, rule: str = "books") -> None:

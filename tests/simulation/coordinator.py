@@ -10,13 +10,14 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, cast
 from unittest.mock import patch
 
-from dreamfleet.common.messages import Beat, HelloRequest, JobBatch, ResultBatch, UploadPart
-from dreamfleet.coordinator import collection, evolution
-from dreamfleet.coordinator.config import LimitsConfig
-from dreamfleet.coordinator.fleet import Fleet, Send
-from dreamfleet.coordinator.journal import Journal
-from dreamfleet.coordinator.report import Report
-from dreamfleet.coordinator.run import Run
+from dreamfleet.common.protocol.messages import Heartbeat, HelloRequest, JobBatch, ResultBatch, UploadPart
+from dreamfleet.coordinator.dispatch.fleet import Fleet, OutgoingBatch
+from dreamfleet.coordinator.jobs import rollout_collection
+from dreamfleet.coordinator.optimisers import evolution
+from dreamfleet.coordinator.run.report import ControllerWriter
+from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.storage.journal import Journal
 from tests.simulation.disk import Disk, MemoryJournal, Witness
 from tests.simulation.schedule import Shape
 from tests.simulation.truth import Strategy, settings_of
@@ -26,7 +27,7 @@ TICK = 0.25  # virtual seconds between turns without a message; the product's ar
 LINGER = 0.005
 
 OPENED, COMMITTED = "opened", "committed"
-Step = Send | str | None
+Step = OutgoingBatch | str | None
 """A batch to send, the name of a moment, or any other moment at which a life may end."""
 
 
@@ -35,8 +36,8 @@ def simulated_surroundings(disk_of: Any) -> Iterator[None]:
     """No file is written, and no registry is asked: `disk_of()` is the disk of the play that is on."""
     with ExitStack() as stack:
         enter = stack.enter_context
-        enter(patch.object(collection, "write_aside", lambda path: disk_of().write_aside(path)))
-        enter(patch.object(Report, "save", lambda self, **_: None))
+        enter(patch.object(rollout_collection, "atomic_write", lambda path: disk_of().atomic_write(path)))
+        enter(patch.object(ControllerWriter, "save", lambda self, **_: None))
         enter(patch.object(evolution, "build_optimiser", lambda name, search: Strategy(search)))
         yield
 
@@ -50,44 +51,44 @@ class Coordinator:
         limits = LimitsConfig(generations=shape.generations if shape.ends else 0)
         journal = cast(Journal, MemoryJournal(disk, witness))
         self.run = Run(journal, settings_of(shape), limits, self.fleet, now)
-        self.exchange = self.run.exchange
+        self.worker_protocol = self.run.worker_protocol
         self.draining = False
 
     def hear(self, worker: str, message: Any, now: float) -> None:
         """One event, as `Service._handle` takes it; hello is `welcome`."""
         if isinstance(message, ResultBatch):
-            self.exchange.results(worker, message, now)
-        elif isinstance(message, Beat):
+            self.worker_protocol.handle_results(worker, message, now)
+        elif isinstance(message, Heartbeat):
             if message.nonce == self.nonce:
-                self.exchange.beat(worker, message, now)
+                self.worker_protocol.handle_heartbeat(worker, message, now)
         elif isinstance(message, UploadPart):
-            self.exchange.upload(worker, message, now)
+            self.worker_protocol.upload(worker, message, now)
         else:
             assert message == "gone"
-            self.exchange.depart(worker, now)
+            self.worker_protocol.handle_departure(worker, now)
 
     def welcome(self, request: HelloRequest, now: float) -> int | None:
         """How its batches are numbered; `None` where the worker may not join."""
-        if self.exchange.refusal(request, self.run.settings):
+        if self.worker_protocol.find_refusal(request, self.run.settings):
             return None
-        return self.exchange.admit(request, now)
+        return self.worker_protocol.admit(request, now)
 
     def turn(self, now: float) -> Iterator[Step]:
         """What follows the events in a turn of the loop, step by step: a life may end between any two."""
         yield None
-        self.exchange.tick(now)
+        self.worker_protocol.tick(now)
         if self.run.advance(now):
             yield OPENED
-            yield from self.exchange.dispatch(now, durable=False)
+            yield from self.worker_protocol.dispatch(now, durable=False)
         yield None
         self.run.commit()
         yield COMMITTED
-        yield from self.exchange.dispatch(now)
+        yield from self.worker_protocol.dispatch(now)
         self.run.prepare()
         self.run.take_closed()
-        self.exchange.take_notes()
+        self.worker_protocol.take_notes()
 
-    def batch(self, send: Send) -> JobBatch:
+    def batch(self, send: OutgoingBatch) -> JobBatch:
         """A send as it travels."""
         content = send.content
         return JobBatch(
@@ -105,4 +106,4 @@ class Coordinator:
     @property
     def over(self) -> bool:
         """Whether this life leaves by itself: the run has ended, or a drain is done."""
-        return self.run.ended is not None or (self.draining and not self.exchange.leased)
+        return self.run.ended is not None or (self.draining and not self.worker_protocol.lease_count)

@@ -8,15 +8,15 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, Protocol
 
-from dreamfleet.common.classes import Classes
-from dreamfleet.common.effort import Effort
-from dreamfleet.common.messages import Job, Result
-from dreamfleet.common.runs import JOURNAL
-from dreamfleet.common.stored import StoredEvaluation, StoredGeneration
-from dreamfleet.coordinator.collection import Collection
-from dreamfleet.coordinator.confirmation import Finalist
-from dreamfleet.coordinator.evaluation import Evaluation
-from dreamfleet.coordinator.journal import OpenGeneration
+from dreamfleet.common.protocol.host_classes import HostClasses
+from dreamfleet.common.protocol.messages import Job, Result
+from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.run_folder import JOURNAL
+from dreamfleet.coordinator.jobs.confirmation import Finalist
+from dreamfleet.coordinator.jobs.evaluation import Evaluation
+from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
+from dreamfleet.coordinator.storage.journal import StoredOpenGeneration
 from tests.simulation.violation import Violation
 
 TABLES = ("fact", "generation", "result", "evaluation", "collection")
@@ -32,8 +32,8 @@ class Disk:
         self.tables["fact"]["uid"] = "0123456789abcdef" * 2
 
     @contextmanager
-    def write_aside(self, path: Path) -> Any:
-        """As `dreamfleet.common.files` has it: whole or not there."""
+    def atomic_write(self, path: Path) -> Any:
+        """As `dreamfleet.common.files.regular_files` has it: whole or not there."""
         file = BytesIO()
         yield file
         self.files[path.name] = file.getvalue()
@@ -87,9 +87,9 @@ class MemoryJournal:
         return self.fact("host_class")
 
     @property
-    def classes(self) -> Classes:
+    def classes(self) -> HostClasses:
         """No rule hangs on it."""
-        return Classes()
+        return HostClasses()
 
     @property
     def effort(self) -> Effort:
@@ -132,23 +132,23 @@ class MemoryJournal:
         finished = StoredEvaluation(generation, evaluation.episodes, mean, std)
         self._put("evaluation", generation, (evaluation, finished))
 
-    def schedule_collection(self, collection: Collection) -> None:
+    def schedule_collection(self, collection: RolloutCollection) -> None:
         self._insert("collection", collection.generation, collection)
 
-    def collections(self) -> list[Collection]:
+    def scheduled_collections(self) -> list[RolloutCollection]:
         return [row for _, row in sorted(self._tables["collection"].items())]
 
-    def last_generation(self) -> OpenGeneration | None:
+    def last_generation(self) -> StoredOpenGeneration | None:
         numbers = self._tables["generation"]
         return self.generation(max(numbers)) if numbers else None
 
-    def generation(self, number: int) -> OpenGeneration | None:
+    def generation(self, number: int) -> StoredOpenGeneration | None:
         row = self._tables["generation"].get(number)
         if row is None or number < max(self._tables["generation"]) - 1:
             return None
-        return OpenGeneration(number, row["state"].packed(), row["seeds"], row["vectors"])
+        return StoredOpenGeneration(number, row["state"].packed(), row["seeds"], row["vectors"])
 
-    def closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
+    def read_closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
         generations = [row["closed"] for _, row in sorted(self._tables["generation"].items()) if "closed" in row]
         return generations, [done for _, (_, done) in sorted(self._tables["evaluation"].items()) if done]
 

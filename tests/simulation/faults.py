@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from dreamfleet.common.messages import Result, ResultBatch
+from dreamfleet.common.protocol.messages import Result, ResultBatch
 from tests.simulation.network import Effect, Way
 from tests.simulation.schedule import Fault
 from tests.simulation.truth import STEPS

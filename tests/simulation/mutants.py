@@ -14,23 +14,23 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from dreamfleet.common.messages import MAX_PART
-from dreamfleet.common.stages import Stages, stages_of
-from dreamfleet.coordinator import fleet, packing
-from dreamfleet.coordinator.collection import Collections
-from dreamfleet.coordinator.confirmation import Confirmation
-from dreamfleet.coordinator.evaluation import Evaluations
-from dreamfleet.coordinator.fleet import Fleet
-from dreamfleet.coordinator.generation import Generation
-from dreamfleet.coordinator.generations import Generations
-from dreamfleet.coordinator.member import Member, Sent
-from dreamfleet.coordinator.run import Run
-from dreamfleet.coordinator.uploads import Uploads as Intake
-from dreamfleet.coordinator.wanted import WantedJobs
-from dreamfleet.worker.service.backlog import Backlog, Parts
+from dreamfleet.common.protocol.messages import MAX_PART
+from dreamfleet.common.runs.stages import StageTracker, stages_of
+from dreamfleet.coordinator.dispatch import fleet, packing
+from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.dispatch.member import Member, SentBatch
+from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
+from dreamfleet.coordinator.jobs.confirmation import Confirmation
+from dreamfleet.coordinator.jobs.evaluation import Evaluations
+from dreamfleet.coordinator.jobs.generation import Generation
+from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollections
+from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler as Intake
+from dreamfleet.coordinator.run.generations import Generations
+from dreamfleet.coordinator.run.run import Run
+from dreamfleet.worker.service.backlog import Backlog, PartialVector
 from dreamfleet.worker.service.membership import Membership
 from dreamfleet.worker.service.outbox import Outbox
-from dreamfleet.worker.service.uploads import Uploads
+from dreamfleet.worker.service.upload_queue import UploadQueue
 from tests.simulation.schedule import Schedule, draw
 from tests.simulation.world import Outcome, play
 
@@ -89,7 +89,7 @@ def mutant(target: Any, attribute: str, **shape: Any) -> Callable[[Callable[...,
 # The coordinator: fleet, wanted jobs, member, packing.
 
 
-@mutant(Fleet, "_release")
+@mutant(Fleet, "_release_leases")
 def fleet_forgets_to_queue_what_a_lost_worker_held(_original):
     def release(self, member):
         member.leases.clear()
@@ -122,9 +122,9 @@ def fleet_believes_every_result_of_the_generation_that_is_open(original):
     return judge
 
 
-@mutant(fleet, "Sent")
+@mutant(fleet, "SentBatch")
 def fleet_never_sends_a_batch_again(_original):
-    return lambda content, _at, first: Sent(content, math.inf, first)
+    return lambda content, _at, first: SentBatch(content, math.inf, first)
 
 
 @mutant(fleet, "ABSENT_BEATS")
@@ -132,17 +132,17 @@ def fleet_never_misses_a_job_that_beats_do_not_show(_original):
     return 10**9
 
 
-@mutant(Fleet, "welcome")
+@mutant(Fleet, "add_worker")
 def fleet_keeps_the_leases_of_a_worker_that_joins_again(_original):
-    def welcome(self, identity, slots, fingerprint, now):
+    def add_worker(self, identity, slots, fingerprint, now):
         numbering = self._next_numbering()
-        self.members[identity] = Member(identity, slots, fingerprint, numbering, heard=now)
+        self.members[identity] = Member(identity, slots, fingerprint, numbering, last_heard=now)
         return numbering
 
-    return welcome
+    return add_worker
 
 
-@mutant(Fleet, "beat")
+@mutant(Fleet, "handle_heartbeat")
 def fleet_believes_beats_of_other_numberings(original):
     def beat(self, identity, beat, now):
         if member := self.members.get(identity):  # which then shows no more batches than were sent, or is found out
@@ -152,7 +152,7 @@ def fleet_believes_beats_of_other_numberings(original):
     return beat
 
 
-@mutant(Fleet, "asked_of")
+@mutant(Fleet, "find_job_for_result")
 def fleet_asks_for_results_of_nobody(_original):
     return lambda self, identity, result: None
 
@@ -167,12 +167,12 @@ def fleet_sends_verdicts_before_they_are_durable(original):
     return lambda self, now, *, durable=True: original(self, now, durable=True)
 
 
-@mutant(WantedJobs, "hold")
+@mutant(PendingJobs, "add_holder")
 def jobs_that_fill_the_slack_are_not_counted(_original):
     return lambda self, digest, worker, **_: self[digest].holders.add(worker)
 
 
-@mutant(Fleet, "result")
+@mutant(Fleet, "handle_result")
 def fleet_gives_no_verdict_on_a_duplicate(original):
     def result(self, identity, result, now):
         judged = original(self, identity, result, now)
@@ -183,17 +183,17 @@ def fleet_gives_no_verdict_on_a_duplicate(original):
     return result
 
 
-@mutant(WantedJobs, "begin")
+@mutant(PendingJobs, "begin_generation")
 def jobs_remember_every_acceptance(_original):
     return lambda self, generation: None
 
 
-@mutant(WantedJobs, "pardon")
+@mutant(PendingJobs, "clear_failures")
 def jobs_keep_their_failures_when_the_run_is_resumed(_original):
     return lambda self: None
 
 
-@mutant(WantedJobs, "remove")
+@mutant(PendingJobs, "remove")
 def jobs_keep_their_tags_when_they_are_answered(original):
     def remove(self, digest):
         tags = dict(self._tags)
@@ -235,7 +235,7 @@ def generation_adds_to_a_place_what_has_been_counted(original):
     return record
 
 
-@mutant(Generation, "_pass_barrier", racing=True, episodes=3)
+@mutant(Generation, "_open_second_half", racing=True, episodes=3)
 def generation_lets_the_worse_half_pass_the_barrier(original):
     def barrier(self):
         self._scores *= -1
@@ -254,7 +254,7 @@ def generations_forget_the_results_of_the_life_before(_original):
 @mutant(Run, "commit")
 def run_commits_only_what_closes_a_generation(original):
     def commit(self):
-        if self._untold:
+        if self._unpublished:
             original(self)
 
     return commit
@@ -275,12 +275,12 @@ def confirmation_fills_its_round_in_the_order_in_which_scores_come(original):
     return record
 
 
-@mutant(Stages, "awaited", **SCORED)
+@mutant(StageTracker, "required_evaluation", **SCORED)
 def stages_begin_without_the_evaluation_that_decides(original):
-    def awaited(self, generation):
+    def required_evaluation(self, generation):
         return original(self, generation) if generation == self._seen else -1
 
-    return awaited
+    return required_evaluation
 
 
 @mutant(Generations, "_search", first_stage=1, anew=True)
@@ -291,7 +291,7 @@ def a_stage_that_is_continued_searches_as_the_first_one(original):
     return search
 
 
-@mutant(Collections, "receive", **COLLECTING)
+@mutant(RolloutCollections, "receive", **COLLECTING)
 def collections_accept_a_rollout_that_has_not_come(_original):
     return lambda self, _worker, result, _work: result
 
@@ -313,44 +313,44 @@ def intake_never_lets_go_of_a_file(_original):
 # The worker.
 
 
-@mutant(Backlog, "take_in")
+@mutant(Backlog, "add_batch")
 def backlog_counts_a_batch_twice(original):
-    def take_in(self, batch, held):
-        seen, ahead = self.seen, set(self._ahead)
+    def add_batch(self, batch, in_slots):
+        seen, ahead = self.seen, set(self._received_ahead)
         if batch.number > seen and batch.number not in ahead:
-            return original(self, batch, held)
-        self.seen, self._ahead = batch.number - 1, set()
-        refused = original(self, batch, held)
-        self.seen, self._ahead = seen, ahead
+            return original(self, batch, in_slots)
+        self.seen, self._received_ahead = batch.number - 1, set()
+        refused = original(self, batch, in_slots)
+        self.seen, self._received_ahead = seen, ahead
         return refused
 
-    return take_in
+    return add_batch
 
 
-@mutant(Backlog, "take_in")
+@mutant(Backlog, "add_batch")
 def backlog_believes_a_digest_that_is_not_of_its_content(original):
-    def take_in(self, batch, held):
-        self._jobs.update({job.digest: job for job, _ in original(self, batch, held)})
+    def add_batch(self, batch, in_slots):
+        self._jobs.update({job.digest: job for job, _ in original(self, batch, in_slots)})
         return []
 
-    return take_in
+    return add_batch
 
 
-@mutant(Backlog, "begin")
+@mutant(Backlog, "start_numbering")
 def backlog_goes_on_counting_in_a_new_life(original):
-    def begin(self, numbering):
+    def start_numbering(self, numbering):
         if not hasattr(self, "seen"):
             original(self, numbering)
         self.numbering = numbering
 
-    return begin
+    return start_numbering
 
 
-@mutant(Backlog, "_whole", **LONG)
+@mutant(Backlog, "_assemble", **LONG)
 def backlog_joins_a_long_vector_before_it_is_whole(_original):
     def whole(self, identity):
         vector = self._vectors.get(identity)
-        return vector.joined() or None if isinstance(vector, Parts) else vector
+        return vector.content() or None if isinstance(vector, PartialVector) else vector
 
     return whole
 
@@ -364,19 +364,19 @@ def outbox_never_repeats(original):
     return due
 
 
-@mutant(Outbox, "settle")
+@mutant(Outbox, "acknowledge")
 def outbox_settles_another_result(original):
     return lambda self, digests: original(
-        self, [each for _, each in zip(digests, reversed(self._waiting), strict=False)]
+        self, [each for _, each in zip(digests, reversed(self._pending), strict=False)]
     )
 
 
-@mutant(Outbox, "settle")
+@mutant(Outbox, "acknowledge")
 def outbox_ignores_verdicts(_original):
     return lambda self, digests: None
 
 
-@mutant(Uploads, "_advance", **COLLECTING)
+@mutant(UploadQueue, "_advance", **COLLECTING)
 def uploads_forget_an_offset(original):
     def advance(self, each, now):
         original(self, each, now)
@@ -386,7 +386,7 @@ def uploads_forget_an_offset(original):
     return advance
 
 
-@mutant(Uploads, "settle", **COLLECTING)
+@mutant(UploadQueue, "acknowledge", **COLLECTING)
 def uploads_go_on_after_the_verdict(_original):
     return lambda self, digests: None
 
@@ -399,12 +399,12 @@ def membership_never_rejoins(_original):
 @mutant(Membership, "must_rejoin")
 def membership_trusts_a_silent_coordinator(original):
     def must_rejoin(self, now, hands):
-        self._quiet_since = now
+        self._silent_since = now
         return original(self, now, hands)
 
     return must_rejoin
 
 
-@mutant(Membership, "vanish")
+@mutant(Membership, "remove_coordinator")
 def membership_does_not_notice_that_it_was_out_of_sight(_original):
     return lambda self, nonce, now: None

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from dreamfleet.coordinator.fleet import Fleet
-from dreamfleet.coordinator.journal import Journal
+from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.storage.journal import Journal
 from tests.simulation.campaign import run, shrunk
 from tests.simulation.disk import MemoryJournal
 from tests.simulation.mutants import FOUND, MUTANTS
@@ -80,6 +80,6 @@ def test_what_the_product_raises_is_a_violation_with_its_place(monkeypatch):
 
 
 def test_the_simulated_journal_has_all_that_the_real_one_has():
-    on_disk = {"create", "save_copy", "overwritten", "check_incarnation"}
+    on_disk = {"create", "save_copy", "is_overwritten", "check_incarnation"}
     real = {name for name in vars(Journal) if not name.startswith("_")} - on_disk
     assert real <= set(vars(MemoryJournal))

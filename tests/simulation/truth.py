@@ -13,11 +13,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dreamfleet.common.controller import ControllerShape
-from dreamfleet.common.messages import Job, TaskSpec
-from dreamfleet.common.seeds import collection_seed, search_seed, training_seed, validation_seeds
-from dreamfleet.common.stored import RunSettings, StageSettings, StoredEvaluation
-from dreamfleet.common.terms import terms_at
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.protocol.messages import Job, TaskSpec
+from dreamfleet.common.runs.records import RunSettings, StageSettings, StoredEvaluation
+from dreamfleet.common.runs.scoring_params import scoring_params_at
+from dreamfleet.common.runs.seeds import collection_seed, search_seed, training_seed, validation_seeds
 from dreamfleet.coordinator.optimisers.api import Search
 from tests.simulation.schedule import Shape
 
@@ -98,7 +98,7 @@ def fitness_of(vector: bytes, seed: int, named: Named) -> float:
 
 def fitness_of_job(job: Job) -> float:
     """What an episode of this job gives, if its vector is what it says."""
-    return _fitness(job.vector, job.seeds[0], job.terms)
+    return _fitness(job.vector, job.seeds[0], job.overrides)
 
 
 def _fitness(identity: bytes, seed: int, named: Named) -> float:
@@ -134,7 +134,7 @@ def _truth(shape: Shape) -> Truth:
     strategy = Strategy(Search(np.zeros(settings.controller.size), shape.population, settings.sigma0, shape.run_seed))
     truth, counted, second = Truth([], [], {}, {}, 0), set(), False
     for number in range(shape.generations):
-        warm = terms_at(number, settings, (), truth.evaluations.values()).spec.temperature
+        warm = scoring_params_at(number, settings, (), truth.evaluations.values()).spec.temperature
         named: Named = (None if warm == settings.task.temperature else warm, None, None, None)
         episodes, racing = shape.episodes, shape.racing
         if not second and _first_is_over(shape, number, truth.evaluations):

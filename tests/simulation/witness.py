@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from dreamfleet.common.messages import Job, JobBatch, Result
-from dreamfleet.common.seeds import validation_seeds
+from dreamfleet.common.protocol.messages import Job, JobBatch, Result
+from dreamfleet.common.runs.seeds import validation_seeds
 from tests.simulation.disk import Disk
 from tests.simulation.schedule import Shape
 from tests.simulation.truth import fitness_of_job, truth_of

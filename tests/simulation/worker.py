@@ -12,25 +12,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
-from dreamfleet.common.keys import PROTOCOL_VERSION
-from dreamfleet.common.messages import (
+from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
+from dreamfleet.common.protocol.messages import (
     MAX_LEASES,
     TAG_BYTES,
-    Beat,
+    Heartbeat,
     HelloRequest,
     Job,
     JobBatch,
     Result,
     ResultBatch,
-    Running,
+    RunningJob,
     TaskSpec,
     UploadPart,
 )
 from dreamfleet.worker.service.backlog import Backlog
-from dreamfleet.worker.service.membership import Hands, Membership, Terms
+from dreamfleet.worker.service.membership import LeaveConditions, Membership, WorkerLoad
 from dreamfleet.worker.service.outbox import Outbox
-from dreamfleet.worker.service.uploads import PACE, Uploads
+from dreamfleet.worker.service.upload_queue import BURST_INTERVAL, UploadQueue
 from tests.simulation.coordinator import BEAT, REPEAT
 from tests.simulation.schedule import Shape
 from tests.simulation.truth import STEPS, TASK, fitness_of, rollout_of
@@ -93,7 +93,7 @@ class Worker:
         self.failures = 0  # turns that are still to fail
         self.nonce: str | None = None  # of the life that it has joined; `None` before the first
         self.inbox: deque[Any] = deque()
-        self.membership = Membership(Terms(drain_timeout=20.0), now)
+        self.membership = Membership(LeaveConditions(drain_timeout=20.0), now)
         self._shape = shape
         self._spec = spec
         self._send = send
@@ -106,7 +106,7 @@ class Worker:
         self._begin()
 
     def _begin(self) -> None:
-        self.backlog, self.outbox, self.uploads = Backlog(self._spec), Outbox(REPEAT), Uploads(REPEAT)
+        self.backlog, self.outbox, self.uploads = Backlog(self._spec), Outbox(REPEAT), UploadQueue(REPEAT)
         self.turns: list[Turn | None] = [None] * self._shape.slots
         self.told_at: dict[bytes, float] = {}  # when each result was last sent
         self._given: Counter[bytes] = Counter()  # in how many batches each job came
@@ -139,7 +139,7 @@ class Worker:
         if len(self.outbox):
             at = min(at, now + REPEAT / 4)
         if len(self.uploads):
-            at = min(at, now + PACE)
+            at = min(at, now + BURST_INTERVAL)
         return min([at, *(turn.ends for turn in self.turns if turn)])
 
     def answer(self, welcome: Welcome, now: float) -> None:
@@ -149,7 +149,7 @@ class Worker:
         self._waits_until = None
         if self.nonce is None:
             self.nonce = welcome.nonce
-            self.backlog.begin(welcome.numbering)
+            self.backlog.start_numbering(welcome.numbering)
             self.membership.join(welcome.nonce, BEAT, now)
             return
         if welcome.nonce != self.nonce or welcome.numbering != self.backlog.numbering:
@@ -159,7 +159,7 @@ class Worker:
 
     def _begin_numbering(self, numbering: int) -> None:
         self._batches.clear()
-        self.backlog.begin(numbering)
+        self.backlog.start_numbering(numbering)
         self.backlog.clear()
         if self.backlog.seen:
             raise Violation("books", f"a worker begins a new numbering with {self.backlog.seen} batches seen")
@@ -175,7 +175,7 @@ class Worker:
             self._waits_until = None  # nobody answered
             self._retry_at = now + RETRY * self._jitter
         if self.nonce is None:
-            if self.membership.leaving(now):
+            if self.membership.is_leaving(now):
                 self.left = True
             elif now >= self._retry_at:
                 self._ask(now)
@@ -186,15 +186,17 @@ class Worker:
         while self.inbox:
             self._take(self.inbox.popleft(), now)
         self._end_turns(now)
-        if self.membership.must_drain(now):
+        if self.membership.start_draining_if_due(now):
             self.backlog.clear()
         self._fill(now)
         self._say(now)
-        hands = Hands(idle=not any(self.turns), owed=len(self.outbox) > 0, uploading=len(self.uploads) > 0)
+        hands = WorkerLoad(
+            idle=not any(self.turns), awaits_verdict=len(self.outbox) > 0, uploading=len(self.uploads) > 0
+        )
         if self.membership.must_rejoin(now, hands):
-            self.membership.ask(now, RETRY * self._jitter)
+            self.membership.note_hello_sent(now, RETRY * self._jitter)
             self._ask(now)
-        self.left = self.membership.over(now, busy=any(self.turns) or len(self.outbox) > 0)
+        self.left = self.membership.is_over(now, busy=any(self.turns) or len(self.outbox) > 0)
 
     def _ask(self, now: float) -> None:
         self._question += 1
@@ -208,27 +210,27 @@ class Worker:
     def _take(self, event: JobBatch | Token, now: float) -> None:
         if isinstance(event, Token):
             if event.there:
-                self.membership.appear(event.nonce)
+                self.membership.add_coordinator(event.nonce)
             else:
-                self.membership.vanish(event.nonce, now)
+                self.membership.remove_coordinator(event.nonce, now)
             return
         if event.nonce != self.nonce or event.numbering < self.backlog.numbering:
             return
         if event.numbering > self.backlog.numbering:
-            self.membership.doubt()
+            self.membership.suspect_forgotten()
             return
-        self.membership.hear(now)
+        self.membership.note_activity(now)
         self._note(event)
         for digest in event.cancels:
             self._abandon(digest, now)
-        for job, why in self.backlog.take_in(event, self._held):
+        for job, why in self.backlog.add_batch(event, self._held):
             self.outbox.add(Result(job.digest, None, 0, 0.0, why, None))
         judged = [verdict.digest for verdict in event.verdicts]
-        owed = self.outbox.digests
-        self.outbox.settle(judged)
-        if self.outbox.digests != [digest for digest in owed if digest not in judged]:
+        awaits_verdict = self.outbox.digests
+        self.outbox.acknowledge(judged)
+        if self.outbox.digests != [digest for digest in awaits_verdict if digest not in judged]:
             raise Violation("books", "a verdict does not end the repetition of its own result alone")
-        self.uploads.settle(judged)
+        self.uploads.acknowledge(judged)
         if self.membership.draining:
             self.backlog.clear()
 
@@ -257,7 +259,7 @@ class Worker:
         for number, turn in enumerate(self.turns):
             if turn is not None and turn.ends <= now:
                 self.turns[number] = None
-                self.membership.hear(now)
+                self.membership.note_activity(now)
                 self._end(turn)
 
     def _end(self, turn: Turn) -> None:
@@ -269,7 +271,7 @@ class Worker:
                 self._scored.errors += 1
                 self.outbox.add(Result(job.digest, None, STEPS, 0.1, "boom", None))
                 continue
-            fitness, upload = fitness_of(vector, job.seeds[0], job.terms), None
+            fitness, upload = fitness_of(vector, job.seeds[0], job.overrides), None
             if job.kind == "collect":
                 data = rollout_of(vector, job.seeds[0], self._shape.rollout)
                 self.uploads.add(job.digest, data)
@@ -277,7 +279,7 @@ class Worker:
             self.outbox.add(Result(job.digest, fitness, STEPS, 0.1, None, upload))
 
     def _fill(self, now: float) -> None:
-        if self.membership.leaving(now):
+        if self.membership.is_leaving(now):
             return
         room = 4 * self._shape.slots * self._shape.width - len(self.outbox)
         for number, turn in enumerate(self.turns):
@@ -298,9 +300,9 @@ class Worker:
         for piece in self.uploads.due(now):
             self._send(UploadPart(**head, **vars(piece)))
 
-    def _beat(self, now: float) -> Beat:
+    def _beat(self, now: float) -> Heartbeat:
         running = [(job.digest, turn.steps(now)) for turn in self.turns if turn for job, _ in turn.work]
-        return Beat(
+        return Heartbeat(
             run_uid=UID,
             incarnation=1,
             nonce=self.nonce or "",
@@ -309,7 +311,7 @@ class Worker:
             capacity=0 if self.membership.draining else self.capacity,
             slots=self._shape.slots,
             queued=tuple(digest[:TAG_BYTES] for digest in self.backlog.queued),
-            running=tuple(Running(digest[:TAG_BYTES], steps) for digest, steps in running),
+            running=tuple(RunningJob(digest[:TAG_BYTES], steps) for digest, steps in running),
             unacked=tuple(digest[:TAG_BYTES] for digest in self.outbox.digests[:MAX_LEASES]),
             load=0.0,
             steps_per_second=STEPS / self._shape.turn / self.slowness * len(running),

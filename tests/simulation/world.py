@@ -11,8 +11,8 @@ from functools import lru_cache
 from itertools import count
 from typing import Any
 
-from dreamfleet.common.messages import HelloRequest, JobBatch
-from dreamfleet.coordinator.fleet import Send
+from dreamfleet.common.protocol.messages import HelloRequest, JobBatch
+from dreamfleet.coordinator.dispatch.fleet import OutgoingBatch
 from tests.simulation import books
 from tests.simulation.coordinator import COMMITTED, LINGER, OPENED, TICK, Coordinator, simulated_surroundings
 from tests.simulation.disk import Disk
@@ -156,7 +156,7 @@ class World:
                 return
             if step == OPENED:
                 books.check_opening(life.fleet, life.run)
-            elif isinstance(step, Send):
+            elif isinstance(step, OutgoingBatch):
                 books.check_credit(life.fleet, step)
                 self._sendings.sent(life.fleet, step)
                 self._send_down(life, step)
@@ -167,7 +167,7 @@ class World:
         for worker, message in inbox:
             life.hear(worker, message, self.now)
 
-    def _dies(self, step: Send | str | None) -> bool:
+    def _dies(self, step: OutgoingBatch | str | None) -> bool:
         kill = self.kill
         if kill is None:
             return False
@@ -328,7 +328,7 @@ class World:
             self._transmit_down(host, request.worker, Welcome(life.nonce, question, numbering))
         self.wake_coordinator(LINGER)
 
-    def _send_down(self, life: Coordinator, send: Send) -> None:
+    def _send_down(self, life: Coordinator, send: OutgoingBatch) -> None:
         host = int(send.identity.partition("/")[0][1:])
         batch = life.batch(send)
         self.witness.promised(self.disk, batch)
@@ -380,10 +380,12 @@ class World:
 
     def _check_waste(self) -> None:
         """What is scored beyond what counts was lost by a fault, one worker's hands at most each."""
-        slack = self.scored.steps / 100 - self.counted_jobs
+        background_jobs = self.scored.steps / 100 - self.counted_jobs
         hands = 3 * self.shape.slots * min(self.shape.width, self.shape.most_jobs)
-        if slack > hands * (2 + len(self.schedule.faults)):
-            raise Violation("waste", f"{slack:.0f} jobs were scored in vain under {len(self.schedule.faults)} faults")
+        if background_jobs > hands * (2 + len(self.schedule.faults)):
+            raise Violation(
+                "waste", f"{background_jobs:.0f} jobs were scored in vain under {len(self.schedule.faults)} faults"
+            )
 
     @property
     def counted_jobs(self) -> int:

@@ -2,12 +2,11 @@
 
 import time
 
-from dreamfleet.common.authority import Authority
-from dreamfleet.common.credentials import read_join
-from dreamfleet.common.session import Network
+from dreamfleet.common.security.authority import Authority
+from dreamfleet.common.security.credentials import read_join_file
+from dreamfleet.common.transport.session import Network
 from tests.support import tasks
-
-PATIENCE = 60  # seconds
+from tests.support.processes import DEADLINE
 
 
 class Access:
@@ -25,7 +24,7 @@ class Access:
         return self.folder / f"{name}.join"
 
     def network(self, name, endpoint):
-        return Network(connect=(endpoint,), credentials=read_join(self.path(name)))
+        return Network(connect=(endpoint,), credentials=read_join_file(self.path(name)))
 
 
 def begin(processes, access, endpoint, bundle, *more, name="safe", inside=()):
@@ -48,7 +47,7 @@ def work(processes, access, endpoint, who, name="safe", *more):
 
 
 def until(found, what):
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + DEADLINE
     while not found():
         assert time.monotonic() < deadline, what
         time.sleep(0.05)

@@ -12,20 +12,20 @@ from dataclasses import replace
 import numpy as np
 import zenoh
 
-from dreamfleet.common import keys
-from dreamfleet.common.codec import decode, decode_json, encode, encode_json
-from dreamfleet.common.messages import (
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import decode, decode_json, encode, encode_json
+from dreamfleet.common.protocol.messages import (
     MAX_PART,
     TAG_BYTES,
     ControlReply,
     JobBatch,
     Result,
     ResultBatch,
-    Running,
+    RunningJob,
     VectorPart,
 )
-from dreamfleet.common.runs import open_run
-from dreamfleet.common.session import open_session
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.transport.session import open_session
 from tests.support import tasks
 from tests.support.samples import JSON, MSGPACK
 
@@ -71,8 +71,8 @@ class Attacker:
         end = "" if seat is None else f".{seat}"
         self.teller, self.holder = Guest(f"teller{end}/0badc0de", 0), Guest(f"holder{end}/0badc0de", 1)
         self._held = [
-            ears.declare_subscriber(keys.any_worker("job", RUN), direct(self._overhear_batch)),
-            ears.declare_subscriber(keys.any_worker("result", RUN), direct(self._overhear_results)),
+            ears.declare_subscriber(keys.all_workers("job", RUN), direct(self._overhear_batch)),
+            ears.declare_subscriber(keys.all_workers("result", RUN), direct(self._overhear_results)),
             ears.declare_subscriber(keys.event_status(RUN), direct(self._overhear_farewell)),
             ears.liveliness().declare_subscriber(
                 f"{keys.ROOT}/**", direct(lambda told: self.seen.add(str(told.key_expr)))
@@ -86,7 +86,7 @@ class Attacker:
                     keys.bundle(RUN, "*"), keys.claim(RUN, "*"), keys.control(RUN, "*"))  # fmt: skip
         told = direct(lambda heard: self.overheard.append(str(heard.key_expr)))
         kinds = ("job", "result", "beat", "upload")
-        self._held += [session.declare_subscriber(keys.any_worker(kind, RUN), told) for kind in kinds]
+        self._held += [session.declare_subscriber(keys.all_workers(kind, RUN), told) for kind in kinds]
         self._held += [session.declare_subscriber(whole, told), session.liveliness().declare_subscriber(whole, told)]
         self._held += [self.session.liveliness().declare_token(key) for key in CLAIMED]
         self._held += [session.declare_queryable(key, direct(self._answer)) for key in answered]
@@ -97,7 +97,7 @@ class Attacker:
             query.reply(query.key_expr, b"rubbish")
 
     def _overhear_batch(self, sample):
-        batch, worker = decode(JobBatch, sample.payload.to_bytes()), keys.worker_of(str(sample.key_expr))
+        batch, worker = decode(JobBatch, sample.payload.to_bytes()), keys.worker_from_key(str(sample.key_expr))
         for guest in (self.teller, self.holder):
             if worker == guest.identity:
                 guest.take(batch)
@@ -116,7 +116,7 @@ class Attacker:
         """Greet as this worker."""
         request = replace(JSON["hello-request"], worker=worker, fingerprint=self.fingerprint or FORGED[0], slots=1,
                           tasks=(tasks.SLOW_TOY,), protocol_min=2, protocol_max=2)  # fmt: skip
-        where = keys.hello(RUN) if self.seat is None else keys.hello_of(RUN, worker)
+        where = keys.hello(RUN) if self.seat is None else keys.secured_hello(RUN, worker)
         self.session.get(where, lambda _: None, payload=encode_json(request), timeout=ASKED)
 
     def steer(self, where):
@@ -133,7 +133,7 @@ class Attacker:
         if self.fingerprint is None or self.head is None:
             return
         self.hello(guest.identity)
-        running = tuple(Running(digest[:TAG_BYTES], steps) for digest in list(guest.held)[-64:])
+        running = tuple(RunningJob(digest[:TAG_BYTES], steps) for digest in list(guest.held)[-64:])
         beat = replace(
             MSGPACK["beat"], run_uid=self.head.run_uid, incarnation=self.head.incarnation, nonce=self.head.nonce,
             numbering=guest.numbering, seen=guest.seen, capacity=guest.capacity, slots=guest.capacity, queued=(),

@@ -1,22 +1,21 @@
 """A real browser, where there is one: Debian's Chromium without a screen."""
 
-import shutil
 from contextlib import contextmanager
 
-import pytest
+from playwright.sync_api import sync_playwright
 
-CHROMIUM = shutil.which("chromium")
-PATIENCE = 45_000  # milliseconds: a busy machine is slow, and every wait ends as soon as it may
+from tests.support.processes import DEADLINE
+from tests.support.programs import find_program, require_programs
+
+PATIENCE = 1000 * DEADLINE  # milliseconds
 
 
 @contextmanager
 def chromium():
     """One browser; the test is skipped without one."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    if CHROMIUM is None:
-        pytest.skip("there is no chromium here")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    require_programs("chromium")
+    with sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=find_program("chromium"), args=["--no-sandbox"])
         yield browser
         browser.close()
 

@@ -5,8 +5,8 @@ import io
 import numpy as np
 import torch
 
-from dreamfleet.common.bundle import RECORDED, write_bundle
-from dreamfleet.worker.training.assemble import graphs, manifest
+from dreamfleet.common.artifacts.bundle import RECORDED_STATES, write_bundle
+from dreamfleet.worker.training.assemble import export_graphs, make_manifest
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED
 from dreamfleet.worker.worldmodel.vae import VAE
@@ -41,7 +41,7 @@ def write_random_bundle(path, seed=0, vae=PAPER, rnn=REWARDED, initial=None, rec
     models = [weights(each) for each in random_models(seed, vae, rnn)]
     if initial is None:
         initial = np.random.default_rng(seed).normal(size=(4, 2, vae.latent)).astype(np.float32)
-    parts = graphs(*models, initial, vae, rnn)
+    parts = export_graphs(*models, initial, vae, rnn)
     if recorded is not None:
-        parts[RECORDED] = npy(recorded)
-    return write_bundle(path, manifest("random", {"seed": seed}, vae, rnn), parts)
+        parts[RECORDED_STATES] = npy(recorded)
+    return write_bundle(path, make_manifest("random", {"seed": seed}, vae, rnn), parts)

@@ -1,9 +1,11 @@
 """A data set of made-up drives, written in milliseconds."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from dreamfleet.worker.training.collect import episode_path
-from dreamfleet.worker.training.world import preprocessing_to
+from dreamfleet.worker.training.data.collect import episode_path
+from dreamfleet.worker.training.data.world import preprocessing_of_size
 
 
 def write_drive(folder, number, steps=12, picture=64):
@@ -17,7 +19,7 @@ def write_drive(folder, number, steps=12, picture=64):
     np.savez_compressed(
         path, picture=pictures, action=random.uniform(0, 1, (steps, 3)).astype(np.float32),
         reward=np.where(np.arange(steps) % 3 == 0, 3.4, -0.1).astype(np.float32), ended=np.array(False),
-        driver=np.array("held"), preprocessing=np.array(preprocessing_to(picture).name),
+        driver=np.array("held"), preprocessing=np.array(preprocessing_of_size(picture).name),
     )  # fmt: skip
     return path
 
@@ -25,3 +27,19 @@ def write_drive(folder, number, steps=12, picture=64):
 def write_drives(folder, episodes=6, steps=12, picture=64):
     """So many episodes of unequal length."""
     return [write_drive(folder, number, steps - number % 3, picture) for number in range(episodes)]
+
+
+def write_encoded_drives(folder):
+    """A data set that an attentive MDN-RNN can learn from: its VAE is trained for two updates, and has encoded it."""
+    from dreamfleet.worker.training.encode import encode
+    from dreamfleet.worker.training.presets import TINY
+    from dreamfleet.worker.training.train_vae import train_vae
+    from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+
+    write_drives(folder)
+    (folder / "preset.json").write_text('{"preset": "attentive"}')
+    layers = VAEConfig(latent=4, channels=(2, 2, 2, 2))
+    train_vae(folder, replace(TINY.vae, updates=2, batch=8, validate_every=1), lambda *_: None, layers)
+    for _ in encode(folder):
+        pass
+    return folder

@@ -6,9 +6,9 @@ from itertools import count
 
 import numpy as np
 
-from dreamfleet.common.messages import TAG_BYTES, Beat, Result, Running
-from dreamfleet.coordinator.fleet import Fleet
-from dreamfleet.coordinator.jobs import make_work, travelling
+from dreamfleet.common.protocol.messages import TAG_BYTES, Heartbeat, Result, RunningJob
+from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
 from tests.support.samples import HEAD, SPEC
 
 TICK = 0.05
@@ -67,9 +67,9 @@ class Played:
     def _next_generation(self):
         self._number += 1
         self._begun = self.now
-        self.fleet.jobs.begin(self._number)
+        self.fleet.jobs.begin_generation(self._number)
         for candidate in range(self._population):
-            vector = travelling(np.arange(float(self._size)) + candidate + self._number * 1000)
+            vector = vector_bytes(np.arange(float(self._size)) + candidate + self._number * 1000)
             work = make_work(SPEC, "score", self._number, candidate, vector, range(1000, 1000 + self._episodes))
             self._open |= {each.job.digest for each in work}
             self.fleet.jobs.offer(work)
@@ -104,14 +104,14 @@ class Played:
             self._at(self.now + host.lives, self._kill, host)
 
     def _kill(self, host):
-        self.fleet.depart(host.identity, self.now)
+        self.fleet.handle_departure(host.identity, self.now)
         host.identity = ""
         self._at(self.now + 1.0, self._start, host)
 
     def _join(self, host):
         host.seen, host.queued, host.heard = set(), {}, self.now
         host.joins += 1
-        host.numbering = self.fleet.welcome(host.identity, 1, "f", self.now)
+        host.numbering = self.fleet.add_worker(host.identity, 1, "f", self.now)
 
     def _arrive(self, host, send):
         if host.identity != send.identity:
@@ -154,7 +154,7 @@ class Played:
 
     def _receive(self, identity, results):
         for result in results:
-            verdict, _ = self.fleet.result(identity, result, self.now)
+            verdict, _ = self.fleet.handle_result(identity, result, self.now)
             if verdict == "accepted":
                 self._open.discard(result.digest)
         while not self._open:
@@ -168,12 +168,12 @@ class Played:
         seen = 0
         while seen + 1 in host.seen:
             seen += 1
-        beat = Beat(
+        beat = Heartbeat(
             **HEAD, nonce="n", numbering=host.numbering, seen=seen,
             capacity=host.width, slots=1, load=0.0, drawn_by="-",
             steps_per_second=10 * len(host.running) / (host.turn + host.row * max(1, len(host.running))),
             queued=tuple(digest[:TAG_BYTES] for digest in host.queued),
-            running=tuple(Running(digest[:TAG_BYTES], self._steps(host)) for digest in host.running),
+            running=tuple(RunningJob(digest[:TAG_BYTES], self._steps(host)) for digest in host.running),
             unacked=tuple(digest[:TAG_BYTES] for digest in host.unacked),
         )  # fmt: skip
         self._at(self.now + host.delay, self._heard, identity, beat)
@@ -187,4 +187,4 @@ class Played:
         return max(0, int(10 * (1 - left / (host.turn + host.row * len(host.running)))))
 
     def _heard(self, identity, beat):
-        self.fleet.beat(identity, beat, self.now)
+        self.fleet.handle_heartbeat(identity, beat, self.now)

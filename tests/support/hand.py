@@ -7,14 +7,14 @@ from dataclasses import asdict
 
 import zenoh
 
-from dreamfleet.common import keys
-from dreamfleet.common.codec import decode, decode_json, encode, encode_json
-from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
-from dreamfleet.common.messages import (
+from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import decode, decode_json, encode, encode_json
+from dreamfleet.common.protocol.messages import (
     MAX_PART,
     TAG_BYTES,
-    Beat,
     BundlePart,
+    Heartbeat,
     HelloReply,
     HelloRequest,
     Intervals,
@@ -25,10 +25,10 @@ from dreamfleet.common.messages import (
     VectorPart,
     Verdict,
 )
-from dreamfleet.common.session import Network, open_session
+from dreamfleet.common.transport.session import Network, open_session
 from tests.support import samples
+from tests.support.processes import DEADLINE
 
-DEADLINE = 30
 FIRST, SECOND = "aaaaaaaaaaaaaaaa", "bbbbbbbbbbbbbbbb"
 WHOLE = VectorPart(id=samples.VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=samples.VECTOR)
 
@@ -61,9 +61,9 @@ class Hand:
             answer(keys.hello(run), _direct(self._hello)),
             answer(keys.status(run), _direct(self._status)),
             answer(keys.bundle(run, bundle.sha256), _direct(self._part)),
-            declare(keys.any_worker("result", run), self._hear(ResultBatch)),
-            declare(keys.any_worker("beat", run), self._hear(Beat)),
-            declare(keys.any_worker("upload", run), self._hear(UploadPart)),
+            declare(keys.all_workers("result", run), self._hear(ResultBatch)),
+            declare(keys.all_workers("beat", run), self._hear(Heartbeat)),
+            declare(keys.all_workers("upload", run), self._hear(UploadPart)),
         ]
         self._token = None
         self.appear()
@@ -91,7 +91,7 @@ class Hand:
         return self.next(HelloRequest)
 
     def beat(self, accept=lambda _: True):
-        return self.next(Beat, accept)
+        return self.next(Heartbeat, accept)
 
     def ready(self):
         """Wait until the worker can score."""

@@ -1,12 +1,16 @@
 """Several hosts on this machine: network namespaces, each on a cable of its own."""
 
 import json
+import os
 import random
 import secrets
-import shutil
 import subprocess
 from contextlib import contextmanager
 from ipaddress import ip_interface, ip_network
+
+import pytest
+
+from tests.support.programs import find_program, require_programs
 
 CABLES = list(ip_network("198.18.0.0/16").subnets(new_prefix=30))  # RFC 2544: what networks are tried out with
 
@@ -42,7 +46,7 @@ class Host:
 def new_host():
     """A host, or `None` where this process may not make one."""
     name = f"df{secrets.token_hex(4)}"
-    if shutil.which("ip") is None:
+    if find_program("ip") is None:
         yield None
         return
     try:
@@ -55,6 +59,14 @@ def new_host():
         yield host
     finally:
         host.remove()
+
+
+def require_hosts(*hosts):
+    """Skip the test unless all were made."""
+    if None in hosts:
+        if os.geteuid() == 0:
+            require_programs("ip")
+        pytest.skip("network namespaces need root and iproute2")
 
 
 def _free_cable():

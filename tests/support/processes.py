@@ -9,11 +9,11 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-from dreamfleet.common.client import Client
-from dreamfleet.common.processes import Child, command
+from dreamfleet.common.host.processes import VerbProcess, command
+from dreamfleet.common.monitoring.client import Client
 
 ROOT = Path(__file__).parents[2]
-DEADLINE = 120  # seconds, on a machine that does much else
+DEADLINE = 300  # seconds that a test waits for what must come: many times what it takes, for a machine may be busy
 
 
 def free_port():
@@ -33,7 +33,7 @@ def environment(cache, root=ROOT):
     }
 
 
-class Process(Child):
+class Process(VerbProcess):
     """A verb running; its stderr lines can be waited for."""
 
     def __init__(self, arguments, cache, inside=(), root=ROOT):
@@ -50,9 +50,12 @@ class Process(Child):
         """Read on; nothing is lost."""
         self._reading.set()
 
-    def _hear(self, line):
+    def _add_line(self, line):
         self._reading.wait()
-        super()._hear(line)
+        super()._add_line(line)
+
+    def wait_for(self, text, times=1, timeout=DEADLINE):
+        return super().wait_for(text, times, timeout)
 
     def finish(self, timeout=DEADLINE):
         return super().finish(timeout)

@@ -2,13 +2,24 @@
 
 import hashlib
 
-from dreamfleet.common.controller import ControllerShape
-from dreamfleet.common.messages import (
-    Beat,
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.monitoring.status import (
+    EpisodeProgress,
+    FailureStatus,
+    GenerationStatus,
+    Population,
+    Status,
+    Throughput,
+    Waste,
+    WorkerCount,
+    WorkerStatus,
+)
+from dreamfleet.common.protocol.messages import (
     BundlePart,
     ClaimNote,
     ControlReply,
     GenerationEvent,
+    Heartbeat,
     HelloReply,
     HelloRequest,
     Intervals,
@@ -16,25 +27,14 @@ from dreamfleet.common.messages import (
     JobBatch,
     Result,
     ResultBatch,
-    Running,
+    RunningJob,
     TaskSpec,
     UploadPart,
     VectorPart,
     Verdict,
     ViewFrame,
 )
-from dreamfleet.common.status import (
-    FailureStatus,
-    OpenGeneration,
-    Population,
-    Progress,
-    Status,
-    Throughput,
-    Waste,
-    WorkerCount,
-    WorkerStatus,
-)
-from dreamfleet.common.stored import RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 
 UID = "0123456789abcdef" * 2
 SPEC = TaskSpec(task="car-racing", bundle="ab" * 32, horizon=1000, patience=100)
@@ -46,9 +46,17 @@ HEAD = {"run_uid": UID, "incarnation": 3}
 
 def job(episode=0, kind="score", candidate=2, spec=SPEC, seed=1048576, **named):
     return Job(
-        kind=kind, task=spec.task, generation=7, candidate=candidate, episode=episode, seeds=(seed + episode,),
-        vector=VECTOR_ID, digest=spec.at(**named).digest(kind, VECTOR_ID, (seed + episode,)), stall=30.0, **named,
-    )  # fmt: skip
+        kind=kind,
+        task=spec.task,
+        generation=7,
+        candidate=candidate,
+        episode=episode,
+        seeds=(seed + episode,),
+        vector=VECTOR_ID,
+        digest=spec.with_overrides(**named).digest(kind, VECTOR_ID, (seed + episode,)),
+        stall=30.0,
+        **named,
+    )
 
 
 MSGPACK = {
@@ -78,13 +86,13 @@ MSGPACK = {
         **HEAD, fingerprint="x86_64 avx2", results=(Result(b"\x01" * 32, 812.5, 1000, 7.25, None, None),),
         host_class="0123456789abcdef",
     ),
-    "beat-classed": Beat(
+    "beat-classed": Heartbeat(
         **HEAD, nonce="c0ffee00c0ffee00", numbering=3, seen=9, capacity=4, slots=4, queued=(), running=(), unacked=(),
         load=1.5, steps_per_second=987.5, drawn_by="native", host_class="0123456789abcdef",
     ),
-    "beat": Beat(
+    "beat": Heartbeat(
         **HEAD, nonce="c0ffee00c0ffee00", numbering=3, seen=9, capacity=4, slots=4, queued=(b"abcdefgh",),
-        running=(Running(b"ABCDEFGH", 412),), unacked=(b"12345678",), load=1.5, steps_per_second=987.5,
+        running=(RunningJob(b"ABCDEFGH", 412),), unacked=(b"12345678",), load=1.5, steps_per_second=987.5,
         drawn_by="native",
     ),
     "bundle": BundlePart(**HEAD, sha256=b"\xab" * 32, offset=40960, total=14302154, data=b"part of a bundle"),
@@ -133,10 +141,10 @@ BEST = StoredEvaluation(4, 16, 120.5, 30.25)
 STATUS = Status(
     schema=2, run="night", run_uid=UID, incarnation=3, package="0.1.0", state="running", why="",
     settings=RunSettings(SPEC, ControllerShape(288), 4, 2, 0.1, "diagonal", 1, 5, 16), limits={"generations": 100},
-    uptime=99.5, generation=OpenGeneration(7, 3, 8, 2.5, 0.09, None), generations=7, last=CLOSED, recent=(CLOSED,),
+    uptime=99.5, generation=GenerationStatus(7, 3, 8, 2.5, 0.09, None), generations=7, last=CLOSED, recent=(CLOSED,),
     population=Population(7, 0, 4, (2, 1, 0, 0), (2, 2, 2, 2), (101.5, -3.25, None, None)),
     last_population=Population(6, 0, 4, (2, 2, 2, 2), (2, 2, 2, 2), (140.0, 112.0, 122.5, -12.5)),
-    evaluation=BEST, best=BEST, evaluations=1, evaluating=Progress(0, 0), collecting=Progress(8, 8),
+    evaluation=BEST, best=BEST, evaluations=1, evaluating=EpisodeProgress(0, 0), collecting=EpisodeProgress(8, 8),
     workers=WorkerCount(1, 1),
     worker_list=(WorkerStatus("host-a/0a1b2c3d", "present", 8, 12, 400, 987.5, 1.5, "native", 0.3, "x86_64 avx2"),),
     slots=8, fingerprint="x86_64 avx2", throughput=Throughput(987.5, 448000),

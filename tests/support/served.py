@@ -4,15 +4,15 @@ import dataclasses
 from contextlib import contextmanager
 from logging import getLogger
 
-from dreamfleet.common.mishaps import Mishaps
-from dreamfleet.common.session import Network, open_session
-from dreamfleet.common.status import WorkerCount
-from dreamfleet.common.stored import StoredEvaluation
-from dreamfleet.coordinator.generation import Standing
-from dreamfleet.coordinator.history import History
-from dreamfleet.coordinator.queryables import answer_status
-from dreamfleet.coordinator.status import Snapshot
-from dreamfleet.coordinator.story import Story
+from dreamfleet.common.host.error_counter import ErrorCounter
+from dreamfleet.common.monitoring.status import WorkerCount
+from dreamfleet.common.runs.records import StoredEvaluation
+from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.coordinator.dispatch.event_log import EventLog
+from dreamfleet.coordinator.jobs.generation import CandidateScores
+from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.service.queryables import declare_status
+from dreamfleet.coordinator.service.status import Snapshot
 from tests.support.samples import CLOSED, STATUS
 
 WORKER = STATUS.worker_list[0]
@@ -30,7 +30,7 @@ def snapshot(generations=8, workers=1, population=16, name="night", **changes):
         for index in range(workers)
     )
     half = population // 2
-    standing = Standing(
+    candidate_scores = CandidateScores(
         generations, [2] * half + [0] * (population - half), [2] * population,
         [float(index) for index in range(half)] + [None] * (population - half),
     )  # fmt: skip
@@ -41,7 +41,7 @@ def snapshot(generations=8, workers=1, population=16, name="night", **changes):
         evaluation=looks[-1] if looks else None, best=looks[-1] if looks else None, evaluations=len(looks),
         **{"failures": (), "failing": 0, "dropped": {}, **changes},
     )  # fmt: skip
-    return Snapshot(status, fleet, history.view(), looks, standing, None, None, Story().view(), 0.0)
+    return Snapshot(status, fleet, history.view(), looks, candidate_scores, None, None, EventLog().view(), 0.0)
 
 
 class Served:
@@ -56,8 +56,8 @@ def serving(endpoint, first, *others):
     """Answer at `endpoint` until the end: for a run whose snapshot may be set, and for others."""
     served = Served(first)
     with open_session(Network(listen=(endpoint,))) as session:
-        mishaps = Mishaps(getLogger(__name__))
-        answer_status(session, first.status.run, lambda: served.snapshot, mishaps)
+        error_counter = ErrorCounter(getLogger(__name__))
+        declare_status(session, first.status.run, lambda: served.snapshot, error_counter)
         for other in others:
-            answer_status(session, other.status.run, lambda other=other: other, mishaps)
+            declare_status(session, other.status.run, lambda other=other: other, error_counter)
         yield served

@@ -3,7 +3,6 @@
 import getpass
 import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -12,12 +11,11 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-from dreamfleet.coordinator.spawn.agent import birth
-from tests.support.processes import ROOT, free_port
+from dreamfleet.coordinator.spawn.agent import process_start
+from tests.support.processes import DEADLINE, ROOT, free_port
+from tests.support.programs import find_program, require_programs
 
-SSHD = shutil.which("sshd", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin")
 LISTENS = "Server listening"
-PATIENCE = 60
 
 
 class SshHost:
@@ -45,19 +43,19 @@ class SshHost:
 
     def start(self):
         Path("/run/sshd").mkdir(parents=True, exist_ok=True)  # sshd wants it where it runs as root
-        command = [*self.inside, SSHD, "-D", "-e", "-f", self._config]
+        command = [*self.inside, find_program("sshd"), "-D", "-e", "-f", self._config]
         self._popen = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         listens = threading.Event()
         self._reader = threading.Thread(target=self._read, args=(listens,), daemon=True)
         self._reader.start()
-        assert listens.wait(PATIENCE), "sshd does not start"
+        assert listens.wait(DEADLINE), "sshd does not start"
         return self
 
     def stop(self):
         """Nobody is let in any more, and no worker is left."""
         for path in self.root().glob("workers/*/worker.json"):
             state = json.loads(path.read_text())
-            if state and birth(state["pid"]) == state["birth"]:
+            if state and process_start(state["pid"]) == state["birth"]:
                 os.killpg(state["pid"], signal.SIGKILL)
         if self._popen is not None:
             self._popen.terminate()
@@ -123,10 +121,8 @@ class SshHosts:
 
 @contextmanager
 def ssh_hosts(folder):
-    """Hosts to add, or `None` where there is no sshd."""
-    if SSHD is None or shutil.which("ssh") is None:
-        yield None
-        return
+    """Hosts to add; the test is skipped without sshd and ssh."""
+    require_programs("sshd", "ssh")
     hosts = SshHosts(folder / "ssh")
     try:
         yield hosts

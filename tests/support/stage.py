@@ -5,7 +5,7 @@ import queue
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
-from dreamfleet.common.session import Network
+from dreamfleet.common.transport.session import Network
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.worker import Worker
 from tests.support import tasks

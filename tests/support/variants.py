@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from dreamfleet.common.controller import Controller
-from dreamfleet.common.variants import Variant
+from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.artifacts.controller import Controller
 
 VARIANTS = {
     "half pedals": Variant(pedals="half"),

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Literal
 
-from dreamfleet.common.actions import FIVE_CHOICES
-from dreamfleet.common.agent import MOST_HELD
+from dreamfleet.common.artifacts.actions import FIVE_CHOICES
+from dreamfleet.common.artifacts.trained_agent import MAX_FRAME_SKIP
 from dreamfleet.common.errors import UsageError
 
 MOST_PARAMETERS = 50_000_000  # a network that is exported is read within bounds
@@ -55,8 +55,8 @@ class AgentConfig:
             raise UsageError("--channels, --kernels, --strides, --hidden and --frame-skip must be at least 1")
         if min(self.sides) < 1:
             raise UsageError(f"--kernels and --strides leave nothing of {self.picture} pixels: make them smaller")
-        if self.frame_skip > MOST_HELD:
-            raise UsageError(f"--frame-skip must be at most {MOST_HELD}, not {self.frame_skip}")
+        if self.frame_skip > MAX_FRAME_SKIP:
+            raise UsageError(f"--frame-skip must be at most {MAX_FRAME_SKIP}, not {self.frame_skip}")
         if self.parameters > MOST_PARAMETERS:
             raise UsageError(
                 f"these layers have {self.parameters:,} parameters, {MOST_PARAMETERS:,} at most are learnt: make "
@@ -77,14 +77,14 @@ class AgentConfig:
         return int(self.channels[-1] * self.sides[-1] ** 2)
 
     @property
-    def planes(self) -> tuple[tuple[int, int], ...]:
+    def channel_pairs(self) -> tuple[tuple[int, int], ...]:
         """Channels before and after each convolution."""
         return tuple(pairwise((3, *self.channels)))
 
     @property
     def parameters(self) -> int:
         """Of convolutions and LSTM, which are nearly all, without biases."""
-        layers = zip(self.planes, self.kernels, strict=True)
+        layers = zip(self.channel_pairs, self.kernels, strict=True)
         looking = sum(before * after * kernel**2 for (before, after), kernel in layers)
         return int(looking + 4 * self.hidden * (self.flat + self.hidden))
 

@@ -25,8 +25,8 @@ def double_q_target(returns: Tensor, discount: Tensor, online: Tensor, target: T
     return returns + discount * target.gather(-1, best).squeeze(-1)
 
 
-def masked_loss(told: Tensor, target: Tensor, mask: Tensor, kind: str) -> Tensor:
+def masked_loss(predicted: Tensor, target: Tensor, mask: Tensor, kind: str) -> Tensor:
     """The mean of Huber's loss (of a threshold of 1) or of the squared difference, where `mask` is 1."""
     each = functional.huber_loss if kind == "huber" else functional.mse_loss
-    losses = each(told, target, reduction="none") * mask
+    losses = each(predicted, target, reduction="none") * mask
     return losses.sum() / torch.clamp(mask.sum(), min=1)

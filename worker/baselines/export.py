@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 from onnx import TensorProto
 
-from dreamfleet.common.agent import AgentManifest, TrainedAgent
+from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.common.fingerprint import package_version
+from dreamfleet.common.host.packages import package_version
 from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.names import DRQN
 from dreamfleet.worker.baselines.network import Networks
-from dreamfleet.worker.baselines.progress import progress_of
+from dreamfleet.worker.baselines.progress import parse_progress
 from dreamfleet.worker.baselines.train import CHECKPOINT
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
-from dreamfleet.worker.training.world import WORLD, preprocessing_to
-from dreamfleet.worker.worldmodel.graph import GraphBuilder
-from dreamfleet.worker.worldmodel.recurrent import Weights, lstm
+from dreamfleet.worker.training.data.world import WORLD, preprocessing_of_size
+from dreamfleet.worker.worldmodel.mdnrnn_graph import Weights, lstm
+from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 
 
 def export_agent(folder: Path) -> TrainedAgent:
@@ -29,7 +29,7 @@ def export_agent(folder: Path) -> TrainedAgent:
         raise UsageError(f"no agent at {path}: train one with `dreamfleet baseline train {DRQN} --data {folder}`")
     config = load_config(path, AgentConfig)
     networks = Networks(config)
-    progress = progress_of(path, load_checkpoint(path, networks, None))
+    progress = parse_progress(path, load_checkpoint(path, networks, None))
     weights = {name: tensor.numpy() for name, tensor in networks.online.state_dict().items()}
     if not all(np.isfinite(each).all() for each in weights.values()):
         raise DatasetError(f"{path} holds NaN or infinity: give --new to train anew, with a lower --rate")
@@ -42,7 +42,13 @@ def export_agent(folder: Path) -> TrainedAgent:
     }  # fmt: skip
     choices = tuple(tuple(map(float, each)) for each in config.table)
     manifest = AgentManifest(
-        DRQN, WORLD, preprocessing_to(config.picture).name, choices, config.frame_skip, 2 * config.hidden, provenance
+        DRQN,
+        WORLD,
+        preprocessing_of_size(config.picture).name,
+        choices,
+        config.frame_skip,
+        2 * config.hidden,
+        provenance,
     )
     return TrainedAgent(manifest, export_network(weights, config))
 
@@ -53,8 +59,10 @@ def export_network(weights: Weights, config: AgentConfig) -> bytes:
     The state is the LSTM's, hidden and cell, zero as an episode begins; `next_state` is that of the next decision.
     """
     graph, choices = GraphBuilder("agent"), len(config.table)
-    picture = graph.take("picture", TensorProto.UINT8, config.picture, config.picture, 3)
-    hidden, cell = graph.split(graph.take("state", TensorProto.FLOAT, 2 * config.hidden), config.hidden, config.hidden)
+    picture = graph.add_input("picture", TensorProto.UINT8, config.picture, config.picture, 3)
+    hidden, cell = graph.split(
+        graph.add_input("state", TensorProto.FLOAT, 2 * config.hidden), config.hidden, config.hidden
+    )
     value = graph.node("Cast", graph.node("Transpose", picture, perm=[0, 3, 1, 2]), to=TensorProto.FLOAT)
     value = graph.node("Div", value, graph.constant(np.array(255, np.float32)))
     for layer, stride in enumerate(config.strides):
@@ -68,6 +76,6 @@ def export_network(weights: Weights, config: AgentConfig) -> bytes:
     if config.heads == "softmax":
         advantage = graph.node("Softmax", advantage, axis=1)
     advantage = graph.node("Sub", advantage, graph.node("ReduceMean", advantage, axes=[1]))
-    graph.give(graph.node("Add", worth, advantage), "worth", TensorProto.FLOAT, choices)
-    graph.give(graph.join(hidden, cell), "next_state", TensorProto.FLOAT, 2 * config.hidden)
+    graph.add_output(graph.node("Add", worth, advantage), "worth", TensorProto.FLOAT, choices)
+    graph.add_output(graph.join(hidden, cell), "next_state", TensorProto.FLOAT, 2 * config.hidden)
     return graph.build()

@@ -11,7 +11,7 @@ from dreamfleet.common.errors import DatasetError
 from dreamfleet.worker.baselines.equations import double_q_target, masked_loss
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 from dreamfleet.worker.baselines.network import Networks, QNetwork
-from dreamfleet.worker.baselines.traces import Traces
+from dreamfleet.worker.baselines.replay_buffer import TraceBatch
 
 
 class Learner:
@@ -22,9 +22,9 @@ class Learner:
         self._networks, self._optimiser, self._config = networks, optimiser, config
         self.updates = updates
 
-    def learn(self, traces: Traces) -> float:
+    def learn(self, traces: TraceBatch) -> float:
         """Make an update; its loss. `DatasetError` where that is no number: what was saved last is kept."""
-        loss = loss_of(self._networks, traces, self._config)
+        loss = compute_loss(self._networks, traces, self._config)
         self._optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if not math.isfinite(told := loss.item()):
@@ -37,27 +37,27 @@ class Learner:
         self._optimiser.step()
         self.updates += 1
         if self.updates % self._config.target_every == 0:
-            self._networks.renew_target()
+            self._networks.update_target()
         return told
 
 
-def loss_of(networks: Networks, traces: Traces, config: LearningConfig) -> Tensor:
+def compute_loss(networks: Networks, traces: TraceBatch, config: LearningConfig) -> Tensor:
     """How far the online network is from what is foretold behind each choice of the traces."""
     device = networks.online.value.weight.device
     of = {name: torch.from_numpy(array).to(device) for name, array in vars(traces).items()}
-    online = along(networks.online, of["picture"], of["real"])
+    online = q_values_along(networks.online, of["picture"], of["real"])
     with torch.no_grad():
-        target = along(networks.target, of["picture"], of["real"])
+        target = q_values_along(networks.target, of["picture"], of["real"])
         behind = slice(config.n_step, None)  # the moments behind the rewards of each choice
         wanted = double_q_target(of["value"], of["discount"], online[:, behind], target[:, behind])
     told = online[:, : config.trace].gather(-1, of["choice"][..., None]).squeeze(-1)
     return masked_loss(told, wanted, of["mask"], config.loss)
 
 
-def along(network: QNetwork, pictures: Tensor, real: Tensor) -> Tensor:
+def q_values_along(network: QNetwork, pictures: Tensor, real: Tensor) -> Tensor:
     """What each choice is worth `(N, L + n, choices)` along traces, behind their burn-in."""
     burn_in = real.shape[1]
     with torch.no_grad():
-        memory = network.warm(network.features(pictures[:, :burn_in]), real) if burn_in else None
+        memory = network.warm_up(network.features(pictures[:, :burn_in]), real) if burn_in else None
     worth, _ = network(network.features(pictures[:, burn_in:]), memory)
     return torch.as_tensor(worth)

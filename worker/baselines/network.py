@@ -21,7 +21,7 @@ class QNetwork(nn.Module):
         super().__init__()
         self.config = config
         layers: list[nn.Module] = []
-        for (before, after), kernel, stride in zip(config.planes, config.kernels, config.strides, strict=True):
+        for (before, after), kernel, stride in zip(config.channel_pairs, config.kernels, config.strides, strict=True):
             layers += [nn.Conv2d(before, after, kernel, stride), nn.ReLU()]
         self.look = nn.Sequential(*layers, nn.Flatten())
         self.lstm = nn.LSTM(config.flat, config.hidden, batch_first=True)
@@ -42,16 +42,16 @@ class QNetwork(nn.Module):
             advantage = advantage.softmax(dim=-1)
         return duelling(self.value(seen), advantage), memory
 
-    def warm(self, features: Tensor, real: Tensor) -> Memory:
+    def warm_up(self, features: Tensor, real: Tensor) -> Memory:
         """The memory behind a burn-in `(N, B, flat)`, without gradients; zero until a row is `real` `(N, B)`."""
-        memory = self.nothing(len(features), features.device)
+        memory = self.zero_memory(len(features), features.device)
         with torch.no_grad():
             for step in range(features.shape[1]):
                 _, (hidden, cell) = self.lstm(features[:, step : step + 1], memory)
                 memory = hidden * real[:, step, None], cell * real[:, step, None]
         return memory
 
-    def nothing(self, rows: int, device: torch.device | None = None) -> Memory:
+    def zero_memory(self, rows: int, device: torch.device | None = None) -> Memory:
         """The memory as an episode begins."""
         zeros = torch.zeros(1, rows, self.config.hidden, device=device)
         return zeros, zeros
@@ -66,6 +66,6 @@ class Networks(nn.Module):
         self.online = QNetwork(config)
         self.target = copy.deepcopy(self.online).requires_grad_(requires_grad=False)
 
-    def renew_target(self) -> None:
+    def update_target(self) -> None:
         """Let the target be what the online network is."""
         self.target.load_state_dict(self.online.state_dict())

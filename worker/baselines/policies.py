@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.actions import FIVE_CHOICES, STEERING_GAS_BRAKE
-from dreamfleet.worker.car_racing.choosing import ChoosingPolicy
+from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_GAS_BRAKE
+from dreamfleet.worker.car_racing.frame_skip_policy import FrameSkipPolicy
 
 if TYPE_CHECKING:
     from dreamfleet.worker.baselines.network import Memory, QNetwork
@@ -32,7 +32,7 @@ class RandomPolicy:
         return self._random.uniform(STEERING_GAS_BRAKE.low, STEERING_GAS_BRAKE.high).astype(np.float32)
 
 
-class QPolicy(ChoosingPolicy):
+class QPolicy(FrameSkipPolicy):
     """The choice of most worth, or with a chance of `epsilon` any: as it learns, on torch.
 
     The memory goes through time with each decision, also where chance decides; where it always does, nobody looks.
@@ -44,7 +44,7 @@ class QPolicy(ChoosingPolicy):
         self._network, self._epsilon, self._random = network, epsilon, random
         self._memory: Memory | None = None
 
-    def forget(self) -> None:
+    def reset_memory(self) -> None:
         """Nothing is remembered."""
         self._memory = None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dreamfleet.common.presets import check_preset
+from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 

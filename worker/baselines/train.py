@@ -14,42 +14,47 @@ import numpy as np
 import torch
 
 from dreamfleet.common.errors import StoppedError
-from dreamfleet.common.files import write_aside
-from dreamfleet.common.holding import held
-from dreamfleet.common.seeds import training_seed
-from dreamfleet.common.stopping import Stop, never
+from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.folder_lock import folder_lock
+from dreamfleet.common.host.stop_signals import Stop, never_stop
+from dreamfleet.common.runs.seeds import training_seed
 from dreamfleet.worker.baselines.agent_config import AgentConfig
-from dreamfleet.worker.baselines.epsilon import epsilon_of
-from dreamfleet.worker.baselines.kept import drop_kept, keep, read_kept
+from dreamfleet.worker.baselines.episode_files import delete_episodes_before, load_episode, save_episode
 from dreamfleet.worker.baselines.learner import Learner
-from dreamfleet.worker.baselines.learning_config import LearningConfig
+from dreamfleet.worker.baselines.learning_config import LearningConfig, epsilon_of
 from dreamfleet.worker.baselines.network import Networks
 from dreamfleet.worker.baselines.policies import QPolicy
-from dreamfleet.worker.baselines.progress import Driven, Progress, progress_of
-from dreamfleet.worker.baselines.reports import Report, reached, reports
-from dreamfleet.worker.baselines.traces import Episode, Replay, oldest_kept
-from dreamfleet.worker.car_racing.agents import NOTHING
-from dreamfleet.worker.car_racing.check import make_car_racing
-from dreamfleet.worker.scoring.episode import Course, Moment, play
+from dreamfleet.worker.baselines.progress import (
+    EpisodeRecord,
+    TrainingProgress,
+    TrainingReport,
+    is_goal_reached,
+    make_reports,
+    parse_progress,
+)
+from dreamfleet.worker.baselines.replay_buffer import Episode, ReplayBuffer, first_in_replay
+from dreamfleet.worker.car_racing.agents import NO_PARAMETERS
+from dreamfleet.worker.car_racing.native_check import make_car_racing
+from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, run_episode
 from dreamfleet.worker.training.checkpoint import load_checkpoint, save_checkpoint
+from dreamfleet.worker.training.data.disk_errors import explain_write_errors
+from dreamfleet.worker.training.data.world import preprocessing_of_size
 from dreamfleet.worker.training.one_thread import on_one_thread
-from dreamfleet.worker.training.room import told_where_full
-from dreamfleet.worker.training.schedule import keep_triton_from_mesa, same_command
-from dreamfleet.worker.training.world import preprocessing_to
+from dreamfleet.worker.training.training_state import disable_triton_after_mesa, resume_command
 
 CHECKPOINT, CURVE, LOCK = "drqn.safetensors", "drqn.jsonl", "drqn.lock"
 
-Hear = Callable[[int, Report | None], None]
+OnEpisode = Callable[[int, TrainingReport | None], None]
 """Told the episodes that are driven, and a report where one is due."""
 
 
-def ignore(_episodes: int, _report: Report | None) -> None:
+def ignore_episode(_episodes: int, _report: TrainingReport | None) -> None:
     """Nobody listens."""
 
 
 def train_drqn(
-    folder: Path, layers: AgentConfig, config: LearningConfig, hear: Hear = ignore,
-    device: torch.device | None = None, stop: Stop = never, new: bool = False,
+    folder: Path, layers: AgentConfig, config: LearningConfig, on_episode: OnEpisode = ignore_episode,
+    device: torch.device | None = None, stop: Stop = never_stop, new: bool = False,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.episodes` or the goal; returns the figures of the training.
 
@@ -57,20 +62,20 @@ def train_drqn(
     before it: whoever is stopped or killed drives the episode again, to the same bits. `StoppedError` if `stop` asks,
     `UsageError` while another process trains in the folder: the two would drop each other's episodes.
     """
-    with held(folder / LOCK, "training"), on_one_thread():
-        training = Training(folder, layers, config, device, new)
-        hear(training.episodes, None)
+    with folder_lock(folder / LOCK, "training"), on_one_thread():
+        training = AgentTraining(folder, layers, config, device, new)
+        on_episode(training.episodes, None)
         try:
             while not training.done:
                 training.drive(stop)
                 training.save()
-                hear(training.episodes, training.report)
+                on_episode(training.episodes, training.report)
         finally:
             training.close()
     return training.figures
 
 
-class Training:
+class AgentTraining:
     """Networks, replay and what was driven so far, in memory and on disk."""
 
     def __init__(
@@ -79,20 +84,20 @@ class Training:
         self._folder, self._layers, self._config, self._new = folder, layers, config, new
         torch.manual_seed(config.seed)
         self._networks = Networks(layers).to(device)
-        keep_triton_from_mesa()
+        disable_triton_after_mesa()
         self._optimiser = torch.optim.Adam(self._networks.online.parameters(), lr=config.rate)
-        self._records: list[Driven] = []
+        self._records: list[EpisodeRecord] = []
         self._oldest = 0  # the first episode that replay holds
-        self._replay = Replay(config)
+        self._replay = ReplayBuffer(config)
         plain = None if new else load_checkpoint(self._path, self._networks, self._optimiser)
-        found = None if plain is None else progress_of(self._path, plain)
+        found = None if plain is None else parse_progress(self._path, plain)
         self._learner = Learner(self._networks, self._optimiser, config, found.update if found else 0)
         if found is not None:
-            self._go_on(found)
+            self._resume(found)
         else:
             self.save()
             shutil.rmtree(folder / "replay", ignore_errors=True)
-        self._environment = make_car_racing(preprocessing=preprocessing_to(layers.picture).name)
+        self._environment = make_car_racing(preprocessing=preprocessing_of_size(layers.picture).name)
 
     @property
     def episodes(self) -> int:
@@ -103,20 +108,20 @@ class Training:
     def done(self) -> bool:
         """Whether all episodes are driven, or the goal is reached."""
         config = self._config
-        return self.episodes >= config.episodes or reached(self._records, config.report_every, config.goal)
+        return self.episodes >= config.episodes or is_goal_reached(self._records, config.report_every, config.goal)
 
     @property
-    def report(self) -> Report | None:
+    def report(self) -> TrainingReport | None:
         """The report that is due behind the last episode."""
         due = self.episodes % self._config.report_every == 0
-        return reports(self._records, self._config.report_every)[-1] if due else None
+        return make_reports(self._records, self._config.report_every)[-1] if due else None
 
     @property
     def figures(self) -> dict[str, float]:
         """Of the whole training: episodes, updates, mean of the last report's episodes, best report."""
         every = self._config.report_every
-        means = [each.mean for each in reports(self._records, every)] or [self._records[-1].score]
-        goal = reached(self._records, every, self._config.goal)
+        means = [each.mean for each in make_reports(self._records, every)] or [self._records[-1].score]
+        goal = is_goal_reached(self._records, every, self._config.goal)
         return {"episodes": self.episodes, "updates": self._learner.updates, "mean_score": round(means[-1], 2),
                 "best_mean_score": round(max(means), 2), "goal_reached": goal}  # fmt: skip
 
@@ -126,30 +131,30 @@ class Training:
         random = np.random.default_rng([config.seed, number])
         epsilon = epsilon_of(config, number)
         policy = QPolicy(self._networks.online, epsilon, random)
-        policy.begin(NOTHING)
-        drive, losses = Drive(), []
-        course = Course(training_seed(config.seed, number, 0), config.steps, config.patience)
+        policy.begin(NO_PARAMETERS)
+        drive, losses = EpisodeRecorder(), []
+        episode_config = EpisodeConfig(training_seed(config.seed, number, 0), config.steps, config.patience)
         before = sum(each.decisions for each in self._records)
-        for moment in play(self._environment, policy, course):
+        for moment in run_episode(self._environment, policy, episode_config):
             if stop():
-                self._leave()
+                self._raise_stopped()
             drive.see(moment, policy)
-            due = policy.decided and (before + drive.decisions) % config.learn_every == 0
+            due = policy.is_new_decision and (before + drive.decisions) % config.learn_every == 0
             if due and number >= config.random_episodes and (traces := self._replay.sample(random)):
                 losses.append(self._learner.learn(traces))
         episode = drive.episode
-        keep(self._folder, number, episode)
+        save_episode(self._folder, number, episode)
         self._replay.add(episode)
         loss = fmean(losses) if losses else None
-        self._records.append(Driven(drive.score, drive.steps, len(episode), epsilon, loss))
+        self._records.append(EpisodeRecord(drive.score, drive.steps, len(episode), epsilon, loss))
 
     def save(self) -> None:
         """Write the checkpoint, then the curve that follows from it; drop the episodes that nothing needs any more."""
         self._oldest = max(self._oldest, self._first_to_keep)
-        progress = Progress(self._learner.updates, self._oldest, tuple(self._records), asdict(self._config))
+        progress = TrainingProgress(self._learner.updates, self._oldest, tuple(self._records), asdict(self._config))
         save_checkpoint(self._path, self._networks, self._optimiser, asdict(progress))
-        self._draw()
-        drop_kept(self._folder, self._oldest)
+        self._write_curve()
+        delete_episodes_before(self._folder, self._oldest)
 
     def close(self) -> None:
         """Release the environment."""
@@ -161,31 +166,31 @@ class Training:
 
     @property
     def _first_to_keep(self) -> int:
-        return oldest_kept([each.decisions for each in self._records], self._config.replay)
+        return first_in_replay([each.decisions for each in self._records], self._config.replay)
 
-    def _go_on(self, found: Progress) -> None:
+    def _resume(self, found: TrainingProgress) -> None:
         self._records = list(found.episodes)
         self._oldest = max(found.oldest, self._first_to_keep)
         for group in self._optimiser.param_groups:
             group["lr"] = self._config.rate
         for number in range(self._oldest, self.episodes):
-            self._replay.add(read_kept(self._folder, number, self._layers.picture))
-        self._draw()
+            self._replay.add(load_episode(self._folder, number, self._layers.picture))
+        self._write_curve()
 
-    def _draw(self) -> None:
+    def _write_curve(self) -> None:
         path = self._folder / CURVE
-        lines = [json.dumps(asdict(each)) for each in reports(self._records, self._config.report_every)]
-        with told_where_full(path), write_aside(path) as file:
+        lines = [json.dumps(asdict(each)) for each in make_reports(self._records, self._config.report_every)]
+        with explain_write_errors(path), atomic_write(path) as file:
             file.write("".join(f"{line}\n" for line in lines).encode())
 
-    def _leave(self) -> None:
+    def _raise_stopped(self) -> None:
         raise StoppedError(
             f"stopped in episode {self.episodes + 1} of {self._config.episodes}: {self._path} keeps those before it; "
-            f"{same_command(self._new)} drives it again and goes on from there"
+            f"{resume_command(self._new)} drives it again and goes on from there"
         )
 
 
-class Drive:
+class EpisodeRecorder:
     """An episode while it is driven: steps of the environment become decisions of the agent."""
 
     def __init__(self) -> None:
@@ -200,9 +205,9 @@ class Drive:
         """Made so far."""
         return len(self._choices)
 
-    def see(self, moment: Moment, policy: QPolicy) -> None:
+    def see(self, moment: Transition, policy: QPolicy) -> None:
         """One step; its reward belongs to the decision that is held."""
-        if policy.decided:
+        if policy.is_new_decision:
             self._pictures.append(moment.seen)
             self._choices.append(policy.choice)
             self._rewards.append(0.0)

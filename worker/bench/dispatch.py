@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.processes import Child
-from dreamfleet.common.runs import open_run
-from dreamfleet.worker.bench.crowd import serve_crowd
-from dreamfleet.worker.bench.naps import NAP_SECONDS, NAPS, NULLS
+from dreamfleet.common.host.processes import VerbProcess
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.worker.bench.simulated_workers import run_simulated_workers
+from dreamfleet.worker.bench.sleep_tasks import NULL_TASK, SLEEP_SECONDS, SLEEP_TASK
 
 SLOTS = 8
 CANDIDATES = 200
@@ -34,11 +34,11 @@ Figures = dict[str, Any]
 
 def bench_dispatch(crowd: int) -> Figures:
     """50 ms jobs on 8 real slots, null jobs on simulated workers, `crowd` of these; peers where installed."""
-    naps, null = measure_naps(), measure_nulls()
+    naps, null = measure_sleep_jobs(), measure_null_jobs()
     peers: dict[str, Figures | None] = {}
     for name, run in (("pool", pool_peer), ("dask", dask_peer), ("ray", ray_peer)):
         if name == "pool" or find_spec({"dask": "distributed"}.get(name, name)):
-            peers[name] = in_time(run)
+            peers[name] = run_peer(run)
     figures: Figures = {
         "efficiency_50ms": round(naps, 4),
         "null_jobs_per_second": round(null["jobs_per_second"]),
@@ -50,16 +50,16 @@ def bench_dispatch(crowd: int) -> Figures:
     return figures
 
 
-def measure_naps() -> float:
+def measure_sleep_jobs() -> float:
     """The ideal makespan of a generation of 50 ms jobs over the measured one, from real workers."""
-    with BenchRun(NAPS, CANDIDATES, 1) as run, run.workers("--task", NAPS, "--slots", SLOTS):
+    with BenchRun(SLEEP_TASK, CANDIDATES, 1) as run, run.workers("--task", SLEEP_TASK, "--slots", SLOTS):
         run.finish()
-        return ROUNDS * NAP_SECONDS / run.generation_seconds()
+        return ROUNDS * SLEEP_SECONDS / run.generation_seconds()
 
 
-def measure_nulls() -> Figures:
+def measure_null_jobs() -> Figures:
     """Jobs a second that cost their workers nothing: two simulated workers of 32 slots each."""
-    with BenchRun(NULLS, 64, NULL_JOBS // 64) as run, run.crowd(2, 32):
+    with BenchRun(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(2, 32):
         run.finish()
         return {"jobs_per_second": NULL_JOBS / run.generation_seconds(), "rss_mb": run.peak_mb}
 
@@ -67,7 +67,7 @@ def measure_nulls() -> Figures:
 def measure_crowd(count: int) -> Figures:
     """Simulated workers of one slot each join, work and leave."""
     started = time.monotonic()
-    with BenchRun(NULLS, 64, NULL_JOBS // 64) as run, run.crowd(count, 1):
+    with BenchRun(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(count, 1):
         run.finish()
         return {
             "workers": count,
@@ -94,7 +94,7 @@ class BenchRun:
         with ExitStack() as stack:
             self._runs = stack.enter_context(tempfile.TemporaryDirectory())
             self._coordinator = stack.enter_context(
-                Child("coordinator", "--run", "bench", "--runs-dir", self._runs, *self._arguments)
+                VerbProcess("coordinator", "--run", "bench", "--runs-dir", self._runs, *self._arguments)
             ).popen
             self._stack = stack.pop_all()
         return self
@@ -104,12 +104,14 @@ class BenchRun:
 
     def workers(self, *arguments: object) -> AbstractContextManager[object]:
         """A real worker."""
-        return Child("worker", "--connect", self.endpoint, *arguments)
+        return VerbProcess("worker", "--connect", self.endpoint, *arguments)
 
     @contextmanager
     def crowd(self, count: int, slots: int) -> Iterator[None]:
         """Simulated workers, in one process."""
-        process = get_context("spawn").Process(target=serve_crowd, args=(self.endpoint, count, slots), daemon=True)
+        process = get_context("spawn").Process(
+            target=run_simulated_workers, args=(self.endpoint, count, slots), daemon=True
+        )
         process.start()
         try:
             yield
@@ -144,13 +146,13 @@ def _resident_mb(pid: int) -> float:
 # ---- peers: the same work ----
 
 
-def nap(_index: int) -> int:
+def sleep_job(_index: int) -> int:
     """A 50 ms job."""
-    time.sleep(NAP_SECONDS)
+    time.sleep(SLEEP_SECONDS)
     return 0
 
 
-def nothing(_index: int) -> int:
+def null_job(_index: int) -> int:
     """A null job."""
     return 0
 
@@ -159,10 +161,10 @@ Mapper = Callable[[Callable[[int], int], int], object]
 Peer = Callable[[], AbstractContextManager[Mapper]]
 
 
-def in_time(peer: Peer) -> Figures | None:
+def run_peer(peer: Peer) -> Figures | None:
     """A peer's figures, measured in a process of its own; `None` if it hangs or fails."""
     ours, theirs = get_context("spawn").Pipe(duplex=False)
-    process = get_context("spawn").Process(target=_tell, args=(theirs, peer))
+    process = get_context("spawn").Process(target=_send_figures, args=(theirs, peer))
     process.start()
     theirs.close()
     try:
@@ -175,22 +177,22 @@ def in_time(peer: Peer) -> Figures | None:
         process.kill()
 
 
-def _tell(pipe: Connection[Figures, Any], peer: Peer) -> None:
+def _send_figures(pipe: Connection[Figures, Any], peer: Peer) -> None:
     pipe.send(peer_figures(peer))
 
 
 def peer_figures(peer: Peer) -> Figures:
     """The same two measures of a peer with 8 processes."""
     with peer() as run:
-        run(nothing, 100)  # its processes are up
+        run(null_job, 100)  # its processes are up
         started = time.perf_counter()
-        run(nap, CANDIDATES)
+        run(sleep_job, CANDIDATES)
         makespan = time.perf_counter() - started
         started = time.perf_counter()
-        run(nothing, NULL_JOBS)
+        run(null_job, NULL_JOBS)
         null = time.perf_counter() - started
     return {
-        "efficiency_50ms": round(ROUNDS * NAP_SECONDS / makespan, 4),
+        "efficiency_50ms": round(ROUNDS * SLEEP_SECONDS / makespan, 4),
         "null_jobs_per_second": round(NULL_JOBS / null),
     }
 

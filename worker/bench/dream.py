@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.messages import TaskSpec
-from dreamfleet.worker.bench.blocks import Measured, alternate
-from dreamfleet.worker.bench.products import Size, fastest, product_cases
-from dreamfleet.worker.dream.batch import Dreamer
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.bench.matrix_products import Size, fastest, product_cases
+from dreamfleet.worker.bench.timing import TimedCall, time_alternately
+from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.tasks.api import Episode
 
 BATCHES = (1, 256, 1024)
@@ -26,26 +26,26 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
     fastest at it on this core, over the time of the whole; activations, chance, sums and Python count nothing.
     `torch_naive_ratio`: over a step of torch's modules and distributions at 256.
     """
-    dreamer = Dreamer(bundle, TaskSpec("dream", bundle.sha256, HORIZON, 0, temperature=1.25))
+    dreamer = DreamBatch(bundle, TaskSpec("dream", bundle.sha256, HORIZON, 0, temperature=1.25))
     random = np.random.default_rng(0)
     vectors = random.normal(0, 0.1, (CANDIDATES, bundle.controller_shape.size)).astype(np.float32)
 
-    def dream(batch: int) -> Measured:
+    def dream(batch: int) -> TimedCall:
         count = min(batch, CANDIDATES)
         dreams: list[Episode] = [(vector, seed) for vector in vectors[:count] for seed in range(batch // count)]
         return lambda: dreamer.score(dreams)
 
-    cases: dict[str, Measured] = {str(batch): dream(batch) for batch in BATCHES}
+    cases: dict[str, TimedCall] = {str(batch): dream(batch) for batch in BATCHES}
     sizes = product_sizes(bundle)
     cases |= product_cases(sizes)
     note = ""
     try:
-        from dreamfleet.worker.bench.eager import make_torch_dream
+        from dreamfleet.worker.bench.torch_steps import make_torch_dream
 
         cases["torch"] = make_torch_dream(bundle, TILE)
     except ModuleNotFoundError as error:
         note = f"torch_naive_ratio needs {error.name}: pip install 'dreamfleet[train]'"
-    seconds = alternate(cases)
+    seconds = time_alternately(cases)
     rates = {str(batch): batch * HORIZON / seconds[str(batch)] for batch in BATCHES}
     least, libraries = fastest(seconds, len(sizes))
     floor = TILE / least

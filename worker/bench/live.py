@@ -13,18 +13,18 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from dreamfleet.common import keys
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.messages import Intervals, Job, TaskSpec
-from dreamfleet.common.session import Network, open_session
-from dreamfleet.worker.bench.blocks import Measured, alternate
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.messages import Intervals, Job, TaskSpec
+from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.worker.bench.timing import TimedCall, time_alternately
 from dreamfleet.worker.scoring.episode import score
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service.admission import Admission
-from dreamfleet.worker.service.glimpses import Seen
+from dreamfleet.worker.service.frame_publisher import FramePublisher
+from dreamfleet.worker.service.frame_sampler import SampledFrame
+from dreamfleet.worker.service.job_group import JobWithVector
 from dreamfleet.worker.service.slot import Slot
-from dreamfleet.worker.service.turn import Work
-from dreamfleet.worker.service.viewing import Viewing
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
 
@@ -47,9 +47,9 @@ def bench_live(bundle: Bundle) -> Figures:
     for task, rows in TASKS.items():
         spec = TaskSpec(task, bundle.sha256, HORIZON, 0, temperature=1.0 if task == "dream" else None)
         vectors = np.random.default_rng(0).normal(0, 0.1, (rows, bundle.controller_shape.size)).astype(np.float32)
-        bare = alternate(_bare(spec, bundle, vectors))
+        bare = time_alternately(_bare_cases(spec, bundle, vectors))
         with WatchedSlot(spec, bundle, vectors) as slot:
-            seconds = alternate({"unwatched": slot.score, "watched": slot.score_watched})
+            seconds = time_alternately({"unwatched": slot.score, "watched": slot.score_watched})
         figures[task] = {
             "unwatched": round(bare["scorer"] / bare["loop"], 4),
             "watched": round(seconds["watched"] / seconds["unwatched"], 4),
@@ -58,7 +58,7 @@ def bench_live(bundle: Bundle) -> Figures:
     return figures
 
 
-def _bare(spec: TaskSpec, bundle: Bundle, vectors: Floats) -> dict[str, Measured]:
+def _bare_cases(spec: TaskSpec, bundle: Bundle, vectors: Floats) -> dict[str, TimedCall]:
     """A turn by a slot's scorer, and by the loop alone, as it was before there was a live view."""
     scorer, task, assignment = Scorer(spec, bundle), find_task(spec.task), Assignment(spec, bundle)
     jobs = [("score", vector, SEED) for vector in vectors]
@@ -71,8 +71,8 @@ def _bare(spec: TaskSpec, bundle: Bundle, vectors: Floats) -> dict[str, Measured
         episodes = [(vector, SEED) for vector in vectors]
         return {"loop": lambda: batch.score(episodes, lambda _made: None), "scorer": whole}
     environment, policy = task.make_environment(assignment), task.make_policy(assignment)
-    course = scorer.course("score", SEED)
-    return {"loop": lambda: score(environment, policy, vectors[0], course), "scorer": whole}
+    episode_config = scorer.episode_config("score", SEED)
+    return {"loop": lambda: score(environment, policy, vectors[0], episode_config), "scorer": whole}
 
 
 class WatchedSlot:
@@ -81,7 +81,7 @@ class WatchedSlot:
     def __init__(self, spec: TaskSpec, bundle: Bundle, vectors: Floats) -> None:
         self.frames, self.watched = 0, 0.0  # that arrived, and the seconds of turns that were watched
         self._spec, self._bundle = spec, bundle
-        self._work = [_work(spec, vector, number) for number, vector in enumerate(vectors)]
+        self._make_job = [_make_job(spec, vector, number) for number, vector in enumerate(vectors)]
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
 
     def __enter__(self) -> WatchedSlot:
@@ -94,8 +94,10 @@ class WatchedSlot:
                 sessions.append(open_session(network))
                 stack.callback(sessions[-1].close)
             _, worker, viewer = sessions
-            viewer.declare_subscriber(keys.view(RUN, WORKER), zenoh.handlers.Callback(self._count, indirect=False))
-            self._viewing = Viewing(worker, RUN, WORKER, lambda _status: None)
+            viewer.declare_subscriber(
+                keys.view(RUN, WORKER), zenoh.handlers.Callback(self._count_frame, indirect=False)
+            )
+            self._frame_publisher = FramePublisher(worker, RUN, WORKER, lambda _status: None)
             self._slot = Slot(0, self._spec, self._bundle.path, self._events, (self._spec.task,))
             stack.callback(self._slot.stop)
             while not self._slot.ready:
@@ -109,31 +111,31 @@ class WatchedSlot:
     def score(self) -> None:
         """One turn while nobody subscribes."""
         self._slot.show(False)
-        self._turn()
+        self._score_group()
 
     def score_watched(self) -> None:
         """One turn while somebody does."""
         self._slot.show(True)
         began = perf_counter()
-        self._turn()
+        self._score_group()
         self.watched += perf_counter() - began
 
-    def _turn(self) -> None:
-        self._slot.submit(self._work)
+    def _score_group(self) -> None:
+        self._slot.submit(self._make_job)
         while True:
             event = self._events.get()[1]
-            if isinstance(event.word, Seen):
-                work = self._slot.work_of(event.life, event.word)
+            if isinstance(event.message, SampledFrame):
+                work = self._slot.find_job(event.child_number, event.message)
                 assert work is not None  # the only turn's
-                self._viewing.show(ADMISSION, 0, work, event.word)
+                self._frame_publisher.show(ADMISSION, 0, work, event.message)
             elif self._slot.handle(event):
                 return
 
-    def _count(self, _sample: object) -> None:
+    def _count_frame(self, _sample: object) -> None:
         self.frames += 1
 
 
-def _work(spec: TaskSpec, vector: Floats, number: int) -> Work:
+def _make_job(spec: TaskSpec, vector: Floats, number: int) -> JobWithVector:
     data = vector.astype("<f4").tobytes()
     digest = spec.digest("score", hashlib.sha256(data).digest(), (SEED,))
     job = Job("score", spec.task, 0, number, 0, (SEED,), hashlib.sha256(data).digest(), digest, 0.0)

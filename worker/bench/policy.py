@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.worker.bench.blocks import Measured, alternate
-from dreamfleet.worker.bench.products import fastest, product_cases
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.worker.bench.matrix_products import fastest, product_cases
+from dreamfleet.worker.bench.timing import TimedCall, time_alternately
 from dreamfleet.worker.worldmodel.inference import PolicyStep
 
 MATRIX = 768  # large enough to be all arithmetic, small enough for many blocks
@@ -22,16 +22,16 @@ def bench_policy(bundle: Bundle) -> dict[str, float | str | None]:
     picture = random.integers(0, 256, (1, *bundle.manifest.picture), dtype=np.uint8)
     parameters = random.normal(0, 0.1, (1, policy.shape.size)).astype(np.float32)
     state = policy.zero_state(1)
-    cases: dict[str, Measured] = {"step": lambda: policy.step(picture, parameters, state)}
+    cases: dict[str, TimedCall] = {"step": lambda: policy.step(picture, parameters, state)}
     cases |= product_cases([((MATRIX, MATRIX), (MATRIX, MATRIX))])
     note = ""
     try:
-        from dreamfleet.worker.bench.eager import make_torch_step
+        from dreamfleet.worker.bench.torch_steps import make_torch_step
 
         cases["torch"] = make_torch_step(bundle, picture, parameters)
     except ModuleNotFoundError as error:
         note = f"torch_ratio needs {error.name}: pip install 'dreamfleet[train]'"
-    seconds = alternate(cases)
+    seconds = time_alternately(cases)
     least, (library,) = fastest(seconds, 1)
     rate = 2 * MATRIX**3 / least
     return {

@@ -11,29 +11,29 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.agent import NETWORK, TrainedAgent
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.onnx_checks import check_self_contained
+from dreamfleet.common.artifacts.trained_agent import NETWORK, TrainedAgent
 from dreamfleet.common.errors import ControllerError
-from dreamfleet.common.tensors import check_closed
-from dreamfleet.worker.car_racing.choosing import ChoosingPolicy
+from dreamfleet.worker.car_racing.frame_skip_policy import FrameSkipPolicy
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS, find_preprocessing
-from dreamfleet.worker.car_racing.task import WORLD, CarRacing, judge_seeing
+from dreamfleet.worker.car_racing.task import WORLD, CarRacingTask, make_reference_environment
 from dreamfleet.worker.tasks.api import Policy, World
 from dreamfleet.worker.worldmodel.inference import open_graph
 
 Floats = NDArray[np.float32]
-NOTHING = np.zeros(0, np.float32)  # the parameters of who has none
+NO_PARAMETERS = np.zeros(0, np.float32)  # the parameters of who has none
 
 
 class PictureAgent(ABC):
     """An agent, as `scoring.agents` has it, that sees the pictures of a preprocessing."""
 
-    task: ClassVar[str] = CarRacing.name
-    reality: ClassVar[str] = CarRacing.name
+    task: ClassVar[str] = CarRacingTask.name
+    reality: ClassVar[str] = CarRacingTask.name
     world: ClassVar[World] = WORLD
     threshold: ClassVar[float | None] = WORLD.threshold
     bundle: ClassVar[None] = None
-    parameters: ClassVar[Floats] = NOTHING
+    parameters: ClassVar[Floats] = NO_PARAMETERS
 
     @property
     @abstractmethod
@@ -51,12 +51,12 @@ class PictureAgent(ABC):
 
     def make_judge(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The unmodified environment of gymnasium, observing what it sees."""
-        return judge_seeing(find_preprocessing(self.preprocessing), render_mode)
+        return make_reference_environment(find_preprocessing(self.preprocessing), render_mode)
 
     @property
     def truth(self) -> Callable[[gymnasium.Env[Any, Any]], dict[str, float]]:
         """The task's."""
-        return CarRacing().truth
+        return CarRacingTask().truth
 
 
 @dataclass(frozen=True)
@@ -93,21 +93,21 @@ class NetworkAgent(PictureAgent):
         return lambda _seed: policy
 
 
-class NetworkPolicy(ChoosingPolicy):
+class NetworkPolicy(FrameSkipPolicy):
     """The choice that the network gives most worth, of equal ones the first."""
 
     def __init__(self, trained: TrainedAgent) -> None:
         manifest = trained.manifest
         super().__init__(manifest.choices, manifest.frame_skip)
         try:
-            check_closed(trained.network)
+            check_self_contained(trained.network)
             self._run = open_graph(trained.network, threads=1).run
         except Exception as error:  # the runtime's errors share no public base
-            raise _unfit(error) from error
+            raise _unusable_network_error(error) from error
         self._zero = np.zeros((1, manifest.state), np.float32)
         self._state = self._zero
 
-    def forget(self) -> None:
+    def reset_memory(self) -> None:
         """Nothing is remembered."""
         self._state = self._zero
 
@@ -116,15 +116,15 @@ class NetworkPolicy(ChoosingPolicy):
         try:
             worth, self._state = self._run(["worth", "next_state"], {"picture": picture[None], "state": self._state})
         except Exception as error:  # as above
-            raise _unfit(error) from error
+            raise _unusable_network_error(error) from error
         if (
-            worth.shape != (1, len(self._table))
+            worth.shape != (1, len(self._actions))
             or self._state.shape != self._zero.shape
             or not np.isfinite(worth).all()
         ):
-            raise _unfit(f"it tells {worth.shape} of {len(self._table)} choices, or no numbers")
+            raise _unusable_network_error(f"it tells {worth.shape} of {len(self._actions)} choices, or no numbers")
         return int(worth[0].argmax())
 
 
-def _unfit(why: object) -> ControllerError:
+def _unusable_network_error(why: object) -> ControllerError:
     return ControllerError(f"the agent's {NETWORK} cannot be run ({' '.join(str(why).split())}): export it again")

@@ -40,7 +40,7 @@ class CarRacing(_Base):  # type: ignore[misc]
 
     def __init__(self, *arguments: Any, preprocessing: str = RAW.name, native: bool = True, **more: Any) -> None:
         super().__init__(*arguments, **more)
-        self._native = native and available()
+        self._native = native and is_native_available()
         self._preprocessing = find_preprocessing(preprocessing)
         self._fixtures = np.zeros(0)
         self.observation_space = gymnasium.spaces.Box(0, 255, self._preprocessing.shape, np.uint8)
@@ -52,7 +52,7 @@ class CarRacing(_Base):  # type: ignore[misc]
 
     def step(self, action: Any) -> Any:
         """Gymnasium's step; an action of another shape, or NaN, is refused before anything moves."""
-        if self.car.__class__ is car_dynamics.Car and available():  # a new one, of a reset
+        if self.car.__class__ is car_dynamics.Car and is_native_available():  # a new one, of a reset
             self.car.__class__ = Car
         if action is not None and self.continuous:
             action = np.asarray(action)
@@ -85,16 +85,16 @@ class CarRacing(_Base):  # type: ignore[misc]
         car, t = self.car, self.t
         hull = car.hull
         if not self._fixtures.size:
-            self._fixtures = fixtures_of(car)
+            self._fixtures = list_fixtures(car)
         bodies = array("d")
         for body in (*car.wheels, hull):
             at = body.position
             bodies.extend((at.x, at.y, body.angle, 0.0 if body is hull else body.phase))
         x, y, angle = bodies[-4:-1]
         zoom = 0.1 * car_racing.SCALE * max(1 - t, 0) + car_racing.ZOOM * car_racing.SCALE * min(t, 1)
-        sight = array("d", (zoom, -angle, x, y, car_racing.PLAYFIELD))
+        camera = array("d", (zoom, -angle, x, y, car_racing.PLAYFIELD))
         out = np.empty((96, 96, 3), np.uint8)
-        _native.scene(out, self._road, self._road_colours, GRASS, self._palette, sight, bodies, self._fixtures, WHEEL)
+        _native.scene(out, self._road, self._road_colours, GRASS, self._palette, camera, bodies, self._fixtures, WHEEL)
         if self._preprocessing is BOX:
             picture = np.empty(BOX.shape, np.uint8)
             _native.picture(picture, out)
@@ -111,16 +111,16 @@ class CarRacing(_Base):  # type: ignore[misc]
             rows, math.sqrt(vx * vx + vy * vy), *(wheel.omega for wheel in wheels),
             wheels[0].joint.angle, hull.angularVelocity,
         )  # fmt: skip
-        text = score_text(f"{self.reward:04.0f}")
+        text = render_score(f"{self.reward:04.0f}")
         rows[:, : text.shape[1]] = text
 
 
-def available() -> bool:
+def is_native_available() -> bool:
     """Whether the native module was built."""
     return _native is not None
 
 
-def fixtures_of(car: car_dynamics.Car) -> NDArray[np.float64]:
+def list_fixtures(car: car_dynamics.Car) -> NDArray[np.float64]:
     """The car's polygons in drawing order: body, colour, count, vertices."""
     rows: list[float] = []
     for obj in car.drawlist:
@@ -133,12 +133,12 @@ def fixtures_of(car: car_dynamics.Car) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=4096)
-def score_text(text: str) -> NDArray[np.uint8]:
+def render_score(text: str) -> NDArray[np.uint8]:
     """The score's text as observation rows 84-95, columns 0-11.
 
     The text lies within the window's first 125 columns, which are exactly twelve of the observation's.
     """
-    image = _write(text)
+    image = _render_text(text)
     place = image.get_rect()
     place.center = (60, int(car_racing.WINDOW_H - car_racing.WINDOW_H * 2.5 / 40.0))
     surface = pygame.Surface((TEXT_WIDTH, car_racing.WINDOW_H))
@@ -147,7 +147,7 @@ def score_text(text: str) -> NDArray[np.uint8]:
     return np.array(pygame.surfarray.pixels3d(small)[:, 84:].transpose(1, 0, 2), order="C")
 
 
-def _write(text: str) -> pygame.Surface:
+def _render_text(text: str) -> pygame.Surface:
     try:
         return _font().render(text, True, (255, 255, 255), (0, 0, 0))
     except pygame.error:  # somebody closed a window, and with it pygame and its fonts
@@ -161,7 +161,7 @@ def _font() -> pygame.font.Font:
     return pygame.font.Font(pygame.font.get_default_font(), 42)
 
 
-def _grass() -> NDArray[np.float64]:
+def _grass_squares() -> NDArray[np.float64]:
     size = car_racing.GRASS_DIM
     return np.array([
         [(size * x + size, size * y + 0), (size * x + 0, size * y + 0),
@@ -170,5 +170,5 @@ def _grass() -> NDArray[np.float64]:
     ], dtype=np.float64)  # fmt: skip
 
 
-GRASS = _grass()
+GRASS = _grass_squares()
 WHEEL = np.array([car_dynamics.WHEEL_W, car_dynamics.WHEEL_R, car_dynamics.SIZE, *car_dynamics.WHEEL_WHITE], float)

@@ -8,11 +8,11 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.worker.car_racing.check import make_car_racing
-from dreamfleet.worker.car_racing.task import WORLD, CarRacing, judge_seeing
-from dreamfleet.worker.worldmodel.mind import Mind
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.worker.car_racing.native_check import make_car_racing
+from dreamfleet.worker.car_racing.task import WORLD, CarRacingTask, make_reference_environment
 from dreamfleet.worker.worldmodel.observation import Observation, open_bundle
+from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 Floats = NDArray[np.float32]
 
@@ -32,13 +32,13 @@ class CarRacingLatent(gymnasium.Env[Floats, Floats]):
         native: bool = False,
     ) -> None:  # fmt: skip
         found = open_bundle(bundle)
-        pictures = CarRacing().preprocessing(found)
+        pictures = CarRacingTask().preprocessing(found)
         self._environment = (
             make_car_racing(preprocessing=pictures.name, render_mode=render_mode)
             if native
-            else judge_seeing(pictures, render_mode)
+            else make_reference_environment(pictures, render_mode)
         )
-        self._mind, self._observation = Mind(found), Observation(found, features)
+        self._mind, self._observation = RecurrentState(found), Observation(found, features)
         self.render_mode = render_mode
         self.observation_space, self.action_space = self._observation.space, self._environment.action_space
 
@@ -55,7 +55,7 @@ class CarRacingLatent(gymnasium.Env[Floats, Floats]):
         if not np.isfinite(done).all():
             raise ValueError("an action must be three finite numbers")
         picture, reward, terminated, truncated, info = self._environment.step(done)
-        self._mind.remember(done[None])
+        self._mind.advance(done[None])
         self._mind.reward(float(reward))
         return self._observe(picture), float(reward), terminated, truncated, info
 
@@ -69,5 +69,5 @@ class CarRacingLatent(gymnasium.Env[Floats, Floats]):
 
     def _observe(self, picture: NDArray[np.uint8]) -> Floats:
         self._mind.see(picture)
-        seen: Floats = self._observation.of(self._mind.latent, self._mind.state)[0]
+        seen: Floats = self._observation.observe(self._mind.latent, self._mind.state)[0]
         return seen

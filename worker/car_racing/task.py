@@ -12,17 +12,17 @@ from gymnasium import spaces
 from gymnasium.envs.box2d.car_dynamics import Car
 from numpy.typing import NDArray
 
-from dreamfleet.common.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.fingerprint import NUMERIC_PACKAGES
-from dreamfleet.worker.car_racing.check import make_car_racing
+from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
-from dreamfleet.worker.car_racing.network import NetworkDriver
+from dreamfleet.worker.car_racing.native_check import make_car_racing
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS
-from dreamfleet.worker.car_racing.truth import truth_of
+from dreamfleet.worker.car_racing.random_network import RandomNetworkPolicy
+from dreamfleet.worker.car_racing.true_state import read_true_state
 from dreamfleet.worker.tasks.api import Assignment, DreamReward, Policy, Preprocessing, Task, World
-from dreamfleet.worker.tasks.policy import Driven
+from dreamfleet.worker.tasks.policy import DriverPolicy
 from dreamfleet.worker.worldmodel.inference import PolicyStep
 
 ENVIRONMENT = "CarRacing-v3"
@@ -39,13 +39,13 @@ WORLD = World(
 )
 
 POLICIES: dict[str, Callable[[np.random.Generator], Policy]] = {
-    "uniform": lambda random: Driven(UniformDriver(random)),
-    "pushed": lambda random: Driven(PushedDriver(random)),
-    "network": NetworkDriver,
+    "uniform": lambda random: DriverPolicy(UniformDriver(random)),
+    "pushed": lambda random: DriverPolicy(PushedDriver(random)),
+    "network": RandomNetworkPolicy,
 }
 
 
-class CarRacing(Task):
+class CarRacingTask(Task):
     """The task `car-racing`."""
 
     name = "car-racing"
@@ -64,7 +64,7 @@ class CarRacing(Task):
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """The environment with the native picture, where that is exact; it observes the bundle's pictures."""
-        return _telling(self.make_recorded(self.preprocessing(assignment.world_model).name), assignment)
+        return _with_off_road_info(self.make_recorded(self.preprocessing(assignment.world_model).name), assignment)
 
     def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
         """The same, observing the pictures of a preprocessing by name."""
@@ -72,7 +72,9 @@ class CarRacing(Task):
 
     def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The unmodified environment of gymnasium, preprocessed here."""
-        return _telling(judge_seeing(self.preprocessing(assignment.world_model), render_mode), assignment)
+        return _with_off_road_info(
+            make_reference_environment(self.preprocessing(assignment.world_model), render_mode), assignment
+        )
 
     def make_policy(self, assignment: Assignment) -> CarRacingPolicy:
         """Encoder, controller and MDN-RNN of a bundle that was trained on this task's pictures."""
@@ -93,7 +95,7 @@ class CarRacing(Task):
 
     def truth(self, environment: gymnasium.Env[Any, Any]) -> dict[str, float]:
         """Car and road as the simulator knows them; `car_racing.truth` names units and signs."""
-        return truth_of(environment.unwrapped)
+        return read_true_state(environment.unwrapped)
 
     def preprocessing(self, bundle: Bundle) -> Preprocessing:
         """What makes the pictures that the bundle was trained on; `BundleError` if this task does not give them."""
@@ -108,7 +110,7 @@ class CarRacing(Task):
         return found
 
 
-def judge_seeing(preprocessing: Preprocessing, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+def make_reference_environment(preprocessing: Preprocessing, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
     """The unmodified environment of gymnasium, its observation as the picture of a preprocessing."""
     return PictureObservation(gymnasium.make(ENVIRONMENT, render_mode=render_mode), preprocessing)
 
@@ -126,7 +128,7 @@ class PictureObservation(gymnasium.ObservationWrapper[NDArray[np.uint8], Any, ND
         return self._preprocessing.picture(observation)
 
 
-class OffRoad(gymnasium.Wrapper[Any, Any, Any, Any]):
+class OffRoadInfo(gymnasium.Wrapper[Any, Any, Any, Any]):
     """CarRacing whose `info` says in `off_road` whether a wheel touches no tile of the road."""
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -137,9 +139,9 @@ class OffRoad(gymnasium.Wrapper[Any, Any, Any, Any]):
         return (*given, info)
 
 
-def _telling(environment: gymnasium.Env[Any, Any], assignment: Assignment) -> gymnasium.Env[Any, Any]:
+def _with_off_road_info(environment: gymnasium.Env[Any, Any], assignment: Assignment) -> gymnasium.Env[Any, Any]:
     """The environment, saying which steps are off the road where candidates pay for them."""
-    return OffRoad(environment) if assignment.world_model.variant.offroad_cost else environment
+    return OffRoadInfo(environment) if assignment.world_model.variant.offroad_cost else environment
 
 
 class CarRacingPolicy:
@@ -168,4 +170,4 @@ class CarRacingPolicy:
 
     def reward(self, value: float) -> None:
         """What the last action brought; some models see it in the next step."""
-        self._step.remember(self.state, np.array([value]))
+        self._step.write_rewards(self.state, np.array([value]))

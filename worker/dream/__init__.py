@@ -15,6 +15,6 @@ ENVIRONMENT = "dreamfleet/CarRacingDream-v0"
 gymnasium.register(
     id=ENVIRONMENT,
     entry_point="dreamfleet.worker.dream.environment:CarRacingDream",
-    vector_entry_point="dreamfleet.worker.dream.environment:CarRacingDreams",
+    vector_entry_point="dreamfleet.worker.dream.environment:CarRacingDreamVector",
     kwargs={"bundle": "tiny"},
 )

@@ -7,39 +7,39 @@ from copy import copy
 
 import numpy as np
 
-from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.noise import SharedNoise
 from dreamfleet.worker.dream.world import DreamWorld
-from dreamfleet.worker.tasks.api import Episode, Glimpse, Onlooker, Score, World
+from dreamfleet.worker.tasks.api import Episode, Score, StepObserver, StepSnapshot, World
 
 DEFAULT_TEMPERATURE = 1.0
-TILE = 256  # rows that dream together: larger batches are slower again
+MAX_ROWS = 256  # rows that dream together: larger batches are slower again
 
 
-class Dreamer:
+class DreamBatch:
     """Dreams batches of episodes to their ends."""
 
     def __init__(self, bundle: Bundle, spec: TaskSpec, world: World | None = None) -> None:
         """`world` is the bundle's own; found by its name if it is not given."""
         self._size = bundle.controller_shape.size
         self._horizon = spec.horizon
-        self._onlooker: Onlooker | None = None
+        self._observer: StepObserver | None = None
         self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, world, spec.recorded)
 
-    def watched(self, onlooker: Onlooker) -> Dreamer:
+    def watched(self, observer: StepObserver) -> DreamBatch:
         """The same, which shows the first of the dreams that still go on."""
         shown = copy(self)
-        shown._onlooker = onlooker
+        shown._observer = observer
         return shown
 
     def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None] = lambda _: None) -> list[Score]:
         """The summed reward of each dream, in step order, in double precision; `on_step` hears of all steps so far."""
         scores: list[Score] = []
-        for start in range(0, len(episodes), TILE):
+        for start in range(0, len(episodes), MAX_ROWS):
             before = sum(score.steps for score in scores)
-            tile = episodes[start : start + TILE]
+            tile = episodes[start : start + MAX_ROWS]
             scores += self._dream(tile, lambda made, before=before: on_step(before + made), start)  # type: ignore[misc]
         return scores
 
@@ -48,15 +48,15 @@ class Dreamer:
         if parameters.shape[1] != self._size or not np.isfinite(parameters).all():
             raise UsageError(f"a dream needs controllers of {self._size} finite parameters")
         world, rows = self._world, np.arange(len(episodes))
-        noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.beginnings)
+        noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.start_states)
         fitness, steps = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
         latent, state, made = noise.first.latent, world.begin(len(rows), noise.first.memory), 0
         for step in range(self._horizon):
-            moment = world.live(latent, parameters, state, noise.next(rows))
-            if self._onlooker is not None and self._onlooker.due():
+            moment = world.step_controllers(latent, parameters, state, noise.next(rows))
+            if self._observer is not None and self._observer.due():
                 first = int(rows[0])
-                seen = Glimpse(step, float(fitness[first]), moment.action[0], None, latent[0], state[0])
-                self._onlooker.see(start + first, lambda seen=seen: seen)  # type: ignore[misc]
+                seen = StepSnapshot(step, float(fitness[first]), moment.action[0], None, latent[0], state[0])
+                self._observer.see(start + first, lambda seen=seen: seen)  # type: ignore[misc]
             fitness[rows] += moment.reward
             steps[rows] += 1
             made += len(rows)

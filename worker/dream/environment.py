@@ -13,9 +13,9 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from dreamfleet.common.actions import Actions, Discrete
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.worker.dream.noise import Noise, side_by_side
+from dreamfleet.common.artifacts.actions import Actions, Discrete
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.worker.dream.noise import EpisodeNoise, stack_draws
 from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.worldmodel.inference import Decoder
 from dreamfleet.worker.worldmodel.observation import Observation, open_bundle
@@ -60,12 +60,12 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         """Begin a dream; without a seed, one after the last. Of `info`: the `memory` that the model has there."""
         super().reset(seed=seed, options=options)
         dream = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._noise = Noise(dream, self._world.chance)
-        begun = self._noise.begin(self._world.beginnings)
+        self._noise = EpisodeNoise(dream, self._world.chance)
+        begun = self._noise.begin(self._world.start_states)
         self._latent = begun.latent[None]
         self._state = self._world.begin(1, begun.memory)
         self._steps = 0
-        return self._observed(), {"memory": begun.memory.copy()}
+        return self._observe(), {"memory": begun.memory.copy()}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Dream one step under `action` `(3,)`."""
@@ -76,18 +76,18 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         self._latent, self._state = moment.latent, moment.state
         self._steps += 1
         truncated = self._steps >= self._horizon
-        return self._observed(), float(moment.reward[0]), bool(moment.done[0]), truncated, {}
+        return self._observe(), float(moment.reward[0]), bool(moment.done[0]), truncated, {}
 
     def render(self) -> NDArray[np.uint8] | None:
         """The picture `(side, side, 3)` that the decoder makes of the latent."""
         return None if self._decoder is None else self._decoder.decode(self._latent)[0]
 
-    def _observed(self) -> Floats:
-        seen: Floats = self._observation.of(self._latent, self._state)[0]
+    def _observe(self) -> Floats:
+        seen: Floats = self._observation.observe(self._latent, self._state)[0]
         return seen
 
 
-class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
+class CarRacingDreamVector(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
     """Many dreams in one batch; one that has ended begins anew at the next step, as gymnasium's vector environments do.
 
     Dream i of `reset(seed=s)` is the single environment's of seed `s + i`.
@@ -122,18 +122,18 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self._latent = np.zeros((self.num_envs, self._world.chance.latent), dtype=np.float32)
         self._state = self._world.begin(self.num_envs)
         self._memory = self._state[:, : self._world.memory_size].copy()
-        self._noise: list[Noise] = [Noise(0, self._world.chance)] * self.num_envs
+        self._noise: list[EpisodeNoise] = [EpisodeNoise(0, self._world.chance)] * self.num_envs
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.zeros(self.num_envs, dtype=bool)
         for index, each in enumerate(seeds):
-            self._begin(index, each)
-        return self._observed(), self._told(np.ones(self.num_envs, dtype=bool))
+            self._reset_one(index, each)
+        return self._observe(), self._start_info(np.ones(self.num_envs, dtype=bool))
 
     def step(
         self, actions: Floats
     ) -> tuple[Floats, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Dream one step under `actions` `(num_envs, 3)`."""
-        draw = side_by_side([noise.next() for noise in self._noise], axis=0).each(np.concatenate)
+        draw = stack_draws([noise.next() for noise in self._noise], axis=0).map(np.concatenate)
         given = np.asarray(actions, dtype=np.float32)
         moment = self._world.imagine(self._latent, given, self._state, draw)
         self._latent, self._state = moment.latent.copy(), moment.state.copy()
@@ -141,25 +141,25 @@ class CarRacingDreams(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         reward, done, truncated = moment.reward.copy(), moment.done.copy(), self._steps >= self._horizon
         begun = self._over
         for index in np.flatnonzero(begun):
-            self._begin(int(index), None)
+            self._reset_one(int(index), None)
             reward[index], done[index], truncated[index] = 0.0, False, False
         self._over = done | truncated
-        return self._observed(), reward, done, truncated, self._told(begun) if begun.any() else {}
+        return self._observe(), reward, done, truncated, self._start_info(begun) if begun.any() else {}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Each dream's picture `(side, side, 3)`."""
         return None if self._decoder is None else tuple(self._decoder.decode(self._latent))
 
-    def _observed(self) -> Floats:
-        return self._observation.of(self._latent, self._state)
+    def _observe(self) -> Floats:
+        return self._observation.observe(self._latent, self._state)
 
-    def _told(self, begun: Flags) -> dict[str, Any]:
+    def _start_info(self, begun: Flags) -> dict[str, Any]:
         """What `info` says of dreams that have just begun, as gymnasium's vector environments say it."""
         return {"memory": self._memory.copy(), "_memory": begun}
 
-    def _begin(self, index: int, seed: int | None) -> None:
+    def _reset_one(self, index: int, seed: int | None) -> None:
         dream = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._noise[index] = Noise(dream, self._world.chance)
-        self._latent[index], self._memory[index] = self._noise[index].begin(self._world.beginnings)
+        self._noise[index] = EpisodeNoise(dream, self._world.chance)
+        self._latent[index], self._memory[index] = self._noise[index].begin(self._world.start_states)
         self._state[index] = self._world.begin(1, self._memory[index])
         self._steps[index] = 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.worker.worldmodel.inference import Controllers, DreamStep
 
 Floats = NDArray[np.float32]
@@ -25,7 +25,7 @@ class DreamPolicy:
         self._parameters = parameters.astype(np.float32).reshape(1, -1)
         self._state = self._step.zero_state(1)
 
-    def remember(self, memory: Floats) -> None:
+    def set_memory(self, memory: Floats) -> None:
         """Begin with what the model remembers `(memory,)`, as the dream does: `reset` of its environment tells it."""
         self._state[:, : self._step.memory_size] = memory
 

@@ -6,14 +6,14 @@ from typing import Any, ClassVar
 
 import gymnasium
 
-from dreamfleet.worker.dream.batch import Dreamer
+from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.tasks.api import Assignment, Policy, Task, World
 from dreamfleet.worker.tasks.registry import find_task
 
 WIDTH = 256  # rows of a batch: larger ones are no faster
 
 
-class Dream(Task):
+class DreamTask(Task):
     """The task `dream`, of any bundle that dreams: whatever is real is the bundle's own world's."""
 
     name = "dream"
@@ -35,10 +35,10 @@ class Dream(Task):
         """What drives in reality."""
         return self.reality(assignment).make_policy(assignment)
 
-    def make_batch(self, assignment: Assignment) -> Dreamer:
+    def make_batch(self, assignment: Assignment) -> DreamBatch:
         """What scores candidates."""
         self.make_policy(assignment)  # refuses a bundle that does not fit its world
-        return Dreamer(assignment.world_model, assignment.spec, self.world_of(assignment))
+        return DreamBatch(assignment.world_model, assignment.spec, self.world_of(assignment))
 
     def reality(self, assignment: Assignment) -> Task:
         """The task of the world that the bundle was trained on; `UsageError` where no package registers it."""

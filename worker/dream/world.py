@@ -8,18 +8,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import DREAM, Bundle
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, Bundle
 from dreamfleet.common.errors import BundleError, UsageError
-from dreamfleet.worker.dream.beginnings import Beginnings
 from dreamfleet.worker.dream.noise import Draw
+from dreamfleet.worker.dream.start_states import StartStates
 from dreamfleet.worker.tasks.api import Assignment, DreamReward, World
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.worldmodel.inference import Dream, DreamStep
+from dreamfleet.worker.worldmodel.inference import DreamOutput, DreamStep
 
 Floats = NDArray[np.float32]
 
 
-class Moment(NamedTuple):
+class DreamtStep(NamedTuple):
     """What one dreamed step gives, a row a dreamer."""
 
     latent: Floats
@@ -37,15 +37,15 @@ class DreamWorld:
     ) -> None:  # fmt: skip
         """`world` is the bundle's own; found by its name if it is not given. `recorded` is a share of `Beginnings`."""
         check_temperature(temperature)
-        if DREAM not in bundle.manifest.parts:
+        if DREAM_GRAPH not in bundle.manifest.parts:
             raise BundleError(f"{bundle.path.name} is from before dreams: build it again with `dreamfleet bundle`")
         self.world = world or world_of(bundle)
-        self._kind = str(bundle.manifest.models.get("mdnrnn", {}).get("reward", "none"))
-        self._worth = self.world.dream_reward
-        survival = self._worth is not None and self._worth.source == "survival"
-        if self._kind == "none" and not survival:
+        self._reward_kind = str(bundle.manifest.models.get("mdnrnn", {}).get("reward", "none"))
+        self._dream_reward = self.world.dream_reward
+        survival = self._dream_reward is not None and self._dream_reward.source == "survival"
+        if self._reward_kind == "none" and not survival:
             raise BundleError(f"{bundle.path.name} predicts no reward: nothing can be scored in its dream")
-        if self._kind != "value" and self._worth is None:
+        if self._reward_kind != "value" and self._dream_reward is None:
             raise BundleError(
                 f"task {bundle.manifest.task} does not say what a dreamt step of {bundle.path.name} is worth"
             )
@@ -53,7 +53,7 @@ class DreamWorld:
         self._temperature = temperature
         self.chance = self._step.chance
         self.memory_size = self._step.memory_size
-        self.beginnings = Beginnings.of(bundle, recorded, self._step.zero_state(1)[0, : self.memory_size])
+        self.start_states = StartStates.of(bundle, recorded, self._step.zero_state(1)[0, : self.memory_size])
 
     def begin(self, rows: int, memory: Floats | None = None) -> Floats:
         """The state `(rows, state)` before a first step: empty, or the model's part is `memory` `(rows, memory)`.
@@ -65,28 +65,36 @@ class DreamWorld:
             state[:, : self.memory_size] = memory
         return state
 
-    def live(self, latent: Floats, parameters: Floats, state: Floats, draw: Draw) -> Moment:
+    def step_controllers(self, latent: Floats, parameters: Floats, state: Floats, draw: Draw) -> DreamtStep:
         """Controllers `parameters` `(rows, size)` act on `latent` `(rows, latent)` and `state`; the dream goes on."""
         step = self._step.step
-        return self._judge(step(latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask))
+        return self._make_step(step(latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask))
 
     def imagine(
         self, latent: Floats, action: Floats, state: Floats, draw: Draw, chosen: Floats | None = None
-    ) -> Moment:
+    ) -> DreamtStep:
         """The dream goes on under given actions `(rows, actions)`; `chosen` is a controller's where another is done."""
         step = self._step.imagine
-        return self._judge(step(latent, action, state, draw.uniform, draw.normal, self._temperature, draw.mask, chosen))
+        return self._make_step(
+            step(latent, action, state, draw.uniform, draw.normal, self._temperature, draw.mask, chosen)
+        )
 
-    def _judge(self, dream: Dream) -> Moment:
+    def _make_step(self, dream: DreamOutput) -> DreamtStep:
         told = dream.reward.astype(np.float64)
-        reward = told if self._worth is None or self._kind == "value" else self._value(told, self._worth, dream)
-        return Moment(dream.latent, dream.state, reward, dream.done > 0.5, dream.action)
+        reward = (
+            told
+            if self._dream_reward is None or self._reward_kind == "value"
+            else self._value(told, self._dream_reward, dream)
+        )
+        return DreamtStep(dream.latent, dream.state, reward, dream.done > 0.5, dream.action)
 
-    def _value(self, told: NDArray[np.float64], worth: DreamReward, dream: Dream) -> NDArray[np.float64]:
+    def _value(self, told: NDArray[np.float64], worth: DreamReward, dream: DreamOutput) -> NDArray[np.float64]:
         if worth.source == "survival":
             label = (dream.done <= 0.5).astype(np.float64)
         else:
-            label = told if self._kind == "positive" else 1 - told  # the notebook's head tells of steps without one
+            label = (
+                told if self._reward_kind == "positive" else 1 - told
+            )  # the notebook's head tells of steps without one
         return np.asarray(worth.gain * label - worth.cost)
 
 

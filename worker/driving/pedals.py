@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 LEFT, RIGHT = (pygame.K_LEFT, pygame.K_a), (pygame.K_RIGHT, pygame.K_d)
 GAS, BRAKE = (pygame.K_UP, pygame.K_w), (pygame.K_DOWN, pygame.K_s)
-BRAKING = 0.8  # gymnasium's own keyboard: at 1 the wheels lock
+BRAKE_STRENGTH = 0.8  # gymnasium's own keyboard: at 1 the wheels lock
 
 
 class Pedals:
@@ -17,7 +17,7 @@ class Pedals:
     def __init__(self) -> None:
         self._held: set[int] = set()
 
-    def hear(self, event: pygame.event.Event) -> None:
+    def handle_event(self, event: pygame.event.Event) -> None:
         """A key goes down or up; with the window's focus go all of them, for nobody tells of those let go elsewhere."""
         if event.type == pygame.KEYDOWN:
             self._held.add(event.key)
@@ -29,4 +29,4 @@ class Pedals:
     def action(self) -> NDArray[np.float32]:
         """Steering in [-1, 1], gas, brake in [0, 1] `(3,)`; left and right together steer nowhere."""
         left, right, gas, brake = (not self._held.isdisjoint(keys) for keys in (LEFT, RIGHT, GAS, BRAKE))
-        return np.array([int(right) - int(left), gas, BRAKING * brake], dtype=np.float32)
+        return np.array([int(right) - int(left), gas, BRAKE_STRENGTH * brake], dtype=np.float32)

@@ -8,8 +8,8 @@ import gymnasium
 import numpy as np
 import pygame
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.worker.car_racing.check import make_car_racing
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.worker.car_racing.native_check import make_car_racing
 from dreamfleet.worker.car_racing.preprocessing import BOX
 from dreamfleet.worker.dream.environment import CarRacingDream
 
@@ -27,7 +27,7 @@ class Scene(Protocol):
         """The picture of now."""
 
 
-class Reality:
+class CarRacingScene:
     """CarRacing, drawn by gymnasium at the size it shows people: 1000x800."""
 
     name, scale = "CarRacing", 1.0
@@ -43,7 +43,7 @@ class Reality:
         return drawn
 
 
-class Dream:
+class DreamScene:
     """A bundle's dream, decoded."""
 
     name = "a dream"

@@ -16,16 +16,16 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from dreamfleet.common.actions import Actions, Continuous, Discrete
+from dreamfleet.common.artifacts.actions import Actions, Continuous, Discrete
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.tasks import GYM
-from dreamfleet.worker.tasks.api import ENVIRONMENTS_OWN, Assignment, Description, Policy, Task, World
+from dreamfleet.common.protocol.tasks import GYM
+from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Description, Policy, Task, World
 from dreamfleet.worker.tasks.policy import FlatPolicy
 
 RGB = "rgb_array"  # gymnasium's name of the mode in which `render` gives pictures
 OPTIONS = ("environment", "normalise", "seed")
 NORMALISING_EPISODES = 20
-MOST_STEPS = 10_000  # of an episode where the environment was registered without a limit of its own
+DEFAULT_MAX_STEPS = 10_000  # of an episode where the environment was registered without a limit of its own
 # What gymnasium's own environments compute with; of any other the distribution that its module is from.
 ENGINES = {
     "gymnasium.envs.box2d": ("box2d", "box2d-py"),
@@ -46,7 +46,7 @@ class GymTask(Task):
         """What the environment's own spaces and registration say; `UsageError` where they cannot be used."""
         environment = self.make_environment(assignment)
         try:
-            return _world_of(environment, self._id)
+            return _build_world(environment, self._id)
         finally:
             environment.close()
 
@@ -65,7 +65,7 @@ class GymTask(Task):
         plain.close()
         own = type(plain.unwrapped).__module__.startswith(tuple(ENGINES))
         drawn = own and RGB in plain.metadata.get("render_modes", ())
-        return _DrawnNowAndThen(self.make_judge(assignment, RGB)) if drawn else None
+        return _RenderOnDemand(self.make_judge(assignment, RGB)) if drawn else None
 
     def make_policy(self, assignment: Assignment) -> Policy:
         """A controller on the flat observation, normalised as it was when the run began."""
@@ -83,10 +83,10 @@ class GymTask(Task):
         arguments = dict(options.get("environment") or {})
         environment = self._make(arguments)
         try:
-            world = _world_of(environment, self._id)
+            world = _build_world(environment, self._id)
             frozen: dict[str, Any] = {"environment": arguments} if arguments else {}
             if options.get("normalise"):
-                mean, deviation = _normal(environment, int(options.get("seed", 0)))
+                mean, deviation = _measure_normalisation(environment, int(options.get("seed", 0)))
                 frozen["normal"] = {"mean": mean.tolist(), "deviation": deviation.tolist()}
             observations = int(np.prod(environment.observation_space.shape or (1,)))
         finally:
@@ -110,7 +110,7 @@ class GymTask(Task):
             raise UsageError(f"{self._id} cannot be made: {type(error).__name__}: {error}") from error
 
 
-class _DrawnNowAndThen(gymnasium.Wrapper[Any, Any, Any, Any]):
+class _RenderOnDemand(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Steps as an environment that is never drawn, and knows of pictures only while `render` draws one.
 
     Where it knows, it may do more in every step: LunarLander makes bodies of its engines' sparks, which only `render`
@@ -130,7 +130,7 @@ class _DrawnNowAndThen(gymnasium.Wrapper[Any, Any, Any, Any]):
             self.unwrapped.render_mode = None
 
 
-def _world_of(environment: gymnasium.Env[Any, Any], name: str) -> World:
+def _build_world(environment: gymnasium.Env[Any, Any], name: str) -> World:
     observations = environment.observation_space
     if not isinstance(observations, spaces.Box):
         raise UsageError(f"{name} observes {observations}: only Box observations can be flattened for a controller")
@@ -140,19 +140,19 @@ def _world_of(environment: gymnasium.Env[Any, Any], name: str) -> World:
         engine = tuple(sorted(set(packages_distributions().get(module.partition(".")[0], ()))))
     rate = environment.metadata.get("render_fps") or World.frames_per_second
     return World(
-        actions=_actions(environment.action_space, name),
+        actions=_convert_action_space(environment.action_space, name),
         packages=("numpy", "gymnasium", *engine),
-        horizon=ENVIRONMENTS_OWN if _limited(environment) else MOST_STEPS,
+        horizon=ENVIRONMENT_LIMIT if _has_step_limit(environment) else DEFAULT_MAX_STEPS,
         frames_per_second=max(1, round(rate)),
         threshold=environment.spec.reward_threshold if environment.spec else None,
     )
 
 
-def _limited(environment: gymnasium.Env[Any, Any]) -> bool:
+def _has_step_limit(environment: gymnasium.Env[Any, Any]) -> bool:
     return environment.spec is not None and bool(environment.spec.max_episode_steps)
 
 
-def _actions(space: Any, name: str) -> Actions:
+def _convert_action_space(space: Any, name: str) -> Actions:
     if isinstance(space, spaces.Discrete):
         return Discrete(int(space.n), int(space.start))
     if isinstance(space, spaces.Box) and len(space.shape) == 1 and space.shape[0]:
@@ -166,14 +166,16 @@ def _actions(space: Any, name: str) -> Actions:
     raise UsageError(f"{name} takes actions {space}: a controller gives a Discrete action or a flat Box")
 
 
-def _normal(environment: gymnasium.Env[Any, Any], seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _measure_normalisation(
+    environment: gymnasium.Env[Any, Any], seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean and deviation `(observations,)` over episodes of random actions; a constant one is left as it is."""
     environment.action_space.seed(seed)
     seen = []
     for episode in range(NORMALISING_EPISODES):
         observation, _ = environment.reset(seed=seed + episode)
         over, steps = False, 0
-        while not over and steps < MOST_STEPS:
+        while not over and steps < DEFAULT_MAX_STEPS:
             steps += 1
             seen.append(np.asarray(observation, dtype=np.float64).reshape(-1))
             observation, _, terminated, truncated, _ = environment.step(environment.action_space.sample())

@@ -25,7 +25,7 @@ def new_figure(height: float, rows: int = 1, columns: int = 1, **settings: Any) 
     return figure, axes
 
 
-def png(figure: Figure) -> bytes:
+def render_png(figure: Figure) -> bytes:
     """The figure's PNG, without the version that drew it: equal figures give equal bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
@@ -44,10 +44,10 @@ def picture_grid(rows: Sequence[tuple[str, Pictures]], columns: Sequence[str]) -
         line[0].set_ylabel(label, rotation=0, ha="right", va="center", fontsize=FONT + 1)
     for each, heading in zip(axes[0], columns, strict=True):
         each.set_title(heading, fontsize=FONT + 1)
-    return png(figure)
+    return render_png(figure)
 
 
-def heat(axes: Any, values: NDArray[Any], title: str, **settings: Any) -> None:
+def draw_heatmap(axes: Any, values: NDArray[Any], title: str, **settings: Any) -> None:
     """Values `(rows, steps)` as colours, with their scale beside them."""
     image = axes.imshow(values, aspect="auto", interpolation="nearest", **settings)
     axes.set_title(title, fontsize=FONT + 1)

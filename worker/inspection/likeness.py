@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.controller import Controller
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.inspection.disturbed_rollouts import OFF, DisturbedDrive
+from dreamfleet.worker.inspection.drive_dreams import DreamSegment, DriveDreamer
 from dreamfleet.worker.inspection.estimate import Estimate
-from dreamfleet.worker.inspection.imagination import Beginning, Imagination
-from dreamfleet.worker.inspection.losses import FOLDS
-from dreamfleet.worker.inspection.probe import LinearProbe, folds, others
-from dreamfleet.worker.inspection.witness import OFF, WitnessedDrive
+from dreamfleet.worker.inspection.probe import LinearProbe, folds, other_rows
+from dreamfleet.worker.inspection.road_losses import FOLDS
 
 Floats = NDArray[np.float64]
 RARE = 0.9  # the quantile of a quantity's size in reality, beyond which it is rare
@@ -28,7 +28,7 @@ SHORTEST = 100  # steps on the road that a drive has to have
 
 
 @dataclass(frozen=True)
-class Alike:
+class RareFrequency:
     """Of one quantity: the size that a tenth of real steps exceeds, and the share of steps that does.
 
     In `reality` by its truth, `foreseen` by the probe on real steps, `dream` by the probe on dreamt ones.
@@ -40,29 +40,29 @@ class Alike:
 
 
 def compare(
-    drives: Sequence[WitnessedDrive], bundle: Bundle, controller: Controller, opening: int, dreams: int,
+    drives: Sequence[DisturbedDrive], bundle: Bundle, controller: Controller, opening: int, dreams: int,
     temperature: float,
-) -> list[Alike]:  # fmt: skip
+) -> list[RareFrequency]:  # fmt: skip
     """Dreams begun behind each drive's opening, as long as it keeps to the road, under the same disturbance.
 
     `UsageError` if fewer than two drives keep to it for long enough.
     """
-    begun = [each for drive in drives if (each := _beginning(drive, opening)) is not None]
+    begun = [each for drive in drives if (each := _dream_segment(drive, opening)) is not None]
     if len(begun) < 2:
         raise UsageError(f"dreams are held to two drives at least that keep to the road for {SHORTEST} steps")
-    imagination = Imagination(bundle, controller, temperature, dreams)
+    imagination = DriveDreamer(bundle, controller, temperature, dreams)
     if begun[0].drive.truth.keys() <= {OFF}:
         raise UsageError("the world's truth tells nothing that dreams could be held to")
     names = [name for name in begun[0].drive.truth if name != OFF]
     truths = [np.stack([each.drive.truth[name][each.steps] for name in names], axis=1) for each in begun]
-    foreseen = [imagination.foresee(each.drive)[0][each.steps] for each in begun]
+    foreseen = [imagination.predict_next(each.drive)[0][each.steps] for each in begun]
     rare = np.quantile(np.abs(np.concatenate(truths)), RARE, axis=0)
     shares: list[dict[str, Floats]] = []
     for fold in folds(len(begun), most=FOLDS):
-        rest = others(fold, len(begun))
+        rest = other_rows(fold, len(begun))
         probe = LinearProbe.fit(*(np.concatenate([each[row] for row in rest]) for each in (foreseen, truths)))
         for row in fold:
-            dreamt = _going(imagination.dream(begun[row], own=True)[0])
+            dreamt = _before_ends(imagination.dream(begun[row], own=True)[0])
             if not len(dreamt):
                 continue
             told = {"reality": truths[row], "foreseen": probe.predict(foreseen[row]), "dream": probe.predict(dreamt)}
@@ -71,12 +71,12 @@ def compare(
         raise UsageError("the dreams of all drives but one end as they begin: nothing of them can be told")
     found = {where: np.stack([each[where] for each in shares], axis=1) for where in shares[0]}
     return [
-        Alike(name, float(rare[row]), {where: Estimate.of(list(each[row])) for where, each in found.items()})
+        RareFrequency(name, float(rare[row]), {where: Estimate.of(list(each[row])) for where, each in found.items()})
         for row, name in enumerate(names)
     ]
 
 
-def _going(features: NDArray[np.float32]) -> NDArray[np.float32]:
+def _before_ends(features: NDArray[np.float32]) -> NDArray[np.float32]:
     """The steps `(steps, features)` of dreams `(dreams, steps, features)`, without those behind their ends.
 
     A dream that has ended stays as it was.
@@ -86,8 +86,8 @@ def _going(features: NDArray[np.float32]) -> NDArray[np.float32]:
     return going
 
 
-def _beginning(drive: WitnessedDrive, opening: int) -> Beginning | None:
+def _dream_segment(drive: DisturbedDrive, opening: int) -> DreamSegment | None:
     """The part of a drive behind its opening until it first leaves the road."""
     off = np.flatnonzero(drive.truth.get(OFF, np.zeros(len(drive)))[opening:] > 0)
     length = int(off[0]) if len(off) else len(drive) - opening
-    return Beginning(drive, opening, length) if length >= SHORTEST else None
+    return DreamSegment(drive, opening, length) if length >= SHORTEST else None

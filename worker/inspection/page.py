@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from dreamfleet.worker.inspection.section import Section
-
 STYLE = """
 body { margin: 2.5rem auto; max-width: 1100px; padding: 0 1.5rem; color: #1c2026; background: #fff;
   font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; }
@@ -51,3 +49,13 @@ def _section(section: Section) -> str:
         f'<section id="{escape(section.name)}">\n<h2>{escape(section.title)}</h2>\n<p>{escape(section.text)}</p>\n'
         f"{image}</section>\n"
     )
+
+
+@dataclass(frozen=True)
+class Section:
+    """A title, what to look for, and a picture (PNG) or none; `name` is its file's."""
+
+    name: str
+    title: str
+    text: str
+    picture: bytes | None = None

@@ -75,7 +75,7 @@ class LinearProbe:
 
 
 @dataclass(frozen=True)
-class LayeredProbe:
+class NetworkProbe:
     """One layer of tanh units on scaled features, by Adam on the squared error; the rate falls to 0 as a cosine."""
 
     inputs: Scale
@@ -83,17 +83,17 @@ class LayeredProbe:
     layers: tuple[Floats, ...]  # weights and biases of the layer, then of the output
 
     @classmethod
-    def fit(cls, features: Any, targets: Any, seed: int = 0) -> LayeredProbe:
+    def fit(cls, features: Any, targets: Any, seed: int = 0) -> NetworkProbe:
         """The same network for the same data and seed."""
         inputs, outputs = Scale.of(features), Scale.of(targets)
         x, y = (each.astype(np.float32) for each in (inputs.apply(features), outputs.apply(targets)))
         random = np.random.default_rng(seed)
-        layers = _begin(x.shape[1], y.shape[1], random)
+        layers = _initial_layers(x.shape[1], y.shape[1], random)
         moments = [(np.zeros_like(each), np.zeros_like(each)) for each in layers]
         for update in range(UPDATES):
             rows = random.integers(len(x), size=BATCH)
             rate = RATE * (1 + np.cos(np.pi * update / UPDATES)) / 2
-            _improve(layers, moments, _gradients(layers, x[rows], y[rows]), rate, update + 1)
+            _adam_step(layers, moments, _gradients(layers, x[rows], y[rows]), rate, update + 1)
         return cls(inputs, outputs, tuple(layers))
 
     def predict(self, features: Any) -> Floats:
@@ -103,7 +103,7 @@ class LayeredProbe:
         return self.outputs.undo(hidden @ second + last)
 
 
-def _begin(features: int, quantities: int, random: np.random.Generator) -> list[Any]:
+def _initial_layers(features: int, quantities: int, random: np.random.Generator) -> list[Any]:
     first = random.standard_normal((features, UNITS)) / np.sqrt(features)
     second = random.standard_normal((UNITS, quantities)) / np.sqrt(UNITS)
     layers = (first, np.zeros(UNITS), second, np.zeros(quantities))
@@ -119,7 +119,9 @@ def _gradients(layers: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
     return x.T @ back + DECAY * first, back.sum(axis=0), hidden.T @ error + DECAY * second, error.sum(axis=0)
 
 
-def _improve(layers: Sequence[Any], moments: Sequence[Any], gradients: Sequence[Any], rate: float, update: int) -> None:
+def _adam_step(
+    layers: Sequence[Any], moments: Sequence[Any], gradients: Sequence[Any], rate: float, update: int
+) -> None:
     """One step of Adam, in place."""
     for layer, (mean, square), gradient in zip(layers, moments, gradients, strict=True):
         mean[...] += (1 - MOMENTS[0]) * (gradient - mean)
@@ -134,6 +136,6 @@ def folds(drives: int, most: int = 4) -> list[list[int]]:
     return [list(range(part, drives, parts)) for part in range(parts)]
 
 
-def others(fold: Sequence[int], drives: int) -> list[int]:
+def other_rows(fold: Sequence[int], drives: int) -> list[int]:
     """The rows that are not in a fold."""
     return sorted(set(range(drives)) - set(fold))

@@ -7,8 +7,8 @@ from contextlib import suppress
 from typing import Any
 
 from dreamfleet.worker.inspection.knowledge import Knowledge
-from dreamfleet.worker.inspection.likeness import Alike
-from dreamfleet.worker.inspection.losses import CALM, Compared
+from dreamfleet.worker.inspection.likeness import RareFrequency
+from dreamfleet.worker.inspection.road_losses import CALM, RoadLossComparison
 
 BEGUN = {"0 steps before": "at the loss", CALM: "where nothing is lost"}  # where another word says it better
 HELD = {"z": "z", "zh": "[z, h]"}
@@ -38,7 +38,7 @@ def knowledge_text(knowledge: Knowledge) -> str:
     )
 
 
-def loss_rows(compared: Sequence[Compared]) -> list[dict[str, object]]:
+def loss_rows(compared: Sequence[RoadLossComparison]) -> list[dict[str, object]]:
     """A row a kind of beginning and figure: of reality, and of the dreams."""
     return [
         {"begun": BEGUN.get(each.begun, each.begun), "n": each.count, "mean": WHAT[figure]}
@@ -48,7 +48,7 @@ def loss_rows(compared: Sequence[Compared]) -> list[dict[str, object]]:
     ]
 
 
-def likeness_rows(compared: Sequence[Alike]) -> list[dict[str, str]]:
+def likeness_rows(compared: Sequence[RareFrequency]) -> list[dict[str, str]]:
     """A row a quantity: what is rare in reality, and how often it is exceeded there and in dreams."""
     return [
         {"quantity": each.quantity, "rare": f"above {each.rare:.3g}"}

@@ -10,13 +10,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.agent import TrainedAgent
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.controller import Controller
-from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.trained_agent import TrainedAgent
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.car_racing.agents import NetworkAgent
-from dreamfleet.worker.scoring.scorer import checked_world
-from dreamfleet.worker.tasks.api import ENVIRONMENTS_OWN, Assignment, Policy, Task, Truthful, World
+from dreamfleet.worker.scoring.scorer import find_checked_world
+from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Policy, Task, TaskWithTrueState, World
 from dreamfleet.worker.tasks.registry import find_task
 
 Floats = NDArray[np.float32]
@@ -67,23 +67,23 @@ class Agent(Protocol):
         """Tells the true state behind the last observation; `None` in a world that keeps it to itself."""
 
 
-def agent_of(controller: Controller | TrainedAgent, bundle: Bundle | None = None) -> Agent:
+def make_agent(controller: Controller | TrainedAgent, bundle: Bundle | None = None) -> Agent:
     """A controller, with its world model if it has one, or a trained agent, ready to drive.
 
     Errors of either kind, where it does not fit what is here, say what to do.
     """
     if isinstance(controller, TrainedAgent):
         return NetworkAgent(controller)
-    fitting = None if bundle is None else bundle.fitting(controller)
-    agent = EvolvedAgent(controller.sha256, spec_for(controller, bundle), controller.parameters, fitting)
-    checked_world(agent.assignment)
+    fitting = None if bundle is None else bundle.for_controller(controller)
+    agent = EvolvedAgent(controller.sha256, make_evaluation_spec(controller, bundle), controller.parameters, fitting)
+    find_checked_world(agent.assignment)
     return agent
 
 
-def spec_for(controller: Controller, bundle: Bundle | None) -> TaskSpec:
+def make_evaluation_spec(controller: Controller, bundle: Bundle | None) -> TaskSpec:
     """What a controller is judged in: whole episodes of its own task."""
     return TaskSpec(
-        controller.task, bundle.sha256 if bundle else "", horizon=ENVIRONMENTS_OWN, patience=0,
+        controller.task, bundle.sha256 if bundle else "", horizon=ENVIRONMENT_LIMIT, patience=0,
         controller=controller.shape, options=controller.options, version=controller.version,
     )  # fmt: skip
 
@@ -136,7 +136,7 @@ class EvolvedAgent:
     def truth(self) -> Truth | None:
         """As that world tells it."""
         reality = self._reality
-        return reality.truth if isinstance(reality, Truthful) else None
+        return reality.truth if isinstance(reality, TaskWithTrueState) else None
 
     @property
     def _task(self) -> Task:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.actions import Continuous
+from dreamfleet.common.artifacts.actions import Continuous
 
 Floats = NDArray[np.float32]
-KEPT = 0.9  # from step to step: at 50 steps a second it turns within a fifth of one
+CORRELATION = 0.9  # from step to step: at 50 steps a second it turns within a fifth of one
 
 
 class Disturbance:
@@ -23,16 +23,16 @@ class Disturbance:
     def next(self) -> Floats:
         """What is added to the next action `(1, actions)`."""
         fresh = self._random.standard_normal(len(self._value))
-        self._value = KEPT * self._value + (1 - KEPT**2) ** 0.5 * fresh
+        self._value = CORRELATION * self._value + (1 - CORRELATION**2) ** 0.5 * fresh
         push: Floats = (self._value * self._scale).astype(np.float32)[None]
         return push
 
     def apply(self, chosen: Floats, push: Floats) -> Floats:
         """The actions that are done."""
-        return pushed(self._actions, chosen, push)
+        return add_disturbance(self._actions, chosen, push)
 
 
-def pushed(actions: Continuous, chosen: Floats, push: Floats) -> Floats:
+def add_disturbance(actions: Continuous, chosen: Floats, push: Floats) -> Floats:
     """Chosen actions `(rows, actions)` with a push on top, within their bounds.
 
     What rests at a bound stays there: a brake that nobody touches would else slow every drive.

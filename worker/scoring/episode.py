@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from dreamfleet.worker.scoring.rollout import Rollout
 from dreamfleet.worker.tasks.api import Policy, Score
 
-STRAYS = 100  # steps off the course that an episode pays for at most: one that is lost is one loss, however long
+MAX_STRAYS = 100  # steps off the course that an episode pays for at most: one that is lost is one loss, however long
 
 
 @dataclass(frozen=True)
-class Course:
+class EpisodeConfig:
     """One episode: its seed, its steps at most, and when a hopeless one is cut (`patience` 0: never)."""
 
     seed: int
@@ -31,7 +31,7 @@ class Course:
     stray: str = ""  # the world's
 
 
-class Moment(NamedTuple):
+class Transition(NamedTuple):
     """One step that was made."""
 
     seen: Any  # the observation before the action
@@ -44,34 +44,34 @@ class Moment(NamedTuple):
     terminal: bool = False  # it ended for good, and was not only cut short by the environment's own limit
 
 
-Begin = Callable[[gymnasium.Env[Any, Any], Any], Any]
+ResetHook = Callable[[gymnasium.Env[Any, Any], Any], Any]
 """Changes an environment that was just reset, and its first observation; returns the new one."""
 
 
-def play(
-    environment: gymnasium.Env[Any, Any], policy: Policy, course: Course, begin: Begin | None = None
-) -> Iterator[Moment]:
+def run_episode(
+    environment: gymnasium.Env[Any, Any], policy: Policy, episode_config: EpisodeConfig, begin: ResetHook | None = None
+) -> Iterator[Transition]:
     """Make the episode's steps one by one, under a policy that has begun.
 
     It is over where the environment says so, after `horizon` steps, or after `patience` steps without a positive
     reward.
     """
-    observation, _ = environment.reset(seed=course.seed)
+    observation, _ = environment.reset(seed=episode_config.seed)
     if begin is not None:
         observation = begin(environment, observation)
     # Of a `Rewarded` policy; to ask `isinstance` of a protocol takes 70 microseconds, as long as some tasks' steps.
-    tell: Callable[[float], None] | None = getattr(policy, "reward", None)
+    report_reward: Callable[[float], None] | None = getattr(policy, "reward", None)
     idle, over = 0, False
-    for step in range(1, course.horizon + 1):
+    for step in range(1, episode_config.horizon + 1):
         seen, action = observation, policy.act(observation)
         observation, given, terminated, truncated, info = environment.step(action)
         reward = float(given)
-        if tell is not None:
-            tell(reward)
+        if report_reward is not None:
+            report_reward(reward)
         idle = 0 if reward > 0 else idle + 1
         ended = bool(terminated or truncated)
-        over = not ended and 0 < course.patience <= idle
-        yield Moment(seen, action, reward, step, ended, over, info, bool(terminated))
+        over = not ended and 0 < episode_config.patience <= idle
+        yield Transition(seen, action, reward, step, ended, over, info, bool(terminated))
         if ended or over:
             return
 
@@ -80,10 +80,10 @@ def score(
     environment: gymnasium.Env[Any, Any],
     policy: Policy,
     parameters: NDArray[np.float32],
-    course: Course,
+    episode_config: EpisodeConfig,
     on_step: Callable[[int], None] = lambda _steps: None,
     rollout: Rollout | None = None,
-    see: Callable[[Moment], None] | None = None,
+    on_transition: Callable[[Transition], None] | None = None,
 ) -> Score:
     """The episode's fitness: the sum of its rewards, in step order, in double precision.
 
@@ -97,22 +97,22 @@ def score(
         raise ValueError("the controller's parameters hold NaN or infinity")
     policy.begin(parameters)
     fitness, steps, strays, finished = 0.0, 0, 0, False
-    for moment in play(environment, policy, course):
+    for moment in run_episode(environment, policy, episode_config):
         fitness += moment.reward
         steps = moment.step
         if rollout is not None:
             rollout.add(moment.seen, moment.action, moment.reward)
             rollout.ended = moment.ended
-        if see is not None:
-            see(moment)
+        if on_transition is not None:
+            on_transition(moment)
         on_step(steps)
         if moment.cut:
-            fitness -= course.idle_cost * (course.horizon - steps)
-        strays += bool(course.stray_cost and moment.info.get(course.stray))
-        finished = moment.ended and bool(moment.info.get(course.finish))
-    if course.time_cost:
-        fitness -= course.time_cost * (steps if finished else course.horizon)
-    fitness -= course.stray_cost * min(strays, STRAYS)
+            fitness -= episode_config.idle_cost * (episode_config.horizon - steps)
+        strays += bool(episode_config.stray_cost and moment.info.get(episode_config.stray))
+        finished = moment.ended and bool(moment.info.get(episode_config.finish))
+    if episode_config.time_cost:
+        fitness -= episode_config.time_cost * (steps if finished else episode_config.horizon)
+    fitness -= episode_config.stray_cost * min(strays, MAX_STRAYS)
     if not math.isfinite(fitness):
         raise ValueError("the episode's rewards do not add up to a number")
     return Score(fitness, steps)

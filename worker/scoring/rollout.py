@@ -40,7 +40,7 @@ class Rollout:
             "preprocessing": np.array(self._preprocessing),
         }
 
-    def packed(self) -> bytes:
+    def to_bytes(self) -> bytes:
         """The compressed `.npz`."""
         file = io.BytesIO()
         write_episode(file, self.arrays())

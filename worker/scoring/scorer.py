@@ -11,40 +11,40 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.classes import class_of
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.fingerprint import fingerprint
-from dreamfleet.common.messages import Kind, TaskSpec
-from dreamfleet.common.variants import Variant
-from dreamfleet.worker.scoring.behaviour import Behaviour
-from dreamfleet.worker.scoring.episode import Course, score
+from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.protocol.host_classes import class_from_fingerprint
+from dreamfleet.common.protocol.messages import Kind, TaskSpec
+from dreamfleet.worker.scoring.episode import EpisodeConfig, score
+from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
 from dreamfleet.worker.scoring.rollout import Rollout
-from dreamfleet.worker.scoring.watched import WatchedPolicy
-from dreamfleet.worker.tasks.api import Assignment, Batch, Batched, Onlooker, Score, Task, Watchable, World
+from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
+from dreamfleet.worker.tasks.api import Assignment, Batch, BatchedTask, Score, StepObserver, Task, WatchableBatch, World
 from dreamfleet.worker.tasks.registry import find_task
 
-DRIVER = "controller"  # as a kept rollout names who drove
+DRIVER_NAME = "controller"  # as a kept rollout names who drove
 
 
 class Scorer:
     """Scores a slot's jobs.
 
-    >>> from dreamfleet.common.store import find_bundle
+    >>> from dreamfleet.common.artifacts.bundle_store import find_bundle
     >>> bundle = find_bundle("tiny")
     >>> scorer = Scorer(TaskSpec("car-racing", bundle.sha256, horizon=100, patience=0), bundle)  # doctest: +SKIP
     >>> scorer.score("score", np.zeros(867, np.float32), seed=2**20)  # doctest: +SKIP
     """
 
     def __init__(self, spec: TaskSpec, bundle: Bundle | None = None) -> None:
-        self.onlooker: Onlooker | None = None  # to be set between turns; `None` costs an episode nothing
+        self.observer: StepObserver | None = None  # to be set between turns; `None` costs an episode nothing
         task = find_task(spec.task)
-        fitting = None if bundle is None else bundle.under(spec.controller, Variant.of(spec.options))
+        fitting = None if bundle is None else bundle.with_controllers(spec.controller, Variant.from_json(spec.options))
         assignment = Assignment(spec, fitting)
-        self.world = checked_world(assignment)
+        self.world = find_checked_world(assignment)
         self.spec = spec
         self._batch_for: Callable[[TaskSpec], Batch] | None = None
-        if isinstance(task, Batched):
+        if isinstance(task, BatchedTask):
             make = task.make_batch
             # One is kept: a run's terms change now and then, and making a batch takes milliseconds.
             self._batch_for = lru_cache(maxsize=1)(lambda each: make(Assignment(each, assignment.bundle)))
@@ -70,20 +70,22 @@ class Scorer:
     ) -> list[Score]:  # fmt: skip
         """A turn's jobs, as `score` does; `on_step` hears of all steps made so far."""
         if (batch := self._batch([kind for kind, _, _ in jobs], spec)) is not None:
-            if self.onlooker is not None and isinstance(batch, Watchable):
-                batch = batch.watched(self.onlooker)
+            if self.observer is not None and isinstance(batch, WatchableBatch):
+                batch = batch.watched(self.observer)
             return batch.score([(parameters, seed) for _, parameters, seed in jobs], on_step)
         scores: list[Score] = []
         for kind, parameters, seed in jobs:
             before = sum(each.steps for each in scores)
 
-            def move(done: int, before: int = before) -> None:
+            def report_steps(done: int, before: int = before) -> None:
                 on_step(before + done)
 
             if (alone := self._batch((kind,), spec)) is not None:
-                scores += alone.score([(parameters, seed)], move)
+                scores += alone.score([(parameters, seed)], report_steps)
             else:
-                scores.append(self._drive(len(scores), parameters, self.course(kind, seed, spec), move))
+                scores.append(
+                    self._run_episode(len(scores), parameters, self.episode_config(kind, seed, spec), report_steps)
+                )
         return scores
 
     def collect(
@@ -91,9 +93,9 @@ class Scorer:
         spec: TaskSpec | None = None,
     ) -> tuple[Score, Rollout]:  # fmt: skip
         """An episode as candidates drive it, and what happened in it, failures included; `spec` as in `score`."""
-        rollout = Rollout(DRIVER, self._preprocessing)
-        course = self.course("collect", seed, spec)
-        return self._drive(0, parameters, course, on_step, rollout), rollout
+        rollout = Rollout(DRIVER_NAME, self._preprocessing)
+        episode_config = self.episode_config("collect", seed, spec)
+        return self._run_episode(0, parameters, episode_config, on_step, rollout), rollout
 
     @property
     def drawn_by(self) -> str:
@@ -107,22 +109,22 @@ class Scorer:
         Where nobody may look, or the task fails at it, the host's fingerprint tells it.
         """
         steps = getattr(self._task, "probe_steps", Task.probe_steps)
-        found, size = Behaviour(), self._assignment.controller.size
+        found, size = HostClassProbe(), self._assignment.controller.size
         with suppress(Exception):  # a job that is to be scored will tell what is wrong, and to whom it matters
             if steps > 0:
-                found.drive(self._environment, self._policy, size, steps)
+                found.add_episode(self._environment, self._policy, size, steps)
                 if self._batch_for is not None:
-                    found.score(self._batch_for(self.spec.at(horizon=steps)), size)
+                    found.add_batch(self._batch_for(self.spec.with_overrides(horizon=steps)), size)
                 return found.host_class
-        return class_of(fingerprint(self.world.packages))
+        return class_from_fingerprint(fingerprint(self.world.packages))
 
-    def course(self, kind: Kind, seed: int, spec: TaskSpec | None = None) -> Course:
+    def episode_config(self, kind: Kind, seed: int, spec: TaskSpec | None = None) -> EpisodeConfig:
         """The episode that a job of this kind and seed is, in the run's specification or in `spec`."""
         if kind == "evaluate":
-            return Course(seed, self.world.horizon)
+            return EpisodeConfig(seed, self.world.horizon)
         spec, world = spec or self.spec, self.world
         time_cost, stray_cost = (world.time_cost, world.stray_cost) if kind == "score" else (0.0, 0.0)
-        return Course(
+        return EpisodeConfig(
             seed, spec.horizon, spec.patience, world.idle_cost, time_cost, world.finish, stray_cost, world.stray
         )
 
@@ -139,27 +141,31 @@ class Scorer:
         if (shown := self.__dict__.get("_shown")) is not None:  # nobody may have looked on
             shown.close()
 
-    def _drive(
-        self, episode: int, parameters: NDArray[np.float32], course: Course, on_step: Callable[[int], None],
+    def _run_episode(
+        self,
+        episode: int,
+        parameters: NDArray[np.float32],
+        episode_config: EpisodeConfig,
+        on_step: Callable[[int], None],
         rollout: Rollout | None = None,
-    ) -> Score:  # fmt: skip
+    ) -> Score:
         """Drive an episode, the one of this place in the turn, before the onlooker's eyes if there is one."""
-        if self.onlooker is None:
-            return score(self._environment, self._policy, parameters, course, on_step, rollout)
-        shown = self._shown
-        policy = WatchedPolicy(self._policy, self.onlooker, episode, None if shown is None else shown.render)
+        if self.observer is None:
+            return score(self._environment, self._policy, parameters, episode_config, on_step, rollout)
+        shown = self._watched_environment
+        policy = WatchedPolicy(self._policy, self.observer, episode, None if shown is None else shown.render)
         environment = self._environment if shown is None else shown
-        return score(environment, policy, parameters, course, on_step, rollout)
+        return score(environment, policy, parameters, episode_config, on_step, rollout)
 
     @cached_property
-    def _shown(self) -> gymnasium.Env[Any, Any] | None:
+    def _watched_environment(self) -> gymnasium.Env[Any, Any] | None:
         """What is scored in while somebody looks on, if that is another environment; one that cannot be had is none."""
         with suppress(Exception):
             return self._task.make_shown(self._assignment)
         return None
 
 
-def checked_world(assignment: Assignment) -> World:
+def find_checked_world(assignment: Assignment) -> World:
     """The world that is scored in; `UsageError` where the task is of another version here."""
     spec, world = assignment.spec, find_task(assignment.spec.task).world_of(assignment)
     if world.version != spec.version:

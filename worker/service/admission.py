@@ -14,17 +14,20 @@ from dataclasses import dataclass, replace
 
 import zenoh
 
-from dreamfleet.common import keys
-from dreamfleet.common.asking import ask_all, ask_everybody
-from dreamfleet.common.codec import Inbox, MalformedError, encode_json, from_plain
 from dreamfleet.common.errors import RefusedError, UsageError
-from dreamfleet.common.fingerprint import NUMERIC_PACKAGES, fingerprint, package_version
-from dreamfleet.common.messages import MAX_TEXT, HelloReply, HelloRequest, Intervals, TaskSpec
+from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES, fingerprint
+from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import one_line
-from dreamfleet.worker.service.announced import check_announced
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import CountingDecoder, encode_json
+from dreamfleet.common.protocol.messages import HelloReply, HelloRequest, Intervals, TaskSpec
+from dreamfleet.common.serialization.constraints import MAX_TEXT
+from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.transport.query import query_all, query_every_responder
+from dreamfleet.worker.service.task_allowlist import check_task_allowed
 
 HELLO_TIMEOUT = 2.0
-MOST_TOLD = 8  # runs by name
+MAX_RUNS_LISTED = 8  # runs by name
 
 
 @dataclass(frozen=True)
@@ -42,12 +45,12 @@ class Admission:
     classes: bool = False  # whether the coordinator knows classes of hosts
 
 
-def ask(
+def request_admission(
     session: zenoh.Session,
     run: str | None,
     request: HelloRequest,
-    inbox: Inbox,
-    joined: str = "",
+    inbox: CountingDecoder,
+    joined_run_uid: str = "",
     *,
     secured: bool = False,
 ) -> Admission | None:
@@ -59,50 +62,56 @@ def ask(
     In a `secured` fleet it is said under this worker's own name.
     Where the run's fingerprint names other packages than the request's, hello is said again about those.
     """
-    reply = _say(session, run, request, inbox, joined, secured=secured)
+    reply = _send_hello(session, run, request, inbox, joined_run_uid, secured=secured)
     if reply is not None and not reply.accepted and reply.packages != request.packages:
         named = fingerprint(reply.packages)[:MAX_TEXT]  # the packages that they name are theirs to choose
         about = replace(request, packages=reply.packages, fingerprint=named)
-        reply = _say(session, reply.run, about, inbox, joined, secured=secured)
+        reply = _send_hello(session, reply.run, about, inbox, joined_run_uid, secured=secured)
     if reply is None:
         return None
-    admission = _admission(reply)
-    check_announced(admission.spec.task, request.tasks)
+    admission = _read_admission(reply)
+    check_task_allowed(admission.spec.task, request.tasks)
     return admission
 
 
-def _say(
-    session: zenoh.Session, run: str | None, request: HelloRequest, inbox: Inbox, joined: str, *, secured: bool
+def _send_hello(
+    session: zenoh.Session,
+    run: str | None,
+    request: HelloRequest,
+    inbox: CountingDecoder,
+    joined_run_uid: str,
+    *,
+    secured: bool,
 ) -> HelloReply | None:
-    key = keys.hello_of(run or "*", request.worker) if secured else keys.hello(run or "*")
+    key = keys.secured_hello(run or "*", request.worker) if secured else keys.hello(run or "*")
     replies = []
-    for _, payload in ask_everybody(session, [key], HELLO_TIMEOUT, encode_json(request)):
+    for _, payload in query_every_responder(session, [key], HELLO_TIMEOUT, encode_json(request)):
         reply = inbox.decode_json(HelloReply, payload)
-        if reply is not None and _is_of(reply, run):
+        if reply is not None and _is_reply_of(reply, run):
             replies.append(reply)
-            if reply.accepted and reply.run_uid == joined:  # nobody is to keep it waiting by not answering
+            if reply.accepted and reply.run_uid == joined_run_uid:  # nobody is to keep it waiting by not answering
                 break
     if not replies:
         return None
     if len(names := sorted({reply.run for reply in replies})) > 1:
-        raise RefusedError(f"several runs are live: choose one with --run: {', '.join(names[:MOST_TOLD])}")
-    return max(replies, key=lambda reply: (reply.run_uid == joined, reply.accepted, random.random()))  # noqa: S311
+        raise RefusedError(f"several runs are live: choose one with --run: {', '.join(names[:MAX_RUNS_LISTED])}")
+    return max(replies, key=lambda reply: (reply.run_uid == joined_run_uid, reply.accepted, random.random()))  # noqa: S311
 
 
-def _is_of(reply: HelloReply, run: str | None) -> bool:
+def _is_reply_of(reply: HelloReply, run: str | None) -> bool:
     """Whether an answer is of `run`, or of any at all: what else answers is nobody's coordinator."""
     with suppress(UsageError):
         return keys.check_run_name(reply.run) == (run or reply.run)
     return False
 
 
-def neediest(session: zenoh.Session, without: Collection[str] = ()) -> str | None:
+def find_run_with_fewest_slots(session: zenoh.Session, excluded: Collection[str] = ()) -> str | None:
     """The live run that works with the fewest slots; of equals the first by name. Those in `without` are left out."""
     found = []
-    for payload in ask_all(session, [keys.status("*")], HELLO_TIMEOUT):
+    for payload in query_all(session, [keys.status("*")], HELLO_TIMEOUT):
         with suppress(ValueError, KeyError, TypeError):  # what answers need not be of this version
             document = json.loads(payload)
-            if document["state"] not in ("ended", "paused") and document["run"] not in without:
+            if document["state"] not in ("ended", "paused") and document["run"] not in excluded:
                 found.append((int(document["slots"]), str(document["run"])))
     return min(found)[1] if found else None
 
@@ -120,7 +129,7 @@ def make_request(worker: str, tasks: tuple[str, ...], slots: int) -> HelloReques
     )
 
 
-def _admission(reply: HelloReply) -> Admission:
+def _read_admission(reply: HelloReply) -> Admission:
     if not reply.accepted:
         raise RefusedError(one_line(f"run {reply.run} refused this worker: {reply.why}; {reply.remedy}"))
     try:

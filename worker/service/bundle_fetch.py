@@ -14,26 +14,26 @@ from time import sleep
 
 import zenoh
 
-from dreamfleet.common import keys
-from dreamfleet.common.asking import ask_everybody
-from dreamfleet.common.bundle import MAX_BUNDLE, Bundle
-from dreamfleet.common.codec import Inbox
-from dreamfleet.common.controller import Controller
+from dreamfleet.common.artifacts.bundle import MAX_BUNDLE, Bundle
+from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import BundleError, DownloadError
-from dreamfleet.common.files import open_growing
-from dreamfleet.common.messages import MAX_PART, BundlePart
-from dreamfleet.common.store import BundleStore, default_cache
+from dreamfleet.common.files.regular_files import open_append
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import CountingDecoder
+from dreamfleet.common.protocol.messages import MAX_PART, BundlePart
+from dreamfleet.common.transport.query import query_every_responder
 
 log = logging.getLogger(__name__)
 WINDOW = 8  # queries in flight: enough to fill a link with a long way
-ATTEMPTS = 3  # damaged downloads before giving up
-SILENCES = 20  # rounds without progress before giving up
+MAX_ATTEMPTS = 3  # damaged downloads before giving up
+MAX_ROUNDS_WITHOUT_PROGRESS = 20  # rounds without progress before giving up
 QUERY_TIMEOUT = 3.0
 PAUSE = 0.5  # seconds after a round without progress
 
 
-def obtain(
-    session: zenoh.Session, run: str, sha256: str, store: BundleStore, inbox: Inbox,
+def fetch_bundle(
+    session: zenoh.Session, run: str, sha256: str, store: BundleStore, inbox: CountingDecoder,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Bundle | None:  # fmt: skip
     """The bundle from the cache, or fetched from the coordinator; `None` if `stopped`, what has come stays.
@@ -43,42 +43,44 @@ def obtain(
     bundle = store.find(sha256)
     if bundle is not None:
         return bundle
-    liars: set[str] = set()  # who gave bytes that were not of the hash
-    with store.downloading(sha256) as path:
-        for attempt in range(1, ATTEMPTS + 1):
+    corrupt_sources: set[str] = set()  # who gave bytes that were not of the hash
+    with store.lock_download(sha256) as path:
+        for attempt in range(1, MAX_ATTEMPTS + 1):
             if (bundle := store.find(sha256)) is not None:  # another worker of this host was faster
                 return bundle
             try:
                 anew = not path.exists() or path.stat().st_size == 0
-                sources = _download(session, keys.bundle(run, sha256), sha256, path, inbox, stopped, liars)
+                sources = _download(session, keys.bundle(run, sha256), sha256, path, inbox, stopped, corrupt_sources)
             except OSError as error:  # what has come stays, and the next worker goes on from there
-                raise store.unwritable(error) from error
+                raise store.write_error(error) from error
             if stopped():
                 return None
             try:
-                bundle = store.complete(sha256)
+                bundle = store.finish_download(sha256)
             except BundleError as error:
-                log.warning("attempt %d of %d: %s", attempt, ATTEMPTS, error)
+                log.warning("attempt %d of %d: %s", attempt, MAX_ATTEMPTS, error)
                 if anew and len(sources) == 1:  # else nobody knows whose bytes they were
-                    liars |= sources
+                    corrupt_sources |= sources
                 continue
             log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6)
             return bundle
-    raise DownloadError(f"the bundle {sha256[:12]}... arrived damaged {ATTEMPTS} times: check the coordinator's copy")
+    raise DownloadError(
+        f"the bundle {sha256[:12]}... arrived damaged {MAX_ATTEMPTS} times: check the coordinator's copy"
+    )
 
 
-def fetch_for(controller: Controller, session: zenoh.Session, run: str) -> Bundle | None:
+def fetch_bundle_of(controller: Controller, session: zenoh.Session, run: str) -> Bundle | None:
     """The world model of a controller that `run` reports: cached, shipped, or fetched; `None` if it needs none."""
     if not controller.bundle:
         return None
-    bundle = obtain(session, run, controller.bundle, BundleStore(default_cache()), Inbox())
+    bundle = fetch_bundle(session, run, controller.bundle, BundleStore(default_cache()), CountingDecoder())
     assert bundle is not None  # nobody stops it
-    return bundle.fitting(controller)
+    return bundle.for_controller(controller)
 
 
 def _download(
-    session: zenoh.Session, key: str, sha256: str, path: Path, inbox: Inbox, stopped: Callable[[], bool],
-    liars: Collection[str],
+    session: zenoh.Session, key: str, sha256: str, path: Path, inbox: CountingDecoder, stopped: Callable[[], bool],
+    corrupt_sources: Collection[str],
 ) -> set[str]:  # fmt: skip
     """Append to `path` until it is as long as the bundle, or `stopped`; whose parts they were.
 
@@ -87,15 +89,15 @@ def _download(
     """
     total, silences, source = None, 0, ""
     sources: set[str] = set()
-    with open_growing(path) as file:
+    with open_append(path) as file:
         while (total is None or file.tell() < total) and not stopped():
             before = file.tell()
             offsets = [before + index * MAX_PART for index in range(WINDOW if total else 1)]
             wanted = [each for each in offsets if total is None or each < total]
-            parts = _ask(session, key, sha256, wanted, inbox, stopped, source)
-            source = source or _choose(parts, liars)
+            parts = _query_parts(session, key, sha256, wanted, inbox, stopped, source)
+            source = source or _choose_source(parts, corrupt_sources)
             for part in sorted(parts.get(source, []), key=lambda part: part.offset):
-                total = _length(part) if total is None else total
+                total = _checked_length(part) if total is None else total
                 if part.total == total and part.offset == file.tell() and part.offset + len(part.data) <= total:
                     file.write(part.data)
                     sources.add(source)
@@ -107,18 +109,18 @@ def _download(
             else:
                 silences, total, source = silences + 1, None, ""  # which was perhaps of something else
                 sleep(PAUSE)
-            if silences >= SILENCES:
+            if silences >= MAX_ROUNDS_WITHOUT_PROGRESS:
                 raise DownloadError("the coordinator no longer answers for its bundle: ask for it later")
     return sources
 
 
-def _choose(parts: Collection[str], liars: Collection[str]) -> str:
+def _choose_source(parts: Collection[str], corrupt_sources: Collection[str]) -> str:
     """One of those who answer, at random: nobody is sure to be first."""
-    known = sorted(set(parts) - set(liars)) or sorted(parts)
+    known = sorted(set(parts) - set(corrupt_sources)) or sorted(parts)
     return random.choice(known) if known else ""  # noqa: S311 - no secret
 
 
-def _length(part: BundlePart) -> int:
+def _checked_length(part: BundlePart) -> int:
     """How long the bundle is; `DownloadError` before more is written than a bundle may be."""
     if part.total > MAX_BUNDLE:
         raise DownloadError(
@@ -128,14 +130,19 @@ def _length(part: BundlePart) -> int:
     return part.total
 
 
-def _ask(
-    session: zenoh.Session, key: str, sha256: str, offsets: list[int], inbox: Inbox, stopped: Callable[[], bool],
+def _query_parts(
+    session: zenoh.Session,
+    key: str,
+    sha256: str,
+    offsets: list[int],
+    inbox: CountingDecoder,
+    stopped: Callable[[], bool],
     source: str,
-) -> dict[str, list[BundlePart]]:  # fmt: skip
+) -> dict[str, list[BundlePart]]:
     """Parts of this bundle by who gave them; without waiting for others once `source` has given all."""
     selectors = [f"{key}?offset={offset};length={MAX_PART}" for offset in offsets]
     parts: dict[str, list[BundlePart]] = {}
-    for who, payload in ask_everybody(session, selectors, QUERY_TIMEOUT, stopped=stopped):
+    for who, payload in query_every_responder(session, selectors, QUERY_TIMEOUT, stopped=stopped):
         part = inbox.decode(BundlePart, payload)
         if part is not None and part.sha256.hex() == sha256:
             parts.setdefault(who, []).append(part)

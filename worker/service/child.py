@@ -12,19 +12,19 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.children import die_with
-from dreamfleet.common.unblocked import unblock_stderr, unblock_stdout
+from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking, make_stdout_nonblocking
+from dreamfleet.common.host.parent_death import exit_with_parent
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from pathlib import Path
 
-    from dreamfleet.common.messages import TaskSpec
+    from dreamfleet.common.protocol.messages import TaskSpec
     from dreamfleet.worker.scoring.scorer import Scorer
 
 
 @dataclass(frozen=True)
-class Ready:
+class ChildReady:
     """A child's first word: it can score, who draws its picture, and of which class its host is."""
 
     drawn_by: str
@@ -32,60 +32,62 @@ class Ready:
 
 
 def serve_jobs(
-    pipe: Connection[Any, Any], steps: Any, abandoned: Any, shown: Any, spec: TaskSpec, bundle: Path | None,
-    announced: tuple[str, ...], parent: int,
+    pipe: Connection[Any, Any], steps: Any, abandoned: Any, is_watched: Any, spec: TaskSpec, bundle: Path | None,
+    allowed_tasks: tuple[str, ...], parent: int,
 ) -> None:  # fmt: skip
     """Score jobs from the pipe until it closes. `steps`, `abandoned` and `shown` are shared with the parent.
 
     Nothing is imported for a task that is not among the `announced` ones.
     """
-    die_with(parent)
+    exit_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker decides; Ctrl-C reaches the whole group
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     with suppress(OSError, AttributeError, ValueError, RuntimeError):  # no stderr: no traceback of a crash
         faulthandler.enable()
-    unblock_stderr()  # whose reader is the worker's, and may be gone to sleep
-    unblock_stdout()
+    make_stderr_nonblocking()  # whose reader is the worker's, and may be gone to sleep
+    make_stdout_nonblocking()
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    scorer = _make_scorer(pipe, spec, bundle, announced)
-    pipe.send(Ready(scorer.drawn_by, scorer.host_class))
-    _take_turns(pipe, scorer, steps, abandoned, shown)
+    scorer = _make_scorer(pipe, spec, bundle, allowed_tasks)
+    pipe.send(ChildReady(scorer.drawn_by, scorer.host_class))
+    _score_groups(pipe, scorer, steps, abandoned, is_watched)
 
 
-def _make_scorer(pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None, announced: tuple[str, ...]) -> Scorer:
+def _make_scorer(
+    pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None, allowed_tasks: tuple[str, ...]
+) -> Scorer:
     """Load task and world model; what keeps them from loading is this child's last word."""
-    from dreamfleet.common.bundle import Bundle
+    from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.worker.scoring.scorer import Scorer
-    from dreamfleet.worker.service.announced import check_announced, check_world
-    from dreamfleet.worker.service.turn import Failure
+    from dreamfleet.worker.service.job_group import ScoringFailure
+    from dreamfleet.worker.service.task_allowlist import check_task_allowed, check_world_allowed
 
     try:
-        check_announced(spec.task, announced)
+        check_task_allowed(spec.task, allowed_tasks)
         if bundle is None:
             return Scorer(spec)
         opened = Bundle.open(bundle, spec.bundle)
-        check_world(opened, announced)
+        check_world_allowed(opened, allowed_tasks)
         return Scorer(spec, opened)
     except Exception as error:
-        pipe.send(Failure.of(error))
+        pipe.send(ScoringFailure.of(error))
         raise SystemExit(1) from error
 
 
-def _take_turns(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandoned: Any, shown: Any) -> None:
-    from dreamfleet.worker.service.glimpses import Sampler
-    from dreamfleet.worker.service.turn import AbandonedError, do_turn
+def _score_groups(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandoned: Any, is_watched: Any) -> None:
+    from dreamfleet.worker.service.frame_sampler import FrameSampler
+    from dreamfleet.worker.service.job_group import AbandonedError, score_group
 
-    sampler = Sampler(pipe.send, lambda: bool(shown.value))
+    sampler = FrameSampler(pipe.send, lambda: bool(is_watched.value))
     while True:
         try:
-            turn, work = pipe.recv()
+            group, work = pipe.recv()
         except EOFError:
             return
 
         def count(made: int) -> None:
             steps.value = made
-            if abandoned[turn % 2] == turn:  # noqa: B023 - called within this round
+            if abandoned[group % 2] == group:  # noqa: B023 - called within this round
                 raise AbandonedError
 
-        scorer.onlooker = sampler.of(turn) if shown.value else None
-        pipe.send(do_turn(scorer, turn, work, count))
+        scorer.observer = sampler.for_group(group) if is_watched.value else None
+        pipe.send(score_group(scorer, group, work, count))

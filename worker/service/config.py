@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dreamfleet.common.config import option
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.keys import check_run_name, check_worker_name
-from dreamfleet.common.messages import MAX_LEASES
+from dreamfleet.common.protocol.keys import check_run_name, check_worker_name
+from dreamfleet.common.protocol.messages import MAX_LEASES
 
 
 @dataclass(frozen=True)

@@ -15,22 +15,28 @@ from typing import Any
 
 import zenoh
 
-from dreamfleet.common import keys
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.codec import Inbox
-from dreamfleet.common.cores import cores
-from dreamfleet.common.credentials import seated
-from dreamfleet.common.errors import AccessError, ConnectionFailedError, DownloadError, NotLetInError, RefusedError
-from dreamfleet.common.session import Network, open_session
-from dreamfleet.common.store import BundleStore, default_cache
-from dreamfleet.worker.service.admission import Admission, ask, make_request, neediest
-from dreamfleet.worker.service.announced import check_world
-from dreamfleet.worker.service.bundle_fetch import obtain
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
+from dreamfleet.common.errors import (
+    AccessError,
+    ConnectionFailedError,
+    DownloadError,
+    HandshakeRejectedError,
+    RefusedError,
+)
+from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import CountingDecoder
+from dreamfleet.common.security.credentials import add_seat_to_name
+from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.worker.service.admission import Admission, find_run_with_fewest_slots, make_request, request_admission
+from dreamfleet.worker.service.bundle_fetch import fetch_bundle
 from dreamfleet.worker.service.config import WorkerConfig
-from dreamfleet.worker.service.joined import JoinedRun, Line
-from dreamfleet.worker.service.membership import Membership, Terms
-from dreamfleet.worker.service.refusals import ALONE, Refusals
-from dreamfleet.worker.service.slots import Slots
+from dreamfleet.worker.service.membership import LeaveConditions, Membership
+from dreamfleet.worker.service.refusal_backoff import SINGLE_RUN_DELAYS, RefusalBackoff
+from dreamfleet.worker.service.run_session import CoordinatorLink, RunSession
+from dreamfleet.worker.service.slot_pool import SlotPool
+from dreamfleet.worker.service.task_allowlist import check_world_allowed
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
 
 log = logging.getLogger(__name__)
@@ -45,19 +51,21 @@ class Worker:
             find_task(
                 name
             )  # one that cannot be loaded is an error now, and not once a run has taken this worker's word
-        self.identity = keys.new_worker(config.name)
+        self.identity = keys.new_worker_identity(config.name)
         if network.credentials is not None:
             label, _, life = self.identity.partition("/")
-            self.identity = f"{seated(label, network.credentials)}/{life}"
-        self.inbox = Inbox()
+            self.identity = f"{add_seat_to_name(label, network.credentials)}/{life}"
+        self.inbox = CountingDecoder()
         self._config = config
         self._network = network
-        self._slot_count = config.slots or cores()
+        self._slot_count = config.slots or usable_cores()
         self._hello = make_request(self.identity, (*known_tasks(), *tasks), self._slot_count)
-        lifetime = min(config.lifetime or math.inf, self._good_for)
-        terms = Terms(lifetime, config.drain_timeout, leaves_alone=config.exit_when_done or config.any)
+        lifetime = min(config.lifetime or math.inf, self._seconds_until_expiry)
+        terms = LeaveConditions(
+            lifetime, config.drain_timeout, leaves_without_coordinator=config.exit_when_done or config.any
+        )
         self._membership = Membership(terms, monotonic())
-        self._refusals = Refusals() if config.any else Refusals(*ALONE)
+        self._refusals = RefusalBackoff() if config.any else RefusalBackoff(*SINGLE_RUN_DELAYS)
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
 
     def stop(self) -> None:
@@ -74,25 +82,27 @@ class Worker:
             finally:
                 session.close()  # type: ignore[no-untyped-call]
         who = self._network.credentials
-        if who is not None and self._good_for <= 0:
+        if who is not None and self._seconds_until_expiry <= 0:
             raise AccessError(
                 f"the join file of {who.identity} ({who.name}) ends at {who.expires:%Y-%m-%d %H:%M} UTC: have it "
                 "issued again, and start this worker with that"
             )
 
     @property
-    def _good_for(self) -> float:
+    def _seconds_until_expiry(self) -> float:
         """Seconds until it had better drain, for links are closed as a join file ends."""
         who = self._network.credentials
-        return math.inf if who is None else who.left(datetime.now(UTC)).total_seconds() - self._config.drain_timeout
+        return (
+            math.inf if who is None else who.time_left(datetime.now(UTC)).total_seconds() - self._config.drain_timeout
+        )
 
     def _startup(self) -> zenoh.Session | None:
         """A session, however long the router takes to come up; `None` if it shall leave meanwhile."""
         times: Counter[str] = Counter()
-        while not self._leaving():
+        while not self._is_leaving():
             try:
                 return open_session(self._network)
-            except NotLetInError as error:
+            except HandshakeRejectedError as error:
                 why, telling = f"{error}; trying again", 2  # a coordinator that has just come up lets it in next time
             except ConnectionFailedError:
                 why, telling = f"waiting for a coordinator at {', '.join(self._network.connect)}", 1
@@ -104,43 +114,45 @@ class Worker:
 
     def _main_loop(self, session: zenoh.Session) -> None:
         """One run, or one after another."""
-        line = Line(session, self.identity, self.inbox, lambda *of: self._ask(session, *of), _jittered_retry)
+        link = CoordinatorLink(
+            session, self.identity, self.inbox, lambda *of: self._request_admission(session, *of), _jittered_retry
+        )
         while (admission := self._join(session)) is not None:
             try:
-                self._serve_run(line, admission)
+                self._serve_run(link, admission)
             except (RefusedError, DownloadError) as error:
-                self._take_refusal(admission.run, error)
+                self._handle_refusal(admission.run, error)
             else:
                 if not self._config.any:
                     return
 
-    def _serve_run(self, line: Line, admission: Admission) -> None:
+    def _serve_run(self, link: CoordinatorLink, admission: Admission) -> None:
         """Work for a run until it is over, or until this worker leaves."""
         bundle = None
-        if admission.spec.bundle and (bundle := self._obtain_bundle(line.session, admission)) is None:
+        if admission.spec.bundle and (bundle := self._fetch_bundle(link.session, admission)) is None:
             return
         # A queue of its own: what slots and coordinators of the last run still say must not pass for this one's.
         self._events = queue.SimpleQueue()
         with ExitStack() as stack:
             memory, path = self._config.slot_memory << 20, bundle.path if bundle else None
             if bundle is not None:
-                check_world(bundle, self._hello.tasks)
-            slots = Slots(
+                check_world_allowed(bundle, self._hello.tasks)
+            slots = SlotPool(
                 self._slot_count, admission.spec, path, self._events, self._hello.tasks, memory,
-                lambda: self._obtain_bundle(line.session, admission) if bundle else None,
+                lambda: self._fetch_bundle(link.session, admission) if bundle else None,
             )  # fmt: skip
             stack.callback(slots.stop)
-            self._refusals.forgive(self._refuser(admission.run))
-            JoinedRun(line, admission, self._membership, slots, self._events).serve()
+            self._refusals.forget(self._refusal_key(admission.run))
+            RunSession(link, admission, self._membership, slots, self._events).serve()
 
     def _join(self, session: zenoh.Session) -> Admission | None:
         """A run that has welcomed this worker; `None` if it shall leave meanwhile."""
         said = False
-        while not self._leaving():
-            admission = self._ask_neediest(session) if self._config.any else self._ask_own(session)
+        while not self._is_leaving():
+            admission = self._request_any_run(session) if self._config.any else self._request_configured_run(session)
             if admission is not None:
                 return admission
-            if not said and not self._refusals.standing(monotonic()):
+            if not said and not self._refusals.refusing_runs(monotonic()):
                 awaited = f"run {self._config.run}" if self._config.run else "a run"
                 barred = "; if it is served already, this join file was revoked" if self._network.credentials else ""
                 log.warning("waiting for %s%s", awaited, barred)
@@ -148,51 +160,53 @@ class Worker:
             self._pause()
         return None
 
-    def _ask_own(self, session: zenoh.Session) -> Admission | None:
-        if self._refusals.standing(monotonic()):
+    def _request_configured_run(self, session: zenoh.Session) -> Admission | None:
+        if self._refusals.refusing_runs(monotonic()):
             return None
         try:
-            return self._ask(session, self._config.run)
+            return self._request_admission(session, self._config.run)
         except RefusedError as error:
-            self._take_refusal("", error)
+            self._handle_refusal("", error)
             return None
 
-    def _ask_neediest(self, session: zenoh.Session) -> Admission | None:
-        run = neediest(session, self._refusals.standing(monotonic()))
+    def _request_any_run(self, session: zenoh.Session) -> Admission | None:
+        run = find_run_with_fewest_slots(session, self._refusals.refusing_runs(monotonic()))
         try:
-            return None if run is None else self._ask(session, run)
+            return None if run is None else self._request_admission(session, run)
         except RefusedError as error:
-            self._take_refusal(str(run), error)
+            self._handle_refusal(str(run), error)
             return None
 
-    def _take_refusal(self, run: str, error: RefusedError | DownloadError) -> None:
+    def _handle_refusal(self, run: str, error: RefusedError | DownloadError) -> None:
         """A refusal ends only a worker that shall leave when it is done; any other asks again, ever later."""
         if self._config.exit_when_done:
             raise error
-        refuser = self._refuser(run)
+        refuser = self._refusal_key(run)
         pause = self._refusals.add(refuser, monotonic())
         if self._refusals.is_news(refuser, str(error)):
             log.warning("%s; asking again in %.0f s, and then ever later", error, pause)
 
-    def _refuser(self, run: str) -> str:
+    def _refusal_key(self, run: str) -> str:
         """Under which name a refusal is remembered: a worker of one run has one that may refuse."""
         return run if self._config.any else ""
 
-    def _ask(self, session: zenoh.Session, run: str | None, host_class: str = "", joined: str = "") -> Admission | None:
+    def _request_admission(
+        self, session: zenoh.Session, run: str | None, host_class: str = "", joined_run_uid: str = ""
+    ) -> Admission | None:
         request, secured = replace(self._hello, host_class=host_class), self._network.credentials is not None
-        return ask(session, run, request, self.inbox, joined, secured=secured)
+        return request_admission(session, run, request, self.inbox, joined_run_uid, secured=secured)
 
-    def _obtain_bundle(self, session: zenoh.Session, admission: Admission) -> Bundle | None:
+    def _fetch_bundle(self, session: zenoh.Session, admission: Admission) -> Bundle | None:
         store = BundleStore(default_cache())
-        return obtain(session, admission.run, admission.spec.bundle, store, self.inbox, stopped=self._leaving)
+        return fetch_bundle(session, admission.run, admission.spec.bundle, store, self.inbox, stopped=self._is_leaving)
 
-    def _leaving(self) -> bool:
-        return self._membership.leaving(monotonic())
+    def _is_leaving(self) -> bool:
+        return self._membership.is_leaving(monotonic())
 
     def _pause(self) -> None:
         """Wait a moment, with jitter, or until told to stop."""
         deadline = monotonic() + _jittered_retry()
-        while not self._leaving() and (left := deadline - monotonic()) > 0:
+        while not self._is_leaving() and (left := deadline - monotonic()) > 0:
             try:
                 self._events.get(timeout=left)
             except queue.Empty:

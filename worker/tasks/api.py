@@ -14,13 +14,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.actions import STEERING_GAS_BRAKE, Actions, Continuous, Discrete
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Actions, Continuous, Discrete
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import BundleError, UsageError
-from dreamfleet.common.messages import TaskSpec
-from dreamfleet.common.tasks import Description
-from dreamfleet.common.variants import Variant
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
 __all__ = [
@@ -28,29 +28,29 @@ __all__ = [
     "Actions",
     "Assignment",
     "Batch",
-    "Batched",
-    "Choosing",
-    "Collected",
+    "BatchedTask",
     "Continuous",
     "Description",
     "Discrete",
     "DreamReward",
     "Driver",
     "Episode",
-    "Glimpse",
-    "Onlooker",
     "Policy",
+    "PolicyWithOutputs",
     "Preprocessing",
-    "Rewarded",
+    "RecordableTask",
+    "RewardAwarePolicy",
     "Score",
-    "Sourced",
+    "StepObserver",
+    "StepSnapshot",
     "Task",
-    "Truthful",
-    "Watchable",
+    "TaskWithPolicies",
+    "TaskWithTrueState",
+    "WatchableBatch",
     "World",
 ]
 
-ENVIRONMENTS_OWN = 10**6  # steps: the environment's own limit ends an episode
+ENVIRONMENT_LIMIT = 10**6  # steps: the environment's own limit ends an episode
 
 
 class Policy(Protocol):
@@ -63,14 +63,14 @@ class Policy(Protocol):
         """The environment's next action."""
 
 
-class Rewarded(Protocol):
+class RewardAwarePolicy(Protocol):
     """A policy that also wants to know what its actions bring; a policy need not."""
 
     def reward(self, value: float) -> None:
         """The reward of the last action, before the next one is asked for."""
 
 
-class Choosing(Protocol):
+class PolicyWithOutputs(Protocol):
     """A policy whose actions hide what it computed, such as an index of the largest output; a policy need not tell."""
 
     def outputs(self, observation: Any) -> Any:
@@ -89,7 +89,7 @@ Episode = tuple[NDArray[np.float32], int]
 """A candidate's flat vector and the seed of its episode."""
 
 
-class Glimpse(NamedTuple):
+class StepSnapshot(NamedTuple):
     """A step of an episode as whoever looks on is shown it, before its action is done."""
 
     step: int  # those that were made before it
@@ -100,13 +100,13 @@ class Glimpse(NamedTuple):
     state: NDArray[np.float32] | None = None  # (state,), what it remembers before the action
 
 
-class Onlooker(Protocol):
+class StepObserver(Protocol):
     """Somebody looks on while episodes are scored; what he sees changes no score by a bit."""
 
     def due(self) -> bool:
         """Whether the present step is to be shown: far fewer are than are made."""
 
-    def see(self, episode: int, look: Callable[[], Glimpse]) -> None:
+    def see(self, episode: int, look: Callable[[], StepSnapshot]) -> None:
         """Look at a step of one of the episodes that are scored together, by its place among them."""
 
 
@@ -129,7 +129,7 @@ class World:
     actions: Actions
     packages: tuple[str, ...] = ("numpy", "gymnasium")  # distributions whose versions a fitness may depend on
     idle_cost: float = 0.0  # what a step without a reward costs: charged for steps that `patience` cuts off
-    horizon: int = ENVIRONMENTS_OWN  # steps of a judged episode at most
+    horizon: int = ENVIRONMENT_LIMIT  # steps of a judged episode at most
     version: int = 1  # to be raised whenever the same parameters and seeds give another fitness
     time_cost: float = 0.0  # what a candidate pays for each step until `finish`, or its horizon; nobody who is judged
     stray_cost: float = 0.0  # what it pays for each step whose `info` says `stray`; of 100 an episode at most
@@ -159,7 +159,7 @@ class Assignment:
     @classmethod
     def of(cls, task: str, bundle: Bundle) -> Assignment:
         """A task on a world model outside of any run."""
-        return cls(TaskSpec(task, bundle.sha256, ENVIRONMENTS_OWN, 0), bundle)
+        return cls(TaskSpec(task, bundle.sha256, ENVIRONMENT_LIMIT, 0), bundle)
 
     @property
     def world_model(self) -> Bundle:
@@ -168,7 +168,7 @@ class Assignment:
         if self.bundle is None:
             raise BundleError(f"task {spec.task} needs a world model: give one with --bundle")
         own = spec.controller or spec.options
-        return self.bundle.under(spec.controller, Variant.of(spec.options)) if own else self.bundle
+        return self.bundle.with_controllers(spec.controller, Variant.from_json(spec.options)) if own else self.bundle
 
     @property
     def controller(self) -> ControllerShape:
@@ -232,15 +232,15 @@ class Batch(Protocol):
 
 
 @runtime_checkable
-class Watchable(Protocol):
+class WatchableBatch(Protocol):
     """A batch that somebody may look on at."""
 
-    def watched(self, onlooker: Onlooker) -> Batch:
+    def watched(self, observer: StepObserver) -> Batch:
         """The same batch, which shows the onlooker one of its episodes; its scores are the same bits."""
 
 
 @runtime_checkable
-class Batched(Protocol):
+class BatchedTask(Protocol):
     """A task that scores candidates in batches, beside its environment, in which its means are evaluated."""
 
     def make_batch(self, assignment: Assignment) -> Batch:
@@ -266,7 +266,7 @@ class Preprocessing:
 
 
 @runtime_checkable
-class Collected(Protocol):
+class RecordableTask(Protocol):
     """A task whose world rollouts are recorded in and world models are trained on."""
 
     name: str
@@ -283,7 +283,7 @@ class Collected(Protocol):
 
 
 @runtime_checkable
-class Sourced(Protocol):
+class TaskWithPolicies(Protocol):
     """A task that also drives for data sets as others did for theirs."""
 
     policies: Mapping[str, Callable[[np.random.Generator], Policy]]
@@ -291,7 +291,7 @@ class Sourced(Protocol):
 
 
 @runtime_checkable
-class Truthful(Protocol):
+class TaskWithTrueState(Protocol):
     """A task whose worlds tell their true state.
 
     `dreamfleet inspect` measures world models against it, and `dreamfleet evaluate` tells how a controller drove.

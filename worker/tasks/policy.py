@@ -7,12 +7,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.actions import Actions
-from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.artifacts.actions import Actions
+from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError
 
 Floats = NDArray[np.float32]
-ALL = "random"  # among names of drivers: each of a world's in turn
+ALL_DRIVERS = "random"  # among names of drivers: each of a world's in turn
 
 
 class FlatPolicy:
@@ -33,7 +33,7 @@ class FlatPolicy:
 
     def act(self, observation: Any) -> Any:
         """The action for one observation of any shape, flattened."""
-        return self._actions.of(self.outputs(observation))
+        return self._actions.to_action(self.outputs(observation))
 
     def outputs(self, observation: Any) -> Floats:
         """The controller's outputs `(outputs,)` for one observation, of which the actions are made."""
@@ -52,7 +52,7 @@ class Driver(Protocol):
         """The next action."""
 
 
-class Driven:
+class DriverPolicy:
     """A driver as a policy."""
 
     def __init__(self, driver: Driver) -> None:

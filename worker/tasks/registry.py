@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from dreamfleet.common.actions import Continuous, Discrete
+from dreamfleet.common.artifacts.actions import Continuous, Discrete
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.tasks import load_task, registered_tasks
+from dreamfleet.common.protocol.tasks import load_task, registered_tasks
 from dreamfleet.worker.tasks.api import Task, World
 
-MAKERS = ("make_environment", "make_judge", "make_policy", "world_of")
+REQUIRED_METHODS = ("make_environment", "make_judge", "make_policy", "world_of")
 
 
 def known_tasks() -> tuple[str, ...]:
@@ -21,13 +21,13 @@ def known_tasks() -> tuple[str, ...]:
 def find_task(name: str) -> Task:
     """A task by name; `UsageError` lists the registered ones, or says what this one lacks."""
     task = load_task(name)
-    if missing := list(_missing(task)):
+    if missing := list(_find_problems(task)):
         raise UsageError(f"task {name!r} is incomplete: {'; '.join(missing)}; docs/tasks.md shows a whole one")
     found: Task = task
     return found
 
 
-def _missing(task: Any) -> Iterator[str]:
+def _find_problems(task: Any) -> Iterator[str]:
     if not isinstance(getattr(task, "name", None), str):
         yield "name must be a text"
     width = getattr(task, "width", None)
@@ -40,6 +40,6 @@ def _missing(task: Any) -> Iterator[str]:
         yield f"world must be a World, not {type(world).__name__}"
     elif not isinstance(world.actions, (Continuous, Discrete)):
         yield f"world.actions must be Continuous or Discrete, not {type(world.actions).__name__}"
-    for maker in MAKERS:
+    for maker in REQUIRED_METHODS:
         if not callable(getattr(task, maker, None)) or getattr(type(task), maker, None) is Task.make_environment:
             yield f"{maker}(assignment) is missing"

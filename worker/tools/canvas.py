@@ -21,7 +21,7 @@ Corner = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Layout:
+class FrameLayout:
     """How large the world is drawn, and whether the small pictures have room beside it."""
 
     track: tuple[int, int]
@@ -33,19 +33,19 @@ class Layout:
         return self.track[0] + (SIDE + 32 if self.column else 2 * MARGIN), self.track[1] + 80
 
 
-AWAKE = Layout((600, 400))  # two small pictures
-DREAMING = Layout((900, 600))  # three
+AWAKE = FrameLayout((600, 400))  # two small pictures
+DREAMING = FrameLayout((900, 600))  # three
 
 
-def plain_layout(picture: Frame) -> Layout:
+def plain_layout(picture: Frame) -> FrameLayout:
     """A world's picture alone, large enough for the words below it."""
     height, width = picture.shape[:2]
     scale = max(1.0, NARROWEST / width)
-    return Layout((round(width * scale) // 2 * 2, round(height * scale) // 2 * 2), column=False)
+    return FrameLayout((round(width * scale) // 2 * 2, round(height * scale) // 2 * 2), column=False)
 
 
 @dataclass(frozen=True)
-class Dreamt:
+class DreamPicture:
     """What the model dreams at a step, and since which step it has not looked."""
 
     picture: Frame
@@ -53,23 +53,23 @@ class Dreamt:
 
 
 @dataclass(frozen=True)
-class Mind:
+class ModelPictures:
     """What a world model sees, makes of it, and dreams."""
 
     seen: Frame
     decoded: Frame
-    dreamt: Dreamt | None = None
+    dreamt: DreamPicture | None = None
 
 
 @dataclass(frozen=True)
-class Moment:
+class DriveFrame:
     """One step of the drive."""
 
     track: Frame
     action: NDArray[Any]
     step: int
     score: float
-    mind: Mind | None = None
+    pictures: ModelPictures | None = None
 
 
 class Board:
@@ -117,27 +117,27 @@ class Board:
 class Canvas(Board):
     """Lays a moment out as one frame."""
 
-    def __init__(self, seed: int, layout: Layout = AWAKE, actions: tuple[str, ...] = ()) -> None:
+    def __init__(self, seed: int, layout: FrameLayout = AWAKE, actions: tuple[str, ...] = ()) -> None:
         super().__init__(layout.size, actions)
         self._seed = seed
         self._layout = layout
 
-    def draw(self, moment: Moment) -> Frame:
+    def draw(self, moment: DriveFrame) -> Frame:
         """The frame `(height, width, 3)`."""
         width, height = self._layout.track
         self._surface.fill(BACKGROUND)
         self._picture(moment.track, (MARGIN, MARGIN), self._layout.track, smooth=True)
-        if moment.mind is not None:
-            self._draw_mind(moment.mind)
+        if moment.pictures is not None:
+            self._draw_model(moment.pictures)
         self._text(f"score {moment.score:7.1f}", (12, height + 24), self._large, INK)
         self._text(f"step {moment.step}   seed {self._seed}", (12, height + 52), self._small, FAINT)
         self._draw_action(moment.action, width + 16, height + 26)
         return pixels(self._surface)
 
-    def _draw_mind(self, mind: Mind) -> None:
-        column = [("what the model sees", mind.seen), ("what it decodes", mind.decoded)]
-        if mind.dreamt is not None:
-            column.append((f"dreaming since step {mind.dreamt.since}", mind.dreamt.picture))
+    def _draw_model(self, pictures: ModelPictures) -> None:
+        column = [("what the model sees", pictures.seen), ("what it decodes", pictures.decoded)]
+        if pictures.dreamt is not None:
+            column.append((f"dreaming since step {pictures.dreamt.since}", pictures.dreamt.picture))
         for row, (label, picture) in enumerate(column):
             left, top = self._layout.track[0] + 20, MARGIN + row * (LABEL + SIDE + GAP)
             self._text(label, (left, top), self._small, FAINT)

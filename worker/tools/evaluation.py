@@ -13,26 +13,30 @@ from time import perf_counter
 from typing import ClassVar
 
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.evaluated import Drive, Evaluated
-from dreamfleet.common.fingerprint import fingerprint, package_version
-from dreamfleet.common.judgement import Judgement
-from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.host.packages import package_version
+from dreamfleet.common.host.parent_death import exit_with_parent
+from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
+from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.worker.scoring.agents import Agent
-from dreamfleet.worker.tools.judge import Judge
+from dreamfleet.worker.tools.agent_evaluator import AgentEvaluator
 
 
-def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Drive]:
+def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[EpisodeResult]:
     """Drive one whole episode a seed in `jobs` processes, in this one if it is 1; yields each as it ends."""
     pin_thread_pools()
     if jobs == 1:  # here: a script of one's own need not guard its main part
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-        judge = Judge(agent)
+        judge = AgentEvaluator(agent)
         yield from map(judge.drive, seeds)
         judge.close()
         return
-    pool = ProcessPoolExecutor(min(jobs, len(seeds)), get_context("spawn"), _Seat.take, (agent,))
+    pool = ProcessPoolExecutor(
+        min(jobs, len(seeds)), get_context("spawn"), _ProcessEvaluator.start, (agent, os.getpid())
+    )
     try:
-        for each in as_completed([pool.submit(_Seat.drive, seed) for seed in seeds]):
+        for each in as_completed([pool.submit(_ProcessEvaluator.drive, seed) for seed in seeds]):
             yield each.result()
     except BrokenProcessPool as error:
         raise DreamfleetError(
@@ -43,40 +47,41 @@ def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Drive]
         pool.shutdown(cancel_futures=True)
 
 
-def judgement(
-    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, on_drive: Callable[[list[Drive]], None]
-) -> Judgement:
+def run_evaluation(
+    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, on_drive: Callable[[list[EpisodeResult]], None]
+) -> EvaluationReport:
     """What `evaluate` finds of an agent by the name that it was asked for; `on_drive` is shown the drives so far."""
-    began, drives = perf_counter(), list[Drive]()
+    began, drives = perf_counter(), list[EpisodeResult]()
     for drive in evaluate(agent, seeds, jobs):
         drives.append(drive)
         on_drive(drives)
-    return Judgement(
+    return EvaluationReport(
         name, agent.sha256, agent.task, agent.reality, agent.bundle.sha256 if agent.bundle else "",
         fingerprint(agent.world.packages), package_version("dreamfleet") or "", perf_counter() - began,
-        Evaluated.of(drives).drives, threshold=agent.threshold,
+        EpisodeResults.of(drives).drives, threshold=agent.threshold,
     )  # fmt: skip
 
 
-class _Seat:
+class _ProcessEvaluator:
     """What drives in a process of its own."""
 
     agent: ClassVar[Agent]
 
     @classmethod
-    def take(cls, agent: Agent) -> None:
-        """Begin the process."""
+    def start(cls, agent: Agent, parent: int) -> None:
+        """Begin the process, which ends with its parent."""
+        exit_with_parent(parent)
         os.environ["SDL_VIDEODRIVER"] = "dummy"
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches the whole group: end without a traceback
         cls.agent = agent
 
     @classmethod
-    def drive(cls, seed: int) -> Drive:
+    def drive(cls, seed: int) -> EpisodeResult:
         """One whole episode."""
-        return cls._judge().drive(seed)
+        return cls._evaluator().drive(seed)
 
     @classmethod
     @cache
-    def _judge(cls) -> Judge:
+    def _evaluator(cls) -> AgentEvaluator:
         """Made by the first drive, so that whatever is wrong is that drive's error."""
-        return Judge(cls.agent)
+        return AgentEvaluator(cls.agent)

@@ -6,17 +6,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.stopping import Stop, never
-from dreamfleet.worker.dream.daydream import DaydreamConfig
+from dreamfleet.common.host.stop_signals import Stop, never_stop
+from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
-from dreamfleet.worker.scoring.episode import Course, play
-from dreamfleet.worker.tools.filming import Filmed, Painter, Thoughts
+from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
+from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, WorldModelView
 from dreamfleet.worker.tools.video import Video
 
 
 def record(
-    agent: Agent, seed: int, steps: int, out: Path, dreaming: DaydreamConfig | None = None,
-    on_step: Callable[[int], None] = lambda _steps: None, stop: Stop = never,
+    agent: Agent, seed: int, steps: int, out: Path, dreaming: ParallelDreamConfig | None = None,
+    on_step: Callable[[int], None] = lambda _steps: None, stop: Stop = never_stop,
 ) -> float:  # fmt: skip
     """Drive one episode in the agent's judge into an mp4; returns its score.
 
@@ -26,12 +26,12 @@ def record(
     environment = agent.make_judge("rgb_array")
     policy: Any = agent.make_policies()(seed)
     policy.begin(agent.parameters)
-    config, bundle = dreaming or DaydreamConfig(seed=seed), agent.bundle
-    thoughts = None if bundle is None else Thoughts(bundle, policy, agent.parameters, config)
+    config, bundle = dreaming or ParallelDreamConfig(seed=seed), agent.bundle
+    model_view = None if bundle is None else WorldModelView(bundle, policy, agent.parameters, config)
     score = 0.0
     with Video(out, agent.world.frames_per_second) as video:
-        painter = Painter(environment, agent.world, seed, video.add)
-        for moment in play(environment, Filmed(policy, painter, thoughts), Course(seed, steps)):
+        painter = FramePainter(environment, agent.world, seed, video.add)
+        for moment in run_episode(environment, FilmedPolicy(policy, painter, model_view), EpisodeConfig(seed, steps)):
             score += moment.reward
             on_step(moment.step)
             if stop():

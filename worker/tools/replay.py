@@ -6,16 +6,16 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.classes import class_of
-from dreamfleet.common.fingerprint import fingerprint
-from dreamfleet.common.runs import RunFolder
-from dreamfleet.common.terms import terms_of
-from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.protocol.host_classes import class_from_fingerprint
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.scoring_params import scoring_params_of
 
 
 @dataclass(frozen=True)
-class Replayed:
+class ReplayedEpisode:
     """One episode's stored and recomputed fitness."""
 
     episode: int
@@ -40,7 +40,7 @@ class Replayed:
         return None if tolerance is None else abs(self.stored - self.replayed) <= tolerance
 
 
-def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[Replayed]:
+def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[ReplayedEpisode]:
     """Each stored episode of a candidate, scored again under its generation's terms, bundle and seeds."""
     parameters = run.candidate(generation, candidate)
     results = run.results(generation, candidate)
@@ -48,12 +48,12 @@ def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[Replayed
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.worker.scoring.scorer import Scorer
 
-    terms, own = terms_of(run, generation), run.spec
+    scoring_params, own = scoring_params_of(run, generation), run.spec
     scorer = Scorer(own, Bundle.open(run.bundle_path, own.bundle) if own.bundle else None)
-    here = scorer.host_class, class_of(fingerprint(run.settings.packages))
+    here = scorer.host_class, class_from_fingerprint(fingerprint(run.settings.packages))
     for result in results:
-        score = scorer.score("score", parameters, result.seed, spec=terms.spec_of(result.episode))
-        yield Replayed(
+        score = scorer.score("score", parameters, result.seed, spec=scoring_params.episode_spec(result.episode))
+        yield ReplayedEpisode(
             result.episode, result.seed, result.fitness, score.fitness, result.host_class, result.host_class in here
         )
     scorer.close()

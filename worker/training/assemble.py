@@ -13,32 +13,33 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from dreamfleet.common.actions import Continuous
-from dreamfleet.common.bundle import (
+from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.common.artifacts.bundle import (
     DECODER,
-    DREAM,
+    DREAM_GRAPH,
     ENCODER,
-    INITIAL,
-    LAYERED,
-    LINEAR,
+    INITIAL_LATENTS_PART,
+    LAYERED_CONTROLLER,
+    LINEAR_CONTROLLER,
     POLICY,
-    RECORDED,
+    RECORDED_STATES,
     WEIGHTS,
     Bundle,
-    Manifest,
+    BundleManifest,
     write_bundle,
 )
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.common.fields import written
-from dreamfleet.common.files import read_regular, write_aside
-from dreamfleet.common.fingerprint import package_version
+from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.regular_files import read_regular
+from dreamfleet.common.host.packages import package_version
+from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
-from dreamfleet.worker.training.dataset import episodes, load, split
-from dreamfleet.worker.training.encode import ENCODED, encoder_of
-from dreamfleet.worker.training.recorded import recorded_states
-from dreamfleet.worker.training.room import told_where_full
-from dreamfleet.worker.training.world import WORLD, find_world, preprocessing_to
+from dreamfleet.worker.training.data.dataset import episode_paths, load_arrays, split_held_out
+from dreamfleet.worker.training.data.disk_errors import explain_write_errors
+from dreamfleet.worker.training.data.world import WORLD, find_world, preprocessing_of_size
+from dreamfleet.worker.training.encode import ENCODED, latents_encoder_hash
+from dreamfleet.worker.training.recorded_states import compute_recorded_states
 from dreamfleet.worker.worldmodel.export import (
     Weights,
     export_controller,
@@ -63,7 +64,7 @@ def record_quality(folder: Path, figures: dict[str, float]) -> None:
     """Keep a model's figures beside the data, for the manifest."""
     path = folder / QUALITY
     known = json.loads(path.read_text()) if path.exists() else {}
-    with told_where_full(path), write_aside(path) as file:
+    with explain_write_errors(path), atomic_write(path) as file:
         file.write(json.dumps({**known, **figures}, indent=1).encode())
 
 
@@ -74,7 +75,7 @@ def assemble(
 
     `measured` are figures that `inspect --json` told of the same bundle without them; `DatasetError` if of another.
     """
-    told = [(path, *_figures(path)) for path in measured]
+    told = [(path, *_load_measurements(path)) for path in measured]
     vae = load_weights(folder / train_vae.CHECKPOINT)
     rnn = load_weights(folder / train_mdnrnn.CHECKPOINT)
     configs = (
@@ -86,30 +87,30 @@ def assemble(
             raise DatasetError(f"{folder / checkpoint} holds NaN or infinity; delete it and train again")
     if configs[0].latent != configs[1].latent:
         raise DatasetError(f"the VAE has {configs[0].latent} latents, the MDN-RNN {configs[1].latent}: train it again")
-    if train_mdnrnn.vae_of(folder) != encoder_of(folder):
+    if train_mdnrnn.mdnrnn_vae_hash(folder) != latents_encoder_hash(folder):
         raise DatasetError(f"the MDN-RNN in {folder} was trained on another VAE: train it again before you bundle")
     quality = folder / QUALITY
     provenance = {
-        "episodes": len(episodes(folder)),
-        "frames": sum(len(load(path, "reward")["reward"]) for path in episodes(folder)),
-        "held_out_episodes": len(split(episodes(folder))[1]),
+        "episodes": len(episode_paths(folder)),
+        "frames": sum(len(load_arrays(path, "reward")["reward"]) for path in episode_paths(folder)),
+        "held_out_episodes": len(split_held_out(episode_paths(folder))[1]),
         "quality": json.loads(quality.read_text()) if quality.exists() else {},
         "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
     }
-    parts = graphs(vae, rnn, initial_latents(folder), *configs)
+    parts = export_graphs(vae, rnn, initial_latents(folder), *configs)
     if recorded:
-        found = recorded_states(folder, recorded)
+        found = compute_recorded_states(folder, recorded)
         if states := len(found.states):
-            parts[RECORDED] = _npy(found.states)
+            parts[RECORDED_STATES] = _npy(found.states)
             provenance["recorded"] = {"states": states, "before_losses": found.before_losses}
     if with_weights:
         tensors = {f"vae.{key}": value for key, value in vae.items()} | {f"mdnrnn.{k}": v for k, v in rnn.items()}
         parts[WEIGHTS] = save(
-            tensors, {"vae": json.dumps(written(configs[0])), "mdnrnn": json.dumps(written(configs[1]))}
+            tensors, {"vae": json.dumps(to_dict(configs[0])), "mdnrnn": json.dumps(to_dict(configs[1]))}
         )
     if told:
         with TemporaryDirectory() as aside:
-            bare = write_bundle(Path(aside) / out.name, manifest(name, provenance, *configs), parts).sha256
+            bare = write_bundle(Path(aside) / out.name, make_manifest(name, provenance, *configs), parts).sha256
         for path, of, _ in told:
             if of != bare:
                 raise DatasetError(
@@ -117,11 +118,11 @@ def assemble(
                     "bundle that without --measured, and measure it"
                 )
         provenance["measured"] = [figures for *_, figures in told]
-    with told_where_full(out):
-        return write_bundle(out, manifest(name, provenance, *configs), parts)
+    with explain_write_errors(out):
+        return write_bundle(out, make_manifest(name, provenance, *configs), parts)
 
 
-def _figures(path: Path) -> tuple[object, dict[str, Any]]:
+def _load_measurements(path: Path) -> tuple[object, dict[str, Any]]:
     """Of which bundle `inspect --json` told figures, and these."""
     try:
         told = json.loads(read_regular(path, MOST_FIGURES))
@@ -135,10 +136,12 @@ def _figures(path: Path) -> tuple[object, dict[str, Any]]:
         raise DatasetError(f"{path} holds no figures of `inspect BUNDLE --probe --json` ({error})") from error
 
 
-def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED) -> Manifest:
+def make_manifest(
+    name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED
+) -> BundleManifest:
     """The manifest of these models."""
-    preprocessing = preprocessing_to(vae.picture)
-    return Manifest(
+    preprocessing = preprocessing_of_size(vae.picture)
+    return BundleManifest(
         name=name,
         task=WORLD,
         preprocessing=preprocessing.name,
@@ -147,11 +150,11 @@ def manifest(name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn:
         hidden=rnn.hidden,
         actions=rnn.actions,
         provenance=provenance,
-        models={"vae": written(vae), "mdnrnn": written(rnn)},
+        models={"vae": to_dict(vae), "mdnrnn": to_dict(rnn)},
     )
 
 
-def graphs(
+def export_graphs(
     vae: Weights,
     rnn: Weights,
     initial: NDArray[np.float32],
@@ -160,16 +163,16 @@ def graphs(
 ) -> dict[str, bytes]:
     """The parts of a new bundle."""
     actions = find_world().world.actions
-    if not isinstance(actions, Continuous) or actions.outputs_of:
+    if not isinstance(actions, Continuous) or actions.output_indices:
         raise DatasetError(f"world models are built for continuous actions of an output each; those of {WORLD} are not")
     return {
         ENCODER: export_encoder(vae, vae_config),
         DECODER: export_decoder(vae, vae_config),
         POLICY: export_policy(vae, rnn, vae_config, rnn_config, actions),
-        DREAM: export_dream(rnn, rnn_config),
-        LINEAR: export_controller(actions, hidden=False),
-        LAYERED: export_controller(actions, hidden=True),
-        INITIAL: _npy(initial),
+        DREAM_GRAPH: export_dream(rnn, rnn_config),
+        LINEAR_CONTROLLER: export_controller(actions, hidden=False),
+        LAYERED_CONTROLLER: export_controller(actions, hidden=True),
+        INITIAL_LATENTS_PART: _npy(initial),
     }
 
 
@@ -182,7 +185,7 @@ def _npy(array: NDArray[Any]) -> bytes:
 def initial_latents(folder: Path) -> NDArray[np.float32]:
     """First `mu` and `logvar` of recorded rollouts, `(N, 2, latent)`: where dreams begin."""
     firsts = []
-    for path in episodes(folder, ENCODED)[:INITIAL_LATENTS]:
-        arrays = load(path, "mu", "logvar")
+    for path in episode_paths(folder, ENCODED)[:INITIAL_LATENTS]:
+        arrays = load_arrays(path, "mu", "logvar")
         firsts.append(np.stack([arrays["mu"][0], arrays["logvar"][0]]))
     return np.stack(firsts).astype(np.float32)

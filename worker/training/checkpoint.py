@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from dreamfleet.common.codec import MalformedError, from_plain
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.common.fields import written
-from dreamfleet.common.files import write_aside
-from dreamfleet.common.stopping import undisturbed
-from dreamfleet.worker.training.room import told_where_full
+from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.host.stop_signals import signals_deferred
+from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.worker.training.data.disk_errors import explain_write_errors
 
 T = TypeVar("T")
 
@@ -32,13 +32,13 @@ def save_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
     tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
-    about = {"progress": json.dumps(progress), "config": json.dumps(written(model.config))}
-    with undisturbed(), told_where_full(path), write_aside(path) as file:
+    about = {"progress": json.dumps(progress), "config": json.dumps(to_dict(model.config))}
+    with signals_deferred(), explain_write_errors(path), atomic_write(path) as file:
         file.write(save({name: tensor.contiguous() for name, tensor in tensors.items()}, about))
 
 
 def load_checkpoint(
-    path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam | None, free: frozenset[str] = frozenset()
+    path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam | None, extensible: frozenset[str] = frozenset()
 ) -> dict[str, Any] | None:
     """Put a checkpoint back and return its progress; `None` if there is none yet.
 
@@ -47,14 +47,14 @@ def load_checkpoint(
     """
     if not path.exists():
         return None
-    check_config(path, model.config, free)
+    check_config(path, model.config, extensible)
     try:
         with safe_open(path, "pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
             progress: dict[str, Any] = json.loads(file.metadata()["progress"])
-        weights, moments = _named(tensors, "model."), _named(tensors, "adam.")
-        if free and load_config(path, type(model.config)) != model.config:
-            moments = _without(moments, _add_rows(weights, model))
+        weights, moments = _select_prefix(tensors, "model."), _select_prefix(tensors, "adam.")
+        if extensible and load_config(path, type(model.config)) != model.config:
+            moments = _drop_parameters(moments, _add_rows(weights, model))
         model.load_state_dict(weights)
         if optimiser is not None:
             _restore_adam(optimiser, moments)
@@ -67,7 +67,7 @@ def load_checkpoint(
 
 def load_config(path: Path, kind: type[T]) -> T:
     """The configuration of a checkpoint's model; one from before they were kept has the defaults."""
-    about = _about(path)
+    about = _read_metadata(path)
     try:
         return from_plain(kind, json.loads(about["config"])) if "config" in about else kind()
     except (ValueError, TypeError, RecursionError, MalformedError, UsageError) as error:
@@ -77,13 +77,13 @@ def load_config(path: Path, kind: type[T]) -> T:
 def load_progress(path: Path) -> dict[str, Any]:
     """How far a checkpoint has come."""
     try:
-        progress: dict[str, Any] = json.loads(_about(path)["progress"])
+        progress: dict[str, Any] = json.loads(_read_metadata(path)["progress"])
     except (ValueError, KeyError, RecursionError) as error:
         raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
     return progress
 
 
-def _about(path: Path) -> Mapping[str, str]:
+def _read_metadata(path: Path) -> Mapping[str, str]:
     if not path.exists():
         raise DatasetError(f"no {path}: train it first with `dreamfleet train {path.stem}`")
     try:
@@ -93,7 +93,7 @@ def _about(path: Path) -> Mapping[str, str]:
         raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
 
 
-def _named(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+def _select_prefix(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
@@ -107,17 +107,17 @@ def _add_rows(weights: dict[str, torch.Tensor], model: torch.nn.Module) -> set[i
     return grown
 
 
-def _without(moments: Mapping[str, torch.Tensor], parameters: set[int]) -> dict[str, torch.Tensor]:
+def _drop_parameters(moments: Mapping[str, torch.Tensor], parameters: set[int]) -> dict[str, torch.Tensor]:
     return {name: tensor for name, tensor in moments.items() if int(name.partition(".")[0]) not in parameters}
 
 
-def check_config(path: Path, config: Any, free: frozenset[str] = frozenset()) -> None:
+def check_config(path: Path, config: Any, extensible: frozenset[str] = frozenset()) -> None:
     """`DatasetError` names what a checkpoint's model has otherwise; what is `free` may have come newly."""
     stored, wanted = asdict(load_config(path, type(config))), asdict(config)
-    if any(stored[name] for name in free):  # what is there stays what it is
-        free = frozenset()
+    if any(stored[name] for name in extensible):  # what is there stays what it is
+        extensible = frozenset()
     differing = [f"{name} {stored[name]}, not {value}" for name, value in wanted.items()
-                 if stored[name] != value and not (name in free and value)]  # fmt: skip
+                 if stored[name] != value and not (name in extensible and value)]  # fmt: skip
     if differing:
         raise DatasetError(
             f"checkpoint {path} is of another model: {'; '.join(differing)}; give it the same flags, or --new to begin "

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from dreamfleet.common.config import option
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 
 

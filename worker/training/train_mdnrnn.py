@@ -11,18 +11,18 @@ import torch
 from torch import Tensor
 
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.common.stopping import Stop, never
+from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.worker.training.checkpoint import load_progress
-from dreamfleet.worker.training.curve import Point, loss_curve
-from dreamfleet.worker.training.dataset import episodes, load, split
-from dreamfleet.worker.training.encode import ENCODED, encoder_of, mirrored_too
-from dreamfleet.worker.training.foresight import foresight
-from dreamfleet.worker.training.rollouts import Rollouts, ends, inputs_of, load_rollouts
-from dreamfleet.worker.training.schedule import Schedule
+from dreamfleet.worker.training.data.dataset import episode_paths, load_arrays, split_held_out
+from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels, load_rollouts, model_inputs
+from dreamfleet.worker.training.encode import ENCODED, encodes_mirrored, latents_encoder_hash
+from dreamfleet.worker.training.loss_curve import AddPoint, open_loss_curve
+from dreamfleet.worker.training.prediction_quality import foresight
 from dreamfleet.worker.training.train_config import TrainConfig
-from dreamfleet.worker.training.train_vae import Report
+from dreamfleet.worker.training.train_vae import ReportProgress
+from dreamfleet.worker.training.training_state import TrainingState
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss, reward_labels, reward_loss
-from dreamfleet.worker.worldmodel.mdnrnn_config import HEADS_TO_COME, REWARDED, MDNRNNConfig
+from dreamfleet.worker.worldmodel.mdnrnn_config import ADDABLE_HEADS, REWARDED, MDNRNNConfig
 
 N = TypeVar("N", float, Tensor)
 CHECKPOINT, CURVE = "mdnrnn.safetensors", "mdnrnn.jsonl"
@@ -30,8 +30,8 @@ VALIDATION_ROLLOUTS = 20  # for the curve while training
 
 
 def train_mdnrnn(
-    folder: Path, config: TrainConfig, report: Report, layers: MDNRNNConfig = REWARDED,
-    device: torch.device | None = None, continue_from: Path | None = None, stop: Stop = never, new: bool = False,
+    folder: Path, config: TrainConfig, report: ReportProgress, layers: MDNRNNConfig = REWARDED,
+    device: torch.device | None = None, continue_from: Path | None = None, stop: Stop = never_stop, new: bool = False,
     events: Path | None = None,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
@@ -39,19 +39,19 @@ def train_mdnrnn(
     A stop changes nothing: all follows from the seed and the update alone. `StoppedError` if `stop` asks for one.
     `events`: a folder for TensorBoard's.
     """
-    train, held_out = split(episodes(folder, ENCODED))
-    vae, mirrors = encoder_of(folder), mirrored_too(folder)
-    latents = load(train[0], "mu")["mu"].shape[1]
+    train, held_out = split_held_out(episode_paths(folder, ENCODED))
+    vae, mirrors = latents_encoder_hash(folder), encodes_mirrored(folder)
+    latents = load_arrays(train[0], "mu")["mu"].shape[1]
     if layers.latent != latents:
         raise DatasetError(f"the encoded rollouts have {latents} latents, this MDN-RNN {layers.latent}: give --latent")
     torch.manual_seed(config.seed)
     model = MDNRNN(layers).to(device)
-    schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from, new, HEADS_TO_COME)
+    schedule = TrainingState(folder / CHECKPOINT, model, config, len(train), continue_from, new, ADDABLE_HEADS)
     if schedule.progress.setdefault("vae", vae) != vae:
         raise DatasetError(f"{folder / CHECKPOINT} was trained on latents of another VAE; --new begins anew")
     report(schedule.update, "")
-    with loss_curve(folder / CURVE, events, schedule.update) as point:
-        while schedule.goes_on(stop):
+    with open_loss_curve(folder / CURVE, events, schedule.update) as point:
+        while schedule.should_continue(stop):
             update = schedule.update + 1
             schedule.set_rate(update * config.batch // len(train) if config.decay < 1 else 0)
             random = np.random.default_rng([config.seed, update])
@@ -66,18 +66,22 @@ def train_mdnrnn(
             report(update, "  ".join(f"{name} {value:.3f}" for name, value in values.items()))
             if update % 10 == 0:
                 point(update=update, **values)
-            schedule.close_update(lambda: _look(model, held_out[:VALIDATION_ROLLOUTS], point, schedule.update, device))
-    return quality(model, held_out, device)
+            schedule.finish_update(
+                lambda: _record_validation(model, held_out[:VALIDATION_ROLLOUTS], point, schedule.update, device)
+            )
+    return measure_quality(model, held_out, device)
 
 
-def _look(model: MDNRNN, paths: Sequence[Path], point: Point, update: int, device: torch.device | None) -> float:
+def _record_validation(
+    model: MDNRNN, paths: Sequence[Path], point: AddPoint, update: int, device: torch.device | None
+) -> float:
     """The held-out loss that counts; a point of the curve."""
     parts = validate(model, paths, device)
     point(update=update, **{f"held_out_{name}": part for name, part in parts.items()})
-    return sum(weighted(model.config, parts).values())
+    return sum(weight_losses(model.config, parts).values())
 
 
-def vae_of(folder: Path) -> str:
+def mdnrnn_vae_hash(folder: Path) -> str:
     """Hash of the VAE checkpoint whose latents the folder's MDN-RNN was trained on."""
     return str(load_progress(folder / CHECKPOINT).get("vae"))
 
@@ -88,8 +92,8 @@ def backward(
     """Gradients of a batch, few rollouts at a time, so that memory does not grow with it; returns the plain losses."""
     values: dict[str, float] = {}
     for chunk in rollouts.chunks():
-        parts = shares(losses(model, chunk.to(device), noise), chunk, rollouts)
-        torch.stack(list(weighted(model.config, parts).values())).sum().backward()  # type: ignore[no-untyped-call]
+        parts = scale_to_batch(losses(model, chunk.to(device), noise), chunk, rollouts)
+        torch.stack(list(weight_losses(model.config, parts).values())).sum().backward()  # type: ignore[no-untyped-call]
         values = {name: values.get(name, 0.0) + part.item() for name, part in parts.items()}
     return values
 
@@ -103,7 +107,7 @@ def validate(model: MDNRNN, paths: Sequence[Path], device: torch.device | None =
             rollouts = load_rollouts(paths[start : start + VALIDATION_ROLLOUTS])
             steps = float(rollouts.mask.sum())
             for chunk in rollouts.chunks():
-                for name, part in shares(losses(model, chunk.to(device), noise), chunk, rollouts).items():
+                for name, part in scale_to_batch(losses(model, chunk.to(device), noise), chunk, rollouts).items():
                     values[name] = values.get(name, 0.0) + part.item() * steps
             weight += steps
     return {name: value / weight for name, value in values.items()}
@@ -114,30 +118,30 @@ def losses(model: MDNRNN, rollouts: Rollouts, noise: torch.Generator) -> dict[st
     config = model.config
     drawn = torch.randn(rollouts.mu.shape, generator=noise).to(rollouts.mu.device)
     sampled = rollouts.mu + torch.exp(0.5 * rollouts.logvar) * drawn
-    prediction = model(inputs_of(config, sampled, rollouts))
+    prediction = model(model_inputs(config, sampled, rollouts))
     ahead = type(prediction)(*(part[:, :-1] for part in prediction))
     parts = {"latent": latent_loss(ahead, sampled[:, 1:], rollouts.mask[:, 1:])}
-    if config.rewarded:
+    if config.has_reward_head:
         labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
         parts["reward"] = reward_loss(config.reward, prediction.reward, labels, rollouts.mask)
     if config.done:
-        parts["done"] = binary_loss(prediction.done, ends(config, rollouts), rollouts.mask)
+        parts["done"] = binary_loss(prediction.done, done_labels(config, rollouts), rollouts.mask)
     return parts
 
 
-def weighted(config: MDNRNNConfig, parts: Mapping[str, N]) -> dict[str, N]:
+def weight_losses(config: MDNRNNConfig, parts: Mapping[str, N]) -> dict[str, N]:
     """Losses as they count in what is learnt."""
     return {name: config.factors[name] * part for name, part in parts.items()}
 
 
-def shares(parts: dict[str, Tensor], chunk: Rollouts, rollouts: Rollouts) -> dict[str, Tensor]:
+def scale_to_batch(parts: dict[str, Tensor], chunk: Rollouts, rollouts: Rollouts) -> dict[str, Tensor]:
     """A chunk's mean losses as what they add to those of all rollouts."""
     ahead = float(chunk.mask[:, 1:].sum() / rollouts.mask[:, 1:].sum())
     every = float(chunk.mask.sum() / rollouts.mask.sum())
     return {name: part * (ahead if name == "latent" else every) for name, part in parts.items()}
 
 
-def quality(model: MDNRNN, held_out: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
+def measure_quality(model: MDNRNN, held_out: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
     """Nats a latent dimension, each head's loss, and how well heads foresee, on held-out rollouts."""
     parts = validate(model, held_out, device)
     figures = {"nats_per_dimension": round(parts.pop("latent"), 3)}

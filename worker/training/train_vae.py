@@ -12,19 +12,19 @@ import torch
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.stopping import Stop, never
-from dreamfleet.worker.training.curve import Point, loss_curve
-from dreamfleet.worker.training.dataset import (
+from dreamfleet.common.host.stop_signals import Stop, never_stop
+from dreamfleet.worker.training.data.dataset import (
     POOL_EPISODES,
     check_pictures,
     check_whole,
-    episodes,
+    episode_paths,
     load_pictures,
     picture_batches,
-    split,
+    split_held_out,
 )
-from dreamfleet.worker.training.schedule import Schedule
+from dreamfleet.worker.training.loss_curve import AddPoint, open_loss_curve
 from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.training_state import TrainingState
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 
@@ -35,10 +35,10 @@ VALIDATION_PICTURES = 2000
 CURVE_PICTURES = 500  # of them, for the curve while training
 ACTIVE_NATS = 0.1  # a picture, on average over the held-out ones, above which a latent carries something
 
-Report = Callable[[int, str], None]
+ReportProgress = Callable[[int, str], None]
 
 
-class Losses(NamedTuple):
+class VAELossValues(NamedTuple):
     """Of a VAE, as `Loss` has them."""
 
     weighted: float
@@ -48,9 +48,9 @@ class Losses(NamedTuple):
 
 
 def train_vae(
-    folder: Path, config: TrainConfig, report: Report, layers: VAEConfig = PAPER,
+    folder: Path, config: TrainConfig, report: ReportProgress, layers: VAEConfig = PAPER,
     device: torch.device | None = None, continue_from: Path | None = None, decoder_only: bool = False,
-    stop: Stop = never, new: bool = False, events: Path | None = None,
+    stop: Stop = never_stop, new: bool = False, events: Path | None = None,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
 
@@ -58,21 +58,21 @@ def train_vae(
     nothing: batches and chance follow from the seed and the update alone. `StoppedError` if `stop` asks for one.
     `events`: a folder for TensorBoard's.
     """
-    train, held_out = split(episodes(folder))
+    train, held_out = split_held_out(episode_paths(folder))
     check_whole([*train, *held_out], "picture", "preprocessing")
     check_pictures([*train, *held_out], layers.picture)
     torch.manual_seed(config.seed)
     model = VAE(layers).to(device)
     if decoder_only and continue_from is None and (new or not (folder / CHECKPOINT).exists()):
         raise UsageError("--decoder-only needs an encoder that was trained: give --continue-from")
-    schedule = Schedule(folder / CHECKPOINT, model, config, len(train), continue_from, new)
+    schedule = TrainingState(folder / CHECKPOINT, model, config, len(train), continue_from, new)
     progress = schedule.progress
     report(schedule.update, "")
     validation = held_out_pictures(held_out, CURVE_PICTURES)
     batches = picture_batches(train, config.batch, config.seed, progress.get("pool", 0), progress.get("taken", 0))
     epoch_pools = max(1, len(train) // POOL_EPISODES)
-    with loss_curve(folder / CURVE, events, schedule.update) as point:
-        while schedule.goes_on(stop):
+    with open_loss_curve(folder / CURVE, events, schedule.update) as point:
+        while schedule.should_continue(stop):
             pool, taken, batch = next(batches)
             schedule.set_rate(pool // epoch_pools)
             torch.manual_seed(config.seed * 1_000_003 + schedule.update)
@@ -82,8 +82,8 @@ def train_vae(
             report(schedule.update, f"error {loss.error:.1f}  KL {loss.divergence:.1f}")
             if schedule.update % 20 == 0:
                 point(update=schedule.update, error=loss.error, kl=loss.divergence)
-            schedule.close_update(lambda: _look(model, validation, point, schedule.update, device))
-    figures = quality(model, held_out, device)
+            schedule.finish_update(lambda: _record_validation(model, validation, point, schedule.update, device))
+    figures = measure_quality(model, held_out, device)
     if figures["reconstruction_error"] >= figures["mean_picture_error"]:
         log.warning(
             "held-out pictures are nearer to their mean (squared error %.4g) than to what this VAE makes of them "
@@ -93,7 +93,9 @@ def train_vae(
     return figures
 
 
-def _look(model: VAE, pictures: NDArray[np.uint8], point: Point, update: int, device: torch.device | None) -> float:
+def _record_validation(
+    model: VAE, pictures: NDArray[np.uint8], point: AddPoint, update: int, device: torch.device | None
+) -> float:
     """The held-out loss that counts; a point of the curve."""
     loss = validate(model, pictures, device)
     parts = {"held_out": loss.plain, "held_out_error": loss.error, "held_out_kl": loss.divergence}
@@ -101,7 +103,7 @@ def _look(model: VAE, pictures: NDArray[np.uint8], point: Point, update: int, de
     return loss.weighted
 
 
-def backward(model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device: torch.device | None) -> Losses:
+def backward(model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device: torch.device | None) -> VAELossValues:
     """Gradients of a batch; returns its losses."""
     model.train()
     if decoder_only:
@@ -109,10 +111,10 @@ def backward(model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device
     noise = torch.randn(len(pictures), model.config.latent).to(device)
     loss = model.loss(as_tensor(pictures, device), noise)
     loss.weighted.backward()  # type: ignore[no-untyped-call]
-    return Losses(*(part.item() for part in loss))
+    return VAELossValues(*(part.item() for part in loss))
 
 
-def validate(model: VAE, pictures: NDArray[np.uint8], device: torch.device | None) -> Losses:
+def validate(model: VAE, pictures: NDArray[np.uint8], device: torch.device | None) -> VAELossValues:
     """Losses on held-out pictures, at the latents' means."""
     model.eval()
     with torch.no_grad():
@@ -120,7 +122,7 @@ def validate(model: VAE, pictures: NDArray[np.uint8], device: torch.device | Non
             torch.stack(model.loss(batch, torch.zeros(len(batch), model.config.latent, device=device))) * len(batch)
             for batch in (as_tensor(pictures[start : start + 100], device) for start in range(0, len(pictures), 100))
         ]
-    return Losses(*(torch.stack(parts).sum(dim=0) / len(pictures)).tolist())
+    return VAELossValues(*(torch.stack(parts).sum(dim=0) / len(pictures)).tolist())
 
 
 def held_out_pictures(held_out: Sequence[Path], most: int) -> NDArray[np.uint8]:
@@ -133,7 +135,7 @@ def held_out_pictures(held_out: Sequence[Path], most: int) -> NDArray[np.uint8]:
     return np.concatenate(found)[:most]
 
 
-def quality(model: VAE, held_out: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
+def measure_quality(model: VAE, held_out: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
     """Summed squared error a picture, beside that of the mean picture, and how many latents are active."""
     pictures = held_out_pictures(held_out, VALIDATION_PICTURES)
     mean = pictures.mean(axis=0, dtype=np.float64) / 255

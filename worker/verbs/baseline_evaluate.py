@@ -6,11 +6,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from dreamfleet.common.cores import cores
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.saving import check_out, saving
-from dreamfleet.common.seeds import TEST, VALIDATION
-from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.common.files.atomic_write import check_output_path, open_output
+from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
+from dreamfleet.common.runs.seeds import TEST, VALIDATION
 
 SUMMARY = "judge a baseline on unseen tracks as controllers are judged, in gymnasium's own unmodified environment"
 EXTRAS = ("worker",)
@@ -27,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--first-seed", type=int, default=TEST.start,
         help=f"first track's seed: test tracks from {TEST.start} (default), validation tracks from {VALIDATION.start}",
     )  # fmt: skip
-    parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one a core)")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
     parser.add_argument("--out", type=Path, help="write the same JSON here too, for `compare`")
 
@@ -35,13 +34,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Drive and print the scores."""
     pin_thread_pools()  # of NumPy and torch, which are not loaded yet
-    from dreamfleet.common.judgement import check_fits
+    from dreamfleet.common.runs.evaluation_report import check_seed_range
 
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
-    check_fits(args.first_seed, args.episodes)
+    check_seed_range(args.first_seed, args.episodes)
     if args.out:
-        check_out(args.out)
+        check_output_path(args.out)
     seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
     if not any(seeds[0] in each and seeds[-1] in each for each in (TEST, VALIDATION)):
         print("note: some of these tracks are neither test nor validation tracks", file=sys.stderr)
@@ -50,8 +49,8 @@ def run(args: argparse.Namespace) -> int:
 
     name = args.agent if args.data is None else f"{args.agent} {args.data}"
     judgement = judge(name, find_baseline(args.agent, args.data), seeds, args.jobs)
-    print(judgement.to_json() if args.json else judgement.told, flush=True)
+    print(judgement.to_json() if args.json else judgement.description, flush=True)
     if args.out:
-        with saving(args.out) as file:
+        with open_output(args.out) as file:
             file.write(f"{judgement.to_json()}\n".encode())
     return 0

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.saving import check_out
+from dreamfleet.common.files.atomic_write import check_output_path
 
 SUMMARY = "write a trained baseline as one file, which `evaluate --controller` and `record` take without torch"
 EXTRAS = ("train",)
@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("agent", choices=NAMES, help="drqn; random drivers are none without their chance")
     parser.add_argument("--data", type=Path, required=True, help="the folder of its training")
     parser.add_argument("--out", type=Path, required=True, help="the file to write, NAME.zip")
-    add_json(parser)
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.agent != DRQN:
         raise UsageError(f"{args.agent} learns nothing: there is nothing to export")
-    check_out(args.out)
+    check_output_path(args.out)
     from dreamfleet.worker.baselines.export import export_agent
 
     agent = export_agent(args.data)
@@ -40,5 +40,5 @@ def run(args: argparse.Namespace) -> int:
         f"{made['steps']:,} steps and {made['updates']:,} updates"
     )
     trained = {name: made[name] for name in ("episodes", "steps", "updates")}
-    answer(args, text, agent=args.out, bytes=size, sha256=agent.sha256, **trained)
+    print_answer(args, text, agent=args.out, bytes=size, sha256=agent.sha256, **trained)
     return 0

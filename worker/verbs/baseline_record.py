@@ -7,8 +7,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from dreamfleet.common.stopping import Stop
-from dreamfleet.worker.tools.videos import offer_videos, record_videos, videos_of
+from dreamfleet.common.host.stop_signals import Stop
+from dreamfleet.worker.tools.video_cli import add_video_flags, record_videos, video_paths
 
 SUMMARY = "record a baseline's drives as mp4s"
 EXTRAS = ("worker", "views")
@@ -20,12 +20,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("agent", choices=NAMES, help="who drives")
     parser.add_argument("--data", type=Path, help="of drqn: the folder of its training")
-    offer_videos(parser)
+    add_video_flags(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Record and print the scores."""
-    videos = videos_of(args)
+    videos = video_paths(args)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.worker.baselines.agents import find_baseline
     from dreamfleet.worker.tools.recording import record

@@ -10,14 +10,14 @@ EXTRAS = ("worker",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from dreamfleet.worker.bench import alone
+    from dreamfleet.worker.bench import command
 
-    alone.configure(parser)
+    command.configure(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure on one thread and print."""
-    from dreamfleet.worker.bench.alone import print_figures
+    from dreamfleet.worker.bench.command import print_figures
     from dreamfleet.worker.bench.dream import bench_dream
 
     return print_figures(bench_dream, args)

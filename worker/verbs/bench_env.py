@@ -22,11 +22,11 @@ def run(args: argparse.Namespace) -> int:
     """Measure on one thread, or compare; exit 1 if anything differs."""
     from multiprocessing import get_context
 
-    from dreamfleet.common.store import find_bundle
-    from dreamfleet.common.threads import forget_library_settings, pin_thread_pools
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.host.resource_limits import clear_library_settings, pin_thread_pools
 
     bundle = find_bundle(args.bundle)
-    forget_library_settings()
+    clear_library_settings()
     pin_thread_pools()
     if args.exact:
         return _compare(bundle, args.json)
@@ -44,11 +44,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _compare(bundle: object, as_json: bool) -> int:
-    from dreamfleet.worker.bench.environment import prove_exact
+    from dreamfleet.worker.bench.environment import check_exact
 
     differences = 0
     done = []
-    for what, difference in prove_exact(bundle):  # type: ignore[arg-type]
+    for what, difference in check_exact(bundle):  # type: ignore[arg-type]
         differences += difference is not None
         done.append(what)
         outcome = "the same" if difference is None else f"DIFFERS at step {difference.step}: {difference.what}"

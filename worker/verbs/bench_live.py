@@ -17,8 +17,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, and print a line a task."""
-    from dreamfleet.common.store import find_bundle
-    from dreamfleet.common.threads import pin_thread_pools
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.host.resource_limits import pin_thread_pools
 
     pin_thread_pools()
     from dreamfleet.worker.bench.live import bench_live

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dreamfleet.common.bundle import MOST_RECORDED
+from dreamfleet.common.artifacts.bundle import MAX_RECORDED_STATES
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.saving import check_out
+from dreamfleet.common.files.atomic_write import check_output_path
 
 SUMMARY = "freeze a trained world model into one file that workers fetch by its hash"
 EXTRAS = ("train",)
@@ -28,27 +28,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--measured", type=Path, nargs="+", default=[], metavar="FILE",
         help="figures to keep in its manifest, told by `inspect --json` (--probe, --losses, ...) of it without them",
     )  # fmt: skip
-    add_json(parser)
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Build the bundle and print its identity."""
     from dreamfleet.worker.training.assemble import assemble
 
-    if not 0 <= args.recorded <= MOST_RECORDED:
-        raise UsageError(f"--recorded must be from 0 to {MOST_RECORDED}, not {args.recorded}")
-    check_out(args.out)
+    if not 0 <= args.recorded <= MAX_RECORDED_STATES:
+        raise UsageError(f"--recorded must be from 0 to {MAX_RECORDED_STATES}, not {args.recorded}")
+    check_output_path(args.out)
     bundle = assemble(
         args.data, args.out, args.out.stem, with_weights=args.with_weights, recorded=args.recorded,
         measured=args.measured,
     )  # fmt: skip
     size = bundle.path.stat().st_size / 1e6
     parameters = bundle.controller_shape.size
-    states = bundle.recorded
+    states = bundle.recorded_count
     text = (
         f"{bundle.path}: {size:.1f} MB, sha256 {bundle.sha256}, controllers of {parameters} parameters, "
         f"{states} recorded states"
     )
-    answer(args, text, bundle=bundle.path, bytes=bundle.path.stat().st_size, sha256=bundle.sha256,
+    print_answer(args, text, bundle=bundle.path, bytes=bundle.path.stat().st_size, sha256=bundle.sha256,
            controller_parameters=parameters, recorded=states)  # fmt: skip
     return 0

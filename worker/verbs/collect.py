@@ -7,14 +7,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.cores import cores
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import StoppedError, UsageError
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.presets import preset_help
-from dreamfleet.common.site import offer
+from dreamfleet.common.host.resource_limits import usable_cores
 
 if TYPE_CHECKING:
-    from dreamfleet.worker.training.pilot import Pilot
+    from dreamfleet.worker.training.data.pilot import Pilot
 
 SUMMARY = "drive at random or by controllers, or take in what a run collected, as training data for a world model"
 EXTRAS = ("worker",)
@@ -22,83 +22,83 @@ EXTRAS = ("worker",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from dreamfleet.worker.training.flags import add_config_flags
+    from dreamfleet.worker.training.config_flags import add_config_flags
     from dreamfleet.worker.training.presets import PRESETS
 
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--preset", help=preset_help("training"))
+    parser.add_argument("--preset", help=preset_help_text("training"))
     add_config_flags(parser, "drives", {name: each.collect for name, each in PRESETS.items()})
-    parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one a core)")
     parser.add_argument(
         "--controller", nargs="+", default=[], metavar="CONTROLLER",
         help="who drives the episodes that are missing, in turn, instead of random drivers: files, runs, or what ships",
     )  # fmt: skip
     parser.add_argument("--from-run", metavar="RUN", help="drive nothing: take in what this run collected, each once")
-    offer(parser, "runs_dir")
-    add_json(parser)
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Collect what is missing."""
     if args.from_run is not None:
-        return _take_in(args)
+        return _import_run(args)
     for flag in ("noise", "spells"):
         if hasattr(args, flag) and not args.controller:
             raise UsageError(f"--{flag} is on a controller's actions: give --controller too")
     if hasattr(args, "driver") and args.controller:
         raise UsageError("--driver is who drives at random: leave it or --controller out")
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.common.stopping import heeding_signals
-    from dreamfleet.worker.training.collect import collect, missing, present
-    from dreamfleet.worker.training.flags import changed
-    from dreamfleet.worker.training.origin import agreed_preset, keep_preset
+    from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.common.host.stop_signals import stop_on_signals
+    from dreamfleet.worker.training.config_flags import apply_flags
+    from dreamfleet.worker.training.data.collect import collect, existing_episodes, missing_numbers
+    from dreamfleet.worker.training.data.dataset_preset import resolve_preset, store_preset
     from dreamfleet.worker.training.presets import find_preset
 
-    preset = find_preset(agreed_preset(args.data, args.preset))
-    config, pilots = changed(preset.collect, args), _pilots(args)
+    preset = find_preset(resolve_preset(args.data, args.preset))
+    config, pilots = apply_flags(preset.collect, args), _load_pilots(args)
     frames = done = 0
-    before = len(present(args.data))
-    total = before + len(missing(args.data, config))
-    with progress_bar("collect", total, "episodes") as bar, heeding_signals() as stop:
-        bar.move(before)
-        keep_preset(args.data, preset.name, config.seed)
+    before = len(existing_episodes(args.data))
+    total = before + len(missing_numbers(args.data, config))
+    with progress_bar("collect", total, "episodes") as bar, stop_on_signals() as stop:
+        bar.update(before)
+        store_preset(args.data, preset.name, config.seed)
         with closing(collect(args.data, config, max(1, args.jobs), pilots)) as counts:
             for count in counts:
                 frames, done = frames + count, done + 1
-                bar.move(before + done)
+                bar.update(before + done)
                 if stop():
                     break
-    there = len(present(args.data))  # with those that were written as the others were told to stop
+    there = len(existing_episodes(args.data))  # with those that were written as the others were told to stop
     if there < total:
         raise StoppedError(
             f"stopped: {args.data} keeps {there - before} new episodes, {there} of {total} in all; the same command "
             "goes on"
         )
     text = f"{args.data}: {done} episodes, {frames} frames new; {there} episodes in all"
-    answer(args, text, data=args.data, new_episodes=done, new_frames=frames, episodes=there)
+    print_answer(args, text, data=args.data, new_episodes=done, new_frames=frames, episodes=there)
     return 0
 
 
-def _pilots(args: argparse.Namespace) -> tuple[Pilot, ...]:
+def _load_pilots(args: argparse.Namespace) -> tuple[Pilot, ...]:
     if not args.controller:
         return ()
-    from dreamfleet.common.shelf import bundle_for, find_controller
-    from dreamfleet.worker.training.pilot import Pilot
+    from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+    from dreamfleet.worker.training.data.pilot import Pilot
 
     found = []
     for name in args.controller:
         controller, beside = find_controller(name, args.runs_dir)
-        bundle = bundle_for(controller, None, beside)
+        bundle = find_bundle_of(controller, None, beside)
         if bundle is None:
             raise UsageError(f"controller {name} sees no world model: give one that was evolved with one")
         found.append(Pilot(controller, bundle))
     return tuple(found)
 
 
-def _take_in(args: argparse.Namespace) -> int:
-    from dreamfleet.common.runs import open_run
-    from dreamfleet.worker.training.collect import present
-    from dreamfleet.worker.training.intake import take_in
+def _import_run(args: argparse.Namespace) -> int:
+    from dreamfleet.common.runs.run_folder import open_run
+    from dreamfleet.worker.training.data.collect import existing_episodes
+    from dreamfleet.worker.training.data.import_rollouts import import_rollouts
 
     if args.controller:
         raise UsageError("--from-run drives nothing: leave --controller out")
@@ -106,8 +106,8 @@ def _take_in(args: argparse.Namespace) -> int:
         drives = stored.rollouts()
         if not drives:
             raise UsageError(f"run {args.from_run} has collected nothing: start a run with --collect-every")
-    new = list(take_in(args.data, drives))
+    new = list(import_rollouts(args.data, drives))
     text = f"{args.data}: {len(new)} episodes, {sum(new)} frames new, of {len(drives)} that {args.from_run} collected"
-    answer(args, text, data=args.data, new_episodes=len(new), new_frames=sum(new), collected=len(drives),
-           episodes=len(present(args.data)))  # fmt: skip
+    print_answer(args, text, data=args.data, new_episodes=len(new), new_frames=sum(new), collected=len(drives),
+           episodes=len(existing_episodes(args.data)))  # fmt: skip
     return 0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer
 
 SUMMARY = "drive yourself by keyboard, on the track or in a world model's dream"
 EXTRAS = ("worker",)
@@ -22,25 +22,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scale", type=float, help="enlarge the picture (default: a dream to 640 pixels, the track not)"
     )
-    add_json(parser)
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Drive, and print each episode's score."""
     if not args.dream and (args.bundle is not None or args.temperature is not None):
         raise UsageError("--bundle and --temperature are of a dream: add --dream")
-    from dreamfleet.common.store import find_bundle
-    from dreamfleet.worker.driving.driving import DrivingConfig, drive, some_seed
-    from dreamfleet.worker.driving.scene import Dream, Reality, Scene
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.worker.driving.loop import DrivingConfig, drive, random_seed
+    from dreamfleet.worker.driving.scene import CarRacingScene, DreamScene, Scene
 
-    config = DrivingConfig(some_seed() if args.seed is None else args.seed, args.steps, args.scale)
+    config = DrivingConfig(random_seed() if args.seed is None else args.seed, args.steps, args.scale)
     scene: Scene
     if args.dream:
         temperature = TEMPERATURE if args.temperature is None else args.temperature
-        scene = Dream(find_bundle(args.bundle or BUNDLE), temperature, config.steps)
+        scene = DreamScene(find_bundle(args.bundle or BUNDLE), temperature, config.steps)
     else:
-        scene = Reality(config.steps)
+        scene = CarRacingScene(config.steps)
     for driven in drive(scene, config):
         text = f"score {driven.score:.1f} in {driven.steps} steps, seed {config.seed}"
-        answer(args, text, score=driven.score, steps=driven.steps, seed=config.seed)
+        print_answer(args, text, score=driven.score, steps=driven.steps, seed=config.seed)
     return 0

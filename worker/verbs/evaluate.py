@@ -7,16 +7,15 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.cores import cores
+from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.saving import check_out, saving
-from dreamfleet.common.seeds import TEST
-from dreamfleet.common.site import offer, reached
-from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.common.files.atomic_write import check_output_path, open_output
+from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
+from dreamfleet.common.runs.seeds import TEST
 
 if TYPE_CHECKING:
-    from dreamfleet.common.evaluated import Drive
-    from dreamfleet.common.judgement import Judgement
+    from dreamfleet.common.runs.episode_results import EpisodeResult
+    from dreamfleet.common.runs.evaluation_report import EvaluationReport
     from dreamfleet.worker.scoring.agents import Agent
 
 SUMMARY = "judge a controller on unseen seeds, in gymnasium's own unmodified environment"
@@ -27,12 +26,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--controller", help="a file, a run, one that ships, or a trained agent's file")
     parser.add_argument("--run", dest="run_name", metavar="RUN", help="judge what this live run reports instead")
-    offer(parser, "connect", texts={"connect": "ask the live run here (give --run too where there are several)"})
+    add_global_flags(
+        parser, "connect", texts={"connect": "ask the live run here (give --run too where there are several)"}
+    )
     parser.add_argument("--episodes", type=int, default=100, help="whole episodes, one a seed (default 100)")
     parser.add_argument("--first-seed", type=int, default=TEST.start, help=f"the first seed (default {TEST.start})")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
-    parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
-    offer(parser, "runs_dir")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one a core)")
+    add_global_flags(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
     parser.add_argument("--out", type=Path, help="write the same JSON here too, for `compare` and `reproduce`")
 
@@ -40,54 +41,54 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Drive and print the scores."""
     pin_thread_pools()  # of NumPy, which is not loaded yet: its threads take three times the time of a drive otherwise
-    from dreamfleet.common.judgement import check_fits
+    from dreamfleet.common.runs.evaluation_report import check_seed_range
 
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
-    check_fits(args.first_seed, args.episodes)
+    check_seed_range(args.first_seed, args.episodes)
     if args.out:
-        check_out(args.out)
-    name, agent = _choose(args)
+        check_output_path(args.out)
+    name, agent = _choose_agent(args)
     seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
     if seeds[0] not in TEST or seeds[-1] not in TEST:
         some = "some" if seeds[0] < TEST.stop and seeds[-1] >= TEST.start else "none"
         print(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; {some} of these are among them", file=sys.stderr)
     judgement = judge(name, agent, seeds, args.jobs)
-    print(judgement.to_json() if args.json else judgement.told, flush=True)
+    print(judgement.to_json() if args.json else judgement.description, flush=True)
     if args.out:
-        with saving(args.out) as file:
+        with open_output(args.out) as file:
             file.write(f"{judgement.to_json()}\n".encode())
     return 0
 
 
-def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> Judgement:
+def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> EvaluationReport:
     """Drive one whole episode a seed, with a progress bar."""
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.tools.evaluation import judgement
+    from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.worker.tools.evaluation import run_evaluation
 
-    def move(drives: list[Drive]) -> None:
-        bar.move(len(drives), f"mean {sum(each.score for each in drives) / len(drives):.1f}")
+    def move(drives: list[EpisodeResult]) -> None:
+        bar.update(len(drives), f"mean {sum(each.score for each in drives) / len(drives):.1f}")
 
     with progress_bar("evaluate", len(seeds), "episodes") as bar:
-        return judgement(name, agent, seeds, jobs, move)
+        return run_evaluation(name, agent, seeds, jobs, move)
 
 
-def _choose(args: argparse.Namespace) -> tuple[str, Agent]:
+def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
     """Whom to judge, by name: from here, or from a live run."""
-    from dreamfleet.common.client import Client
-    from dreamfleet.common.shelf import bundle_for, find_agent
-    from dreamfleet.worker.scoring.agents import agent_of
-    from dreamfleet.worker.service.bundle_fetch import fetch_for
+    from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
+    from dreamfleet.worker.scoring.agents import make_agent
+    from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
     live = bool(args.run_name) or bool({"connect", "join"} & args.given)
     if live and not args.controller:
-        with Client(reached(args)) as client:
+        with Client(resolve_network(args)) as client:
             run = args.run_name or client.status().run
             reported = client.controller(run)
             if args.bundle is None:
-                return run, agent_of(reported, fetch_for(reported, client.session, run))
-        return run, agent_of(reported, bundle_for(reported, args.bundle))
+                return run, make_agent(reported, fetch_bundle_of(reported, client.session, run))
+        return run, make_agent(reported, find_bundle_of(reported, args.bundle))
     if live or not args.controller:
         raise UsageError("give either --controller, or --run (and --connect) to judge what a live run reports")
     controller, beside = find_agent(args.controller, args.runs_dir)
-    return args.controller, agent_of(controller, bundle_for(controller, args.bundle, beside))
+    return args.controller, make_agent(controller, find_bundle_of(controller, args.bundle, beside))

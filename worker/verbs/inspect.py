@@ -9,17 +9,17 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer, print_rows
-from dreamfleet.common.seeds import VALIDATION
-from dreamfleet.common.site import offer
-from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.runs.seeds import VALIDATION
 
 if TYPE_CHECKING:
-    from dreamfleet.common.bundle import Bundle
-    from dreamfleet.worker.inspection.inspection import Subject
-    from dreamfleet.worker.inspection.measuring import Driving
-    from dreamfleet.worker.inspection.witness import WitnessConfig
+    from dreamfleet.common.artifacts.bundle import Bundle
+    from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDriveConfig
+    from dreamfleet.worker.inspection.measurements import DriverChoice
+    from dreamfleet.worker.inspection.page_builder import InspectionSubject
 
 SUMMARY = "look into a world model: what it sees, keeps and dreams, and how it learnt, as one page, or as figures"
 EXTRAS = ("worker", "views")
@@ -67,8 +67,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     figures.add_argument("--noise", type=float, default=0.3, help="added to actions, of half their range (default 0.3)")
     figures.add_argument("--temperature", type=float, help="of the dreams (default the run's, else 1.0)")
-    offer(parser, "runs_dir")
-    add_json(parser)
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -84,61 +84,63 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--driver drives for figures: give --probe too")
     if not args.subject and not args.data:
         raise UsageError("give a bundle or a run to look into, or --data folders whose trainings to draw")
-    return _draw(args)
+    return _draw_page(args)
 
 
-def _draw(args: argparse.Namespace) -> int:
+def _draw_page(args: argparse.Namespace) -> int:
     if args.steps < 2 or args.seed < 0:
         raise UsageError("--steps must be at least 2 and --seed at least 0")
     if args.action and args.controller:
         raise UsageError("one drives: give --controller or --action")
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.inspection.inspection import inspect
-    from dreamfleet.worker.inspection.rollout import DriveConfig
+    from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.worker.inspection.encoded_rollout import DriveConfig
+    from dreamfleet.worker.inspection.page_builder import write_page
 
     with ExitStack() as held:
-        subject = _driven(args, _found(args, held))
+        subject = _with_driver(args, _open_subject(args, held))
         if args.action and subject.bundle is None:
             raise UsageError("--action is driven beside a world model's dream: name a bundle, or a run with one")
         sections = SECTIONS + len(args.data)
         config = DriveConfig(args.seed, args.steps, tuple(args.action or ()))
         bar = held.enter_context(progress_bar("inspect", sections, "sections"))
-        page = inspect(subject, args.out, config, args.data, bar.move, args.picture)
-        bar.move(sections)
-    answer(args, str(page), page=page)
+        page = write_page(subject, args.out, config, args.data, bar.update, args.picture)
+        bar.update(sections)
+    print_answer(args, str(page), page=page)
     return 0
 
 
 def _measure(args: argparse.Namespace) -> int:
     pin_thread_pools()  # of NumPy, which is not loaded yet
-    from dreamfleet.worker.inspection.witness import WitnessConfig
+    from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDriveConfig
 
-    _check(args)
+    _check_figure_flags(args)
     with ExitStack() as held:
-        subject = _subject(args, held)
-        bundle, driving = _choose(args, subject)
-        config = WitnessConfig(args.noise, first_seed=args.seed, anywhere=bool(driving.driver))
+        subject = _open_measured_subject(args, held)
+        bundle, driving = _choose_driver(args, subject)
+        config = DisturbedDriveConfig(args.noise, first_seed=args.seed, anywhere=bool(driving.driver))
         found: dict[str, Any] = {"bundle": bundle.sha256, "noise": args.noise, "first_seed": args.seed}
         found["driver"] = driving.driver or (driving.controller and driving.controller.sha256)
         if args.probe:
-            found["probe"] = _probe(args, bundle, driving, config)
+            found["probe"] = _measure_probe(args, bundle, driving, config)
         if args.likeness:
-            found["likeness"] = _liken(args, bundle, driving, config, _temperature(args, subject))
+            found["likeness"] = _measure_likeness(args, bundle, driving, config, _temperature(args, subject))
         if args.losses:
-            found["losses"] = _lose(args, bundle, driving, config, _temperature(args, subject))
+            found["losses"] = _measure_losses(args, bundle, driving, config, _temperature(args, subject))
     if args.json:
-        answer(args, "", **found)
+        print_answer(args, "", **found)
     return 0
 
 
-def _probe(args: argparse.Namespace, bundle: Bundle, driving: Driving, config: WitnessConfig) -> dict[str, Any]:
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.inspection.measuring import probe
+def _measure_probe(
+    args: argparse.Namespace, bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig
+) -> dict[str, Any]:
+    from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.worker.inspection.measurements import probe
     from dreamfleet.worker.inspection.tables import knowledge_rows, knowledge_text
 
     drives = DRIVES if args.episodes is None else args.episodes
     with progress_bar("probe", drives, "drives") as bar:
-        known = probe(bundle, driving, config, drives, bar.move)
+        known = probe(bundle, driving, config, drives, bar.update)
     if not args.json:
         rows = knowledge_rows(known)
         print_rows(rows, right=tuple(rows[0])[1:])
@@ -146,17 +148,17 @@ def _probe(args: argparse.Namespace, bundle: Bundle, driving: Driving, config: W
     return asdict(known)
 
 
-def _liken(
-    args: argparse.Namespace, bundle: Bundle, driving: Driving, config: WitnessConfig, temperature: float
+def _measure_likeness(
+    args: argparse.Namespace, bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig, temperature: float
 ) -> dict[str, Any]:
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.inspection.losses import LossConfig
-    from dreamfleet.worker.inspection.measuring import likeness
+    from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.worker.inspection.measurements import likeness
+    from dreamfleet.worker.inspection.road_losses import RoadLossConfig
     from dreamfleet.worker.inspection.tables import LIKENESS, likeness_rows
 
-    drives, wanted = DRIVES if args.episodes is None else args.episodes, LossConfig(temperature=temperature)
+    drives, wanted = DRIVES if args.episodes is None else args.episodes, RoadLossConfig(temperature=temperature)
     with progress_bar("likeness", drives, "drives") as bar:
-        compared = likeness(bundle, driving, config, wanted, drives, bar.move)
+        compared = likeness(bundle, driving, config, wanted, drives, bar.update)
     if not args.json:
         rows = likeness_rows(compared)
         print_rows(rows, right=tuple(rows[0])[1:])
@@ -165,17 +167,17 @@ def _liken(
     return {**facts, "quantities": [asdict(each) for each in compared]}
 
 
-def _lose(
-    args: argparse.Namespace, bundle: Bundle, driving: Driving, config: WitnessConfig, temperature: float
+def _measure_losses(
+    args: argparse.Namespace, bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig, temperature: float
 ) -> dict[str, Any]:
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.worker.inspection.losses import LossConfig
-    from dreamfleet.worker.inspection.measuring import dream_losses
+    from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.worker.inspection.measurements import measure_dream_losses
+    from dreamfleet.worker.inspection.road_losses import RoadLossConfig
     from dreamfleet.worker.inspection.tables import loss_rows, loss_text
 
-    wanted = LossConfig(LOSSES if args.episodes is None else args.episodes, temperature=temperature)
+    wanted = RoadLossConfig(LOSSES if args.episodes is None else args.episodes, temperature=temperature)
     with progress_bar("losses", wanted.losses, "losses") as bar:
-        compared, drives = dream_losses(bundle, driving, config, wanted, bar.move)
+        compared, drives = measure_dream_losses(bundle, driving, config, wanted, bar.update)
     if not args.json:
         rows = loss_rows(compared)
         print_rows(rows, right=("n", *tuple(rows[0])[3:]))
@@ -184,20 +186,20 @@ def _lose(
     return {**facts, "begun": [asdict(each) for each in compared]}
 
 
-def _driven(args: argparse.Namespace, subject: Subject) -> Subject:
+def _with_driver(args: argparse.Namespace, subject: InspectionSubject) -> InspectionSubject:
     """The subject with who drives for its page, where that is said."""
     if not args.controller:
         return subject
-    bundle, driving = _choose(args, subject)
+    bundle, driving = _choose_driver(args, subject)
     controller, own = driving.controller, driving.own
     if controller is None or own is None:
         raise UsageError(f"controller {args.controller} sees no world model: give one that was evolved with one")
     if controller.bundle == bundle.sha256:
-        return replace(subject, bundle=bundle.fitting(controller), controller=controller)
-    return replace(subject, bundle=bundle, controller=controller, own=own.fitting(controller))
+        return replace(subject, bundle=bundle.for_controller(controller), controller=controller)
+    return replace(subject, bundle=bundle, controller=controller, own=own.for_controller(controller))
 
 
-def _check(args: argparse.Namespace) -> None:
+def _check_figure_flags(args: argparse.Namespace) -> None:
     fewest, what = (FEWEST_LOSSES, "losses, for --losses") if args.losses else (FEWEST_DRIVES, "drives")
     if args.episodes is not None and args.episodes < fewest:
         raise UsageError(f"--episodes must be at least {fewest} {what}, not {args.episodes}")
@@ -207,20 +209,20 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("one drives: give --controller or --driver")
 
 
-def _subject(args: argparse.Namespace, held: ExitStack) -> Subject:
-    subject = _found(args, held)
+def _open_measured_subject(args: argparse.Namespace, held: ExitStack) -> InspectionSubject:
+    subject = _open_subject(args, held)
     if args.subject and subject.bundle is None:
         raise UsageError(f"run {args.subject} has no world model to measure: name a bundle, or a run with one")
     return subject
 
 
-def _found(args: argparse.Namespace, held: ExitStack) -> Subject:
-    from dreamfleet.worker.inspection.inspection import Subject, find_subject
+def _open_subject(args: argparse.Namespace, held: ExitStack) -> InspectionSubject:
+    from dreamfleet.worker.inspection.page_builder import InspectionSubject, find_subject
 
-    return held.enter_context(find_subject(args.subject, args.runs_dir)) if args.subject else Subject(None)
+    return held.enter_context(find_subject(args.subject, args.runs_dir)) if args.subject else InspectionSubject(None)
 
 
-def _temperature(args: argparse.Namespace, subject: Subject) -> float:
+def _temperature(args: argparse.Namespace, subject: InspectionSubject) -> float:
     from dreamfleet.worker.dream.batch import DEFAULT_TEMPERATURE
 
     if args.temperature is not None:
@@ -228,21 +230,21 @@ def _temperature(args: argparse.Namespace, subject: Subject) -> float:
     return (subject.run.spec.temperature if subject.run else 0.0) or DEFAULT_TEMPERATURE
 
 
-def _choose(args: argparse.Namespace, subject: Subject) -> tuple[Bundle, Driving]:
+def _choose_driver(args: argparse.Namespace, subject: InspectionSubject) -> tuple[Bundle, DriverChoice]:
     """What is measured, and who drives."""
-    from dreamfleet.common.shelf import bundle_for, find_controller
-    from dreamfleet.worker.inspection.measuring import Driving
+    from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+    from dreamfleet.worker.inspection.measurements import DriverChoice
 
     controller, own = subject.controller, subject.bundle
     if args.controller:
         controller, beside = find_controller(args.controller, args.runs_dir)
         if own is None or controller.bundle != own.sha256:
-            own = bundle_for(controller, None, beside)
+            own = find_bundle_of(controller, None, beside)
     bundle = subject.bundle or own
     if bundle is None:
         raise UsageError("give a bundle or a run to measure, or a --controller that has a world model")
     if args.driver:
-        return bundle, Driving(driver=args.driver)
+        return bundle, DriverChoice(driver=args.driver)
     if controller is None:
         raise UsageError("nobody drives: give --controller, or for --probe a --driver")
-    return bundle, Driving(controller, own)
+    return bundle, DriverChoice(controller, own)

@@ -10,19 +10,19 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.cli.global_config import add_global_flags, add_run_argument, resolve_network
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.seeds import TEST
-from dreamfleet.common.site import offer, offer_run, reached
+from dreamfleet.common.runs.seeds import TEST
 
 if TYPE_CHECKING:
-    from dreamfleet.common.bundle import Bundle
-    from dreamfleet.common.client import Client
-    from dreamfleet.common.messages import TaskSpec
-    from dreamfleet.worker.tools.glass import Shown
-    from dreamfleet.worker.tools.live import Driver
-    from dreamfleet.worker.tools.outlets import Show
+    from dreamfleet.common.artifacts.bundle import Bundle
+    from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.protocol.messages import TaskSpec
+    from dreamfleet.worker.tools.frame_sinks import SendFrame
+    from dreamfleet.worker.tools.live_sources import Driver
+    from dreamfleet.worker.tools.live_view import CaptionedFrame
 
 SUMMARY = "watch what a worker scores, the best mean, or a controller: its drive, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")  # a window needs only the first
@@ -32,8 +32,8 @@ LONGEST = 20  # seconds of pictures in files, unless told otherwise
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    offer(parser, "connect")
-    offer_run(parser)
+    add_global_flags(parser, "connect")
+    add_run_argument(parser)
     whom = parser.add_mutually_exclusive_group()
     whom.add_argument("--worker", metavar="NAME", help="what this worker scores (default: the busiest worker's)")
     whom.add_argument("--best", action="store_true", help="the run's best mean so far, driven here track after track")
@@ -55,8 +55,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", help="no window: an .mp4, a folder for PNGs, or - for a stream of JPEGs")
     parser.add_argument("--bundle", help="of --controller: the world model (default: the one that it names)")
     parser.add_argument("--temperature", type=float, default=1.0, help="of the dream (default 1.0)")
-    offer(parser, "runs_dir")
-    add_json(parser)
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,13 +65,13 @@ def run(args: argparse.Namespace) -> int:
     os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"  # a greeting on stdout, where a stream may go
     if args.out is not None:
         os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from dreamfleet.common.stopping import heeding_signals
+    from dreamfleet.common.host.stop_signals import stop_on_signals
 
     with ExitStack() as stack:
-        show = stack.enter_context(_outlet(args))  # what cannot be shown is said before anything is asked
-        pictures = stack.enter_context(_pictures(args))
-        stop = stack.enter_context(heeding_signals())
-        seconds = LONGEST if args.seconds is None and _in_files(args) else args.seconds
+        show = stack.enter_context(_open_sink(args))  # what cannot be shown is said before anything is asked
+        pictures = stack.enter_context(_open_pictures(args))
+        stop = stack.enter_context(stop_on_signals())
+        seconds = LONGEST if args.seconds is None and _writes_files(args) else args.seconds
         most = None if seconds is None else max(1, round(seconds * args.fps))
         made = 0
         for shown in pictures:
@@ -79,8 +79,8 @@ def run(args: argparse.Namespace) -> int:
             made += shown is not None
             if not wanted or stop() or made == most:
                 break
-    if _in_files(args):
-        answer(args, f"{args.out}: {made} pictures", out=args.out, pictures=made)
+    if _writes_files(args):
+        print_answer(args, f"{args.out}: {made} pictures", out=args.out, pictures=made)
     return 0
 
 
@@ -94,65 +94,67 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--generation is of a run on this disk: name it with --controller")
 
 
-def _in_files(args: argparse.Namespace) -> bool:
+def _writes_files(args: argparse.Namespace) -> bool:
     """Whether nobody looks while it runs."""
     return args.out not in (None, "-")
 
 
-def _outlet(args: argparse.Namespace) -> AbstractContextManager[Show]:
+def _open_sink(args: argparse.Namespace) -> AbstractContextManager[SendFrame]:
     if args.out is None:
         return _window(args.controller or args.run_name or "live")
-    from dreamfleet.worker.tools.outlets import outlet
+    from dreamfleet.worker.tools.frame_sinks import open_sink
 
-    return outlet(args.out, args.fps, sys.stdout.buffer)
+    return open_sink(args.out, args.fps, sys.stdout.buffer)
 
 
 @contextmanager
-def _window(name: str) -> Iterator[Show]:
-    from dreamfleet.worker.driving.screen import Screen
+def _window(name: str) -> Iterator[SendFrame]:
+    from dreamfleet.worker.driving.picture_window import PictureWindow
 
-    with Screen(name) as screen:
+    with PictureWindow(name) as screen:
         yield lambda shown: screen.draw(None if shown is None else shown.picture)
 
 
 @contextmanager
-def _pictures(args: argparse.Namespace) -> Iterator[Iterator[Shown | None]]:
-    from dreamfleet.common.client import Client
+def _open_pictures(args: argparse.Namespace) -> Iterator[Iterator[CaptionedFrame | None]]:
+    from dreamfleet.common.monitoring.client import Client
 
     if args.controller:
-        yield _drives(args, _found(args))
+        yield _drive_pictures(args, _named_driver(args))
         return
-    with Client(reached(args)) as client:
+    with Client(resolve_network(args)) as client:
         if args.best:
             name = args.run_name or client.status().run
-            yield _drives(args, lambda: _best(client, name))
+            yield _drive_pictures(args, lambda: _best_driver(client, name))
         else:
-            with _watched(args, client) as pictures:
+            with _worker_pictures(args, client) as pictures:
                 yield pictures
 
 
 @contextmanager
-def _watched(args: argparse.Namespace, client: Client) -> Iterator[Iterator[Shown | None]]:
+def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Iterator[CaptionedFrame | None]]:
     """What a worker of the run does."""
-    from dreamfleet.common.codec import Inbox
-    from dreamfleet.common.live import LiveView
-    from dreamfleet.common.store import BundleStore, default_cache
-    from dreamfleet.common.variants import Variant
-    from dreamfleet.worker.service.bundle_fetch import obtain
-    from dreamfleet.worker.tools.glass import Glass, Imagination
-    from dreamfleet.worker.tools.live import watched
+    from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
+    from dreamfleet.common.artifacts.car_racing_variants import Variant
+    from dreamfleet.common.monitoring.live import LiveView
+    from dreamfleet.common.protocol.codec import CountingDecoder
+    from dreamfleet.worker.service.bundle_fetch import fetch_bundle
+    from dreamfleet.worker.tools.live_sources import worker_frames
+    from dreamfleet.worker.tools.live_view import LiveCanvas, LiveDreamer
 
     with LiveView(client, args.run_name, args.worker) as view:
         spec = view.status.settings.task
-        glass = Glass(view.run)
+        glass = LiveCanvas(view.run)
         if spec.bundle:
-            bundle = obtain(client.session, view.run, spec.bundle, BundleStore(default_cache()), Inbox())
+            bundle = fetch_bundle(
+                client.session, view.run, spec.bundle, BundleStore(default_cache()), CountingDecoder()
+            )
             assert bundle is not None  # nobody stops it
-            fitting = bundle.under(spec.controller, Variant.of(spec.options))
-            glass = Glass(view.run, _action_names(spec, fitting), Imagination(fitting, args.temperature))
+            fitting = bundle.with_controllers(spec.controller, Variant.from_json(spec.options))
+            glass = LiveCanvas(view.run, _action_names(spec, fitting), LiveDreamer(fitting, args.temperature))
         print(f"watching run {view.run}; its workers: {view.status.workers.present}", file=sys.stderr)
-        yield watched(view, glass, args.fps)
-        if view.over:
+        yield worker_frames(view, glass, args.fps)
+        if view.is_over:
             print(f"run {view.run} {view.status.state}: {one_line(view.status.why)}", file=sys.stderr)
 
 
@@ -165,35 +167,35 @@ def _action_names(spec: TaskSpec, bundle: Bundle) -> tuple[str, ...]:
     return find_task(spec.task).world_of(Assignment(spec, bundle)).action_names if known else ()
 
 
-def _drives(args: argparse.Namespace, driver: Callable[[], Driver]) -> Iterator[Shown]:
+def _drive_pictures(args: argparse.Namespace, driver: Callable[[], Driver]) -> Iterator[CaptionedFrame]:
     """A controller's drives; in a file as fast as they can be made, elsewhere at the world's pace."""
-    from dreamfleet.worker.dream.daydream import DaydreamConfig
-    from dreamfleet.worker.tools.live import driven, paced
+    from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
+    from dreamfleet.worker.tools.live_sources import driven_frames, limit_rate
 
-    pictures = driven(driver, DaydreamConfig(args.temperature), args.fps, args.seed)
-    return pictures if _in_files(args) else paced(pictures, args.fps)
+    pictures = driven_frames(driver, ParallelDreamConfig(args.temperature), args.fps, args.seed)
+    return pictures if _writes_files(args) else limit_rate(pictures, args.fps)
 
 
-def _best(client: Client, run: str) -> Driver:
+def _best_driver(client: Client, run: str) -> Driver:
     """The run's best mean as it is now."""
-    from dreamfleet.worker.scoring.agents import agent_of
-    from dreamfleet.worker.service.bundle_fetch import fetch_for
+    from dreamfleet.worker.scoring.agents import make_agent
+    from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
     reported = client.controller(run)
     facts = {"run": run, "generation": reported.provenance.get("generation")}
-    return agent_of(reported, fetch_for(reported, client.session, run)), facts
+    return make_agent(reported, fetch_bundle_of(reported, client.session, run)), facts
 
 
-def _found(args: argparse.Namespace) -> Callable[[], Driver]:
+def _named_driver(args: argparse.Namespace) -> Callable[[], Driver]:
     """Whom `--controller` names."""
-    from dreamfleet.common.shelf import bundle_for, find_agent, find_mean
-    from dreamfleet.worker.scoring.agents import agent_of
+    from dreamfleet.common.runs.lookup import find_agent, find_bundle_of, find_evaluated_mean
+    from dreamfleet.worker.scoring.agents import make_agent
 
     if args.generation is not None:
-        mean, folder = find_mean(args.controller, args.runs_dir, args.generation)
-        agent = agent_of(mean, bundle_for(mean, args.bundle, folder))
+        mean, folder = find_evaluated_mean(args.controller, args.runs_dir, args.generation)
+        agent = make_agent(mean, find_bundle_of(mean, args.bundle, folder))
     else:
         controller, beside = find_agent(args.controller, args.runs_dir)
-        agent = agent_of(controller, bundle_for(controller, args.bundle, beside))
+        agent = make_agent(controller, find_bundle_of(controller, args.bundle, beside))
     facts = {"controller": args.controller, "generation": args.generation}
     return lambda: (agent, facts)

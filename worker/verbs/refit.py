@@ -6,11 +6,11 @@ import argparse
 import math
 from pathlib import Path
 
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.saving import check_out, told
-from dreamfleet.common.site import offer
-from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
+from dreamfleet.common.host.resource_limits import pin_thread_pools
 
 SUMMARY = "fit a controller to another world model, so that it chooses there what it chose, on recorded drives"
 EXTRAS = ("worker",)
@@ -27,8 +27,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--episodes", type=int, default=DRIVES, help=f"drives at most, the folder's last ones (default {DRIVES})"
     )
-    offer(parser, "runs_dir")
-    add_json(parser)
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -36,29 +36,31 @@ def run(args: argparse.Namespace) -> int:
     pin_thread_pools()  # of NumPy, which is not loaded yet
     if args.episodes < 2:
         raise UsageError(f"--episodes must be at least 2, not {args.episodes}")
-    check_out(args.out)
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.common.shelf import bundle_for, find_controller
-    from dreamfleet.common.store import find_bundle
-    from dreamfleet.worker.training.refit import last_drives, outputs_of, refit
+    check_output_path(args.out)
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+    from dreamfleet.worker.training.refit import last_drives, output_names, refit
 
     controller, beside = find_controller(args.controller, args.runs_dir)
-    own = bundle_for(controller, args.bundle, beside)
+    own = find_bundle_of(controller, args.bundle, beside)
     if own is None:
         raise UsageError(f"controller {args.controller} sees no world model: give one that was evolved with one")
     paths = last_drives(args.data, args.episodes)
     with progress_bar("refit", len(paths), "drives") as bar:
-        fitted = refit(controller, own, find_bundle(args.to), paths, bar.move)
-    with told(args.out):
+        fitted = refit(controller, own, find_bundle(args.to), paths, bar.update)
+    with reporting_write_errors(args.out):
         fitted.controller.save(args.out)
     r_squared = [None if math.isnan(each) else round(each, 4) for each in fitted.r_squared]
-    spoken = ", ".join(f"{name} {'not told' if each is None else f'{each:.2f}'}"
-                       for name, each in zip(outputs_of(fitted.controller, own), r_squared, strict=False))  # fmt: skip
+    spoken = ", ".join(
+        f"{name} {'not told' if each is None else f'{each:.2f}'}"
+        for name, each in zip(output_names(fitted.controller, own), r_squared, strict=False)
+    )
     text = f"{args.out}: fitted on {fitted.steps} steps of {fitted.drives} drives; R² on held-out ones: {spoken}"
     if None in r_squared:
         text += " (too few drives, or it never moves)"
     if not fitted.drives:
         text = f"{args.out}: the same parameters, since both models see and remember alike"
-    answer(args, text, controller=args.out, sha256=fitted.controller.sha256, bundle=fitted.controller.bundle,
+    print_answer(args, text, controller=args.out, sha256=fitted.controller.sha256, bundle=fitted.controller.bundle,
            drives=fitted.drives, steps=fitted.steps, r_squared=r_squared)  # fmt: skip
     return 0

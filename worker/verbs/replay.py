@@ -9,11 +9,11 @@ import re
 import sys
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.errors import JournalError, UsageError
-from dreamfleet.common.site import offer
 
 if TYPE_CHECKING:
-    from dreamfleet.worker.tools.replay import Replayed
+    from dreamfleet.worker.tools.replay import ReplayedEpisode
 
 SUMMARY = "score a candidate of a run again and compare with the journal, to the bit on a host of the same class"
 EXTRAS = ("worker",)
@@ -25,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--candidate", required=True, metavar="G/I", help="generation and index, such as 3/0")
     parser.add_argument("--tolerance", type=float, metavar="N", help="by so much a fitness may differ that "
                         "a host of another class scored (default: it is not checked)")  # fmt: skip
-    offer(parser, "runs_dir")
+    add_global_flags(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print the episodes as JSON")
 
 
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     """Replay each episode; exit 1 if one differs that this host can check, or if it can check none."""
     import numpy as np
 
-    from dreamfleet.common.runs import open_run
+    from dreamfleet.common.runs.run_folder import open_run
     from dreamfleet.worker.tools.replay import replay
 
     found = re.fullmatch(r"(\d{1,12})/(\d{1,12})", args.candidate)
@@ -57,14 +57,14 @@ def run(args: argparse.Namespace) -> int:
     else:
         for each in episodes:
             print(f"episode {each.episode}  seed {each.seed}  stored {each.stored!r}  replayed {each.replayed!r}  "
-                  f"{_mark(each, args.tolerance)}")  # fmt: skip
+                  f"{_describe_match(each, args.tolerance)}")  # fmt: skip
     if unchecked:
         print(f"{unchecked} of {len(episodes)} episodes were scored by hosts of another class: whether they are right "
               "cannot be checked here to the bit; --tolerance N compares them", file=sys.stderr)  # fmt: skip
     return 0 if False not in agree and True in agree else 1
 
 
-def _mark(each: Replayed, tolerance: float | None) -> str:
+def _describe_match(each: ReplayedEpisode, tolerance: float | None) -> str:
     if each.same:
         return "same bits"
     agrees = each.agrees(tolerance)

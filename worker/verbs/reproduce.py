@@ -7,15 +7,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.cores import cores
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.site import offer
-from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
 
 if TYPE_CHECKING:
-    from dreamfleet.common.judgement import Judgement
-    from dreamfleet.common.reproduction import Reproduction
+    from dreamfleet.common.runs.evaluation_report import EvaluationReport
+    from dreamfleet.common.runs.reproduction import Reproduction
 
 SUMMARY = "drive recorded controllers again on their recorded seeds, and compare with what `evaluate --out` wrote"
 EXTRAS = ("worker",)
@@ -26,30 +25,33 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("reports", metavar="REPORT", nargs="+", type=Path, help="files of `evaluate --out`")
     parser.add_argument("--episodes", type=int, help="drive only the first so many seeds of each (default all)")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
-    parser.add_argument("--jobs", type=int, default=cores(), help="processes (default one a core)")
-    offer(parser, "runs_dir")
-    add_json(parser)
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one a core)")
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Say of each report whether it holds; exit 1 if one does not."""
     pin_thread_pools()  # of NumPy, which is not loaded yet
-    from dreamfleet.common.judgement import read_judgement
+    from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 
     if args.jobs < 1 or (args.episodes is not None and args.episodes < 1):
         raise UsageError("--episodes and --jobs must be at least 1")
-    found = [_again(args, path, recorded) for path, recorded in [(each, read_judgement(each)) for each in args.reports]]
+    found = [
+        _reproduce(args, path, recorded)
+        for path, recorded in [(each, read_evaluation_report(each)) for each in args.reports]
+    ]
     rows = [{"report": path, **_row(each)} for path, each in zip(args.reports, found, strict=True)]
-    holds = all(each.holds for each in found)
-    answer(args, "\n".join(each.told for each in found), reproduced=holds, reports=rows)
+    holds = all(each.is_reproduced for each in found)
+    print_answer(args, "\n".join(each.description for each in found), reproduced=holds, reports=rows)
     return 0 if holds else 1
 
 
-def _again(args: argparse.Namespace, path: Path, recorded: Judgement) -> Reproduction:
+def _reproduce(args: argparse.Namespace, path: Path, recorded: EvaluationReport) -> Reproduction:
     """Drive one report's controller again."""
-    from dreamfleet.common.reproduction import Reproduction
-    from dreamfleet.common.shelf import bundle_for, find_agent
-    from dreamfleet.worker.scoring.agents import agent_of
+    from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
+    from dreamfleet.common.runs.reproduction import Reproduction
+    from dreamfleet.worker.scoring.agents import make_agent
     from dreamfleet.worker.verbs.evaluate import judge
 
     controller, beside = find_agent(recorded.name, args.runs_dir)
@@ -58,18 +60,24 @@ def _again(args: argparse.Namespace, path: Path, recorded: Judgement) -> Reprodu
             f"{path} records the controller {recorded.controller[:12]}, and {recorded.name} is "
             f"{controller.sha256[:12]}: take the one that was recorded, or record this one with `dreamfleet evaluate`"
         )
-    bundle = bundle_for(controller, args.bundle, beside)
+    bundle = find_bundle_of(controller, args.bundle, beside)
     if bundle is not None and bundle.sha256 != recorded.bundle:
         raise BundleError(
             f"{path} records drives by the world model {recorded.bundle[:12] or 'of none'}, and this is "
             f"{bundle.sha256[:12]}: give that one by --bundle"
         )
-    seeds = recorded.evaluated.seeds[: args.episodes]
-    again = judge(recorded.name, agent_of(controller, bundle), seeds, args.jobs)
+    seeds = recorded.results.seeds[: args.episodes]
+    again = judge(recorded.name, make_agent(controller, bundle), seeds, args.jobs)
     return Reproduction(recorded, again)
 
 
 def _row(found: Reproduction) -> dict[str, object]:
     difference = asdict(found.difference) if len(found.pairs) > 1 else None
-    return {"name": found.recorded.name, "reproduced": found.holds, "same_host": found.same_host,
-            "differing": found.differing, "mean": found.again.evaluated.mean, "difference": difference}  # fmt: skip
+    return {
+        "name": found.recorded.name,
+        "reproduced": found.is_reproduced,
+        "same_host": found.same_fingerprint,
+        "differing": found.differing_seeds,
+        "mean": found.repeated.results.mean,
+        "difference": difference,
+    }

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.listing import add_json, answer
-from dreamfleet.common.saving import check_out, told
-from dreamfleet.common.threads import pin_thread_pools
+from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
+from dreamfleet.common.host.resource_limits import pin_thread_pools
 
 SUMMARY = "find a few features that foretell what a driver will do and earn, for a search in them (--subspace)"
 EXTRAS = ("worker",)
@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--views", type=int, default=0,
         help="beside it so many directions that foretell what the model itself will see and remember (default 0)",
     )  # fmt: skip
-    add_json(parser)
+    add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -37,23 +37,23 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--episodes must be at least 5, not {args.episodes}: every fifth is held out")
     if args.views < 0:
         raise UsageError(f"--views must not be negative, not {args.views}")
-    check_out(args.out)
-    from dreamfleet.common.progress import progress_bar
-    from dreamfleet.common.store import find_bundle
+    check_output_path(args.out)
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.worker.training.fit_subspace import find_subspace
     from dreamfleet.worker.training.refit import last_drives
-    from dreamfleet.worker.training.subspace import find_subspace
 
     bundle, paths = find_bundle(args.bundle), last_drives(args.data, args.episodes)
     with progress_bar("subspace", len(paths), "drives") as bar:
-        found = find_subspace(bundle, paths, bar.move, args.views)
+        found = find_subspace(bundle, paths, bar.update, args.views)
     subspace, r_squared = found.subspace, [round(each, 4) for each in found.r_squared]
-    with told(args.out):
+    with reporting_write_errors(args.out):
         subspace.save(args.out, {"drives": found.drives, "steps": found.steps, "r_squared": r_squared})
     width = max(map(len, subspace.names))
     rows = [f"{name:<{width}}  {each:.2f}" for name, each in zip(subspace.names, r_squared, strict=True)]
     told_first = "what is foretold, in which steps from now, and its R² on held-out drives:"
     last = f"{args.out}: {len(rows)} features, by {found.steps} steps of {found.drives} drives"
     text = "\n".join([told_first, *rows, last])
-    answer(args, text, subspace=args.out, sha256=subspace.sha256, bundle=bundle.sha256, features=subspace.names,
+    print_answer(args, text, subspace=args.out, sha256=subspace.sha256, bundle=bundle.sha256, features=subspace.names,
            r_squared=r_squared, drives=found.drives, steps=found.steps)  # fmt: skip
     return 0

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from onnx import TensorProto
 
-from dreamfleet.common.actions import Continuous
-from dreamfleet.worker.worldmodel.graph import GraphBuilder
+from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
-from dreamfleet.worker.worldmodel.recurrent import Recurrent, Weights, export_dream
-from dreamfleet.worker.worldmodel.vae_config import LEAK, Layer, VAEConfig
+from dreamfleet.worker.worldmodel.mdnrnn_graph import RecurrentGraph, Weights, export_dream
+from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
+from dreamfleet.worker.worldmodel.vae_config import LEAK, ConvolutionLayer, VAEConfig
 
 __all__ = ["Weights", "export_controller", "export_decoder", "export_dream", "export_encoder", "export_policy"]
 EPSILON = 1e-5  # of torch's batch normalisation
@@ -26,16 +26,16 @@ EPSILON = 1e-5  # of torch's batch normalisation
 def export_encoder(vae: Weights, config: VAEConfig) -> bytes:
     """`picture` (N, side, side, 3) uint8 to `mu` and `logvar` (N, latent)."""
     graph = GraphBuilder("encoder")
-    flat = _encode(graph, graph.take("picture", TensorProto.UINT8, config.picture, config.picture, 3), vae, config)
+    flat = _encode(graph, graph.add_input("picture", TensorProto.UINT8, config.picture, config.picture, 3), vae, config)
     for name in ("mu", "logvar"):
-        graph.give(_linear(graph, flat, vae, name), name, TensorProto.FLOAT, config.latent)
+        graph.add_output(_linear(graph, flat, vae, name), name, TensorProto.FLOAT, config.latent)
     return graph.build()
 
 
 def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
     """`latent` (N, latent) to `picture` (N, side, side, 3) uint8; weights in half precision, sums in single."""
     graph = GraphBuilder("decoder")
-    latent = graph.take("latent", TensorProto.FLOAT, config.latent)
+    latent = graph.add_input("latent", TensorProto.FLOAT, config.latent)
     kernel, bias = graph.weight(vae["dense.weight"]), graph.weight(vae["dense.bias"])
     value = graph.node("Gemm", latent, kernel, bias, transB=1)
     side, last = config.decoder_sides[0], len(config.up) - 1
@@ -47,7 +47,7 @@ def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
     value = graph.node("Mul", value, graph.constant(np.array(255, np.float32)))
     value = graph.node("Cast", graph.node("Round", value), to=TensorProto.UINT8)
     value = graph.node("Transpose", value, perm=[0, 2, 3, 1])
-    graph.give(value, "picture", TensorProto.UINT8, config.picture, config.picture, 3)
+    graph.add_output(value, "picture", TensorProto.UINT8, config.picture, config.picture, 3)
     return graph.build()
 
 
@@ -62,17 +62,17 @@ def export_policy(
     """
     graph, count = GraphBuilder("policy"), rnn_config.actions
     size = count * (rnn_config.latent + rnn_config.hidden + 1)
-    picture = graph.take("picture", TensorProto.UINT8, vae_config.picture, vae_config.picture, 3)
-    parameters = graph.take("parameters", TensorProto.FLOAT, size)
-    recurrent = Recurrent(graph, graph.take("state", TensorProto.FLOAT, rnn_config.state), rnn, rnn_config)
+    picture = graph.add_input("picture", TensorProto.UINT8, vae_config.picture, vae_config.picture, 3)
+    parameters = graph.add_input("parameters", TensorProto.FLOAT, size)
+    recurrent = RecurrentGraph(graph, graph.add_input("state", TensorProto.FLOAT, rnn_config.state), rnn, rnn_config)
     latent = _linear(graph, _encode(graph, picture, vae, vae_config), vae, "mu")
     weights, biases = graph.split(parameters, size - count, count)
     weights = graph.node("Reshape", weights, graph.shape(-1, count, rnn_config.latent + rnn_config.hidden))
     action = _squash(graph, _layer(graph, graph.join(latent, recurrent.hidden), weights, biases), actions)
     recurrent.advance(latent, action)
-    graph.give(action, "action", TensorProto.FLOAT, count)
-    graph.give(recurrent.next_state(), "next_state", TensorProto.FLOAT, rnn_config.state)
-    graph.give(latent, "latent", TensorProto.FLOAT, rnn_config.latent)
+    graph.add_output(action, "action", TensorProto.FLOAT, count)
+    graph.add_output(recurrent.next_state(), "next_state", TensorProto.FLOAT, rnn_config.state)
+    graph.add_output(latent, "latent", TensorProto.FLOAT, rnn_config.latent)
     return graph.build()
 
 
@@ -83,11 +83,11 @@ def export_controller(actions: Continuous, *, hidden: bool) -> bytes:
     `weights1` (N, A, K), `biases1` (N, A).
     """
     graph, kind = GraphBuilder("controller"), TensorProto.FLOAT
-    value, sizes = graph.take("features", kind, "F"), ["F", "K", "A"] if hidden else ["F", "A"]
+    value, sizes = graph.add_input("features", kind, "F"), ["F", "K", "A"] if hidden else ["F", "A"]
     for index, (before, after) in enumerate(pairwise(sizes)):
-        weights = graph.take(f"weights{index}", kind, after, before)
-        value = _layer(graph, value, weights, graph.take(f"biases{index}", kind, after))
-    graph.give(_squash(graph, value, actions), "action", kind, actions.outputs)
+        weights = graph.add_input(f"weights{index}", kind, after, before)
+        value = _layer(graph, value, weights, graph.add_input(f"biases{index}", kind, after))
+    graph.add_output(_squash(graph, value, actions), "action", kind, actions.outputs)
     return graph.build()
 
 
@@ -102,7 +102,7 @@ def _encode(graph: GraphBuilder, picture: str, vae: Weights, config: VAEConfig) 
     return str(graph.node("Reshape", value, graph.shape(-1, config.flat)))
 
 
-def _window(layer: Layer) -> dict[str, Any]:
+def _window(layer: ConvolutionLayer) -> dict[str, Any]:
     pads = {"pads": [layer.before] * 2 + [layer.after] * 2} if layer.after else {}
     return {"strides": [layer.stride] * 2} | pads
 

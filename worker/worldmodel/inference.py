@@ -8,10 +8,18 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import DECODER, DREAM, ENCODER, LAYERED, LINEAR, POLICY, Bundle
+from dreamfleet.common.artifacts.bundle import (
+    DECODER,
+    DREAM_GRAPH,
+    ENCODER,
+    LAYERED_CONTROLLER,
+    LINEAR_CONTROLLER,
+    POLICY,
+    Bundle,
+)
+from dreamfleet.common.artifacts.onnx_checks import check_self_contained
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.tensors import check_closed
-from dreamfleet.worker.worldmodel.choices import Choices, Layer, decide
+from dreamfleet.worker.worldmodel.choice_memory import ChoiceMemory, Layer, compute_actions
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]
@@ -23,7 +31,7 @@ def open_part(bundle: Bundle, name: str) -> onnxruntime.InferenceSession:
     """A session on one of a bundle's graphs; one thread, because scoring processes are one a core."""
     graph = bundle.read(name)
     try:
-        check_closed(graph)
+        check_self_contained(graph)
         return open_graph(graph, threads=1)
     except Exception as error:  # the runtime's errors share no public base
         raise BundleError(f"{bundle.path}: {name} cannot be run ({error})") from error
@@ -53,7 +61,7 @@ def check_sizes(
             )
 
 
-class Step(NamedTuple):
+class PolicyOutput(NamedTuple):
     """What one policy step gives, a row an episode.
 
     `state` is for the next step: its first columns are h, its last ones what the controller keeps of its choices.
@@ -71,8 +79,8 @@ class PolicyStep:
         self.shape = bundle.controller_shape
         self.hidden_size = bundle.manifest.hidden
         self._reward = RewardLabel(bundle)
-        self._whole = bundle.variant.driving.plain and self.shape == bundle.default_shape
-        if self._whole:
+        self._one_graph = bundle.variant.without_costs.is_default and self.shape == bundle.default_shape
+        if self._one_graph:
             session = open_part(bundle, POLICY)
             manifest = bundle.manifest
             expected = {"picture": [*manifest.picture], "parameters": [self.shape.size], "latent": [manifest.latent]}
@@ -87,20 +95,20 @@ class PolicyStep:
             self._memory = DreamStep(bundle)
             self.state_size = self._memory.state_size
 
-    def step(self, picture: Pictures, parameters: Floats, state: Floats) -> Step:
+    def step(self, picture: Pictures, parameters: Floats, state: Floats) -> PolicyOutput:
         """Act and advance: `picture` (N, side, side, 3), `parameters` (N, size), `state` (N, state_size)."""
-        if not self._whole:
+        if not self._one_graph:
             latent, _ = self._encoder.encode(picture)
             action = self._controllers.act(parameters, latent, state)
-            return Step(action, self._memory.advance(latent, action, state), latent)
+            return PolicyOutput(action, self._memory.advance(latent, action, state), latent)
         feed = {"picture": picture, "parameters": parameters, "state": state}
-        return Step(*self._run(["action", "next_state", "latent"], feed))
+        return PolicyOutput(*self._run(["action", "next_state", "latent"], feed))
 
     def zero_state(self, rows: int) -> Floats:
         """The state before the first step."""
         return self._reward.begin(np.zeros((rows, self.state_size), dtype=np.float32))
 
-    def remember(self, state: Floats, rewards: NDArray[np.float64]) -> None:
+    def write_rewards(self, state: Floats, rewards: NDArray[np.float64]) -> None:
         """Write the rewards (N,) that followed the last step into `state`, where the model looks at them."""
         self._reward.write(state, rewards)
 
@@ -133,11 +141,15 @@ class Controllers:
 
     def __init__(self, bundle: Bundle) -> None:
         self.shape, variant = bundle.controller_shape, bundle.variant
-        self.choices = Choices(variant)
-        remembered = self.shape.features - variant.seen > bundle.manifest.latent
+        self.choices = ChoiceMemory(variant)
+        remembered = self.shape.features - variant.extra_features > bundle.manifest.latent
         self._hidden = bundle.manifest.hidden if remembered else 0
         self._actions = variant.controls
-        self._run = open_part(bundle, LAYERED if self.shape.hidden else LINEAR).run if variant.driving.plain else None
+        self._run = (
+            open_part(bundle, LAYERED_CONTROLLER if self.shape.hidden else LINEAR_CONTROLLER).run
+            if variant.without_costs.is_default
+            else None
+        )
         self._parameters = np.zeros((0, self.shape.size), dtype=np.float32)
         self._layers: list[Layer] = []
         self._feed: dict[str, Floats] = {}
@@ -156,15 +168,15 @@ class Controllers:
 
     def _decide(self, latent: Floats, state: Floats) -> Floats:
         parts = [latent, state[:, : self._hidden]] if self._hidden else [latent]
-        parts += [self.choices.features(state)] if self.choices.seen else []
+        parts += [self.choices.features(state)] if self.choices.extra_features else []
         features = np.concatenate(parts, axis=1) if len(parts) > 1 else latent
         if self._run is None:
-            return decide(self._layers, features, self._actions)
+            return compute_actions(self._layers, features, self._actions)
         (action,) = self._run(["action"], {**self._feed, "features": features})
         return np.asarray(action, dtype=np.float32)
 
 
-class Dream(NamedTuple):
+class DreamOutput(NamedTuple):
     """What one step of the dream gives, a row a dreamer.
 
     `reward` is the probability that the reward head's label is true, or the value; `done` a probability; (N,), zero
@@ -178,7 +190,7 @@ class Dream(NamedTuple):
     done: Floats
 
 
-class Chance(NamedTuple):
+class NoiseSize(NamedTuple):
     """How much chance one step of a dream takes: numbers a row, and the rate of dropout; 0: none."""
 
     latent: int
@@ -190,30 +202,30 @@ class DreamStep:
     """Controller and MDN-RNN, which dreams the next latent."""
 
     def __init__(self, bundle: Bundle) -> None:
-        session, manifest = open_part(bundle, DREAM), bundle.manifest
-        check_sizes(bundle, DREAM, session, {"latent": [manifest.latent], "action": [manifest.actions]})
+        session, manifest = open_part(bundle, DREAM_GRAPH), bundle.manifest
+        check_sizes(bundle, DREAM_GRAPH, session, {"latent": [manifest.latent], "action": [manifest.actions]})
         sizes = {each.name: each.shape for each in session.get_inputs()}
         self._run = session.run
         outputs = [each.name for each in session.get_outputs()]
-        self.attends = ATTENTION in outputs
+        self.has_attention = ATTENTION in outputs
         self._names = [name for name in outputs if name != ATTENTION]
         self._controllers = Controllers(bundle)
         self._choices, self._reward = self._controllers.choices, RewardLabel(bundle)
-        self._only = onnxruntime.RunOptions()
-        self._only.only_execute_path_to_fetches = True
-        self._idle: dict[str, Floats] = {}
+        self._run_options = onnxruntime.RunOptions()
+        self._run_options.only_execute_path_to_fetches = True
+        self._zero_noise: dict[str, Floats] = {}
         self.shape = bundle.controller_shape
         self.hidden_size = bundle.manifest.hidden
         self.memory_size: int = sizes["state"][1]  # the world model's part of a state
         self.state_size = self.memory_size + self._choices.columns
         self.latent_size: int = sizes["latent"][1]
         dropout = float(manifest.models["mdnrnn"]["dropout"]) if "mask" in sizes else 0.0
-        self.chance = Chance(self.latent_size, self.hidden_size, dropout)
+        self.chance = NoiseSize(self.latent_size, self.hidden_size, dropout)
 
     def step(
         self, latent: Floats, parameters: Floats, state: Floats, uniform: Floats, normal: Floats,
         temperature: float, mask: Floats | None = None,
-    ) -> Dream:  # fmt: skip
+    ) -> DreamOutput:  # fmt: skip
         """Act on `latent` (N, latent) and `state` (N, state_size) by `parameters` (N, size), and dream on.
 
         `uniform` in [0, 1) and `normal` (N, latent) are chance; `mask` (N, hidden) is the dropout, for models that were
@@ -225,9 +237,9 @@ class DreamStep:
     def imagine(
         self, latent: Floats, action: Floats, state: Floats, uniform: Floats, normal: Floats,
         temperature: float, mask: Floats | None = None, chosen: Floats | None = None,
-    ) -> Dream:  # fmt: skip
+    ) -> DreamOutput:  # fmt: skip
         """Dream on under these actions `(N, actions)`; `chosen` are the controllers' where others are done."""
-        own = self._models(state)
+        own = self._model_state(state)
         feed = {"latent": latent, "action": action, "state": own, "uniform": uniform, "normal": normal}
         feed["temperature"] = np.array([temperature], dtype=np.float32)
         if self.chance.dropout:
@@ -235,37 +247,39 @@ class DreamStep:
         given = dict(zip(self._names, self._run(self._names, feed), strict=True))
         none = np.zeros(len(latent), dtype=np.float32)
         told = given.get("reward", none), given.get("done", none)
-        after = self._after(given["next_state"], state, action if chosen is None else chosen)
-        return Dream(action, given["next_latent"], after, *told)
+        after = self._next_state(given["next_state"], state, action if chosen is None else chosen)
+        return DreamOutput(action, given["next_latent"], after, *told)
 
     def advance(self, latent: Floats, action: Floats, state: Floats, chosen: Floats | None = None) -> Floats:
         """The next state alone, as in reality, where the next latent is seen and not dreamt; `chosen` as above."""
-        return self._after(self._look("next_state", latent, action, state), state, action if chosen is None else chosen)
+        return self._next_state(
+            self._run_output("next_state", latent, action, state), state, action if chosen is None else chosen
+        )
 
     def attend(self, latent: Floats, action: Floats, state: Floats) -> Floats:
         """The weights (N, window) that attention gives its inputs at this step, the oldest first."""
-        return self._look(ATTENTION, latent, action, state)
+        return self._run_output(ATTENTION, latent, action, state)
 
-    def _look(self, output: str, latent: Floats, action: Floats, state: Floats) -> Floats:
+    def _run_output(self, output: str, latent: Floats, action: Floats, state: Floats) -> Floats:
         """One output that chance has no part in."""
-        if len(self._idle.get("uniform", "")) != len(latent):
+        if len(self._zero_noise.get("uniform", "")) != len(latent):
             zeros = np.zeros((len(latent), self.latent_size), dtype=np.float32)
-            self._idle = {"uniform": zeros, "normal": zeros, "temperature": np.ones(1, np.float32)}
+            self._zero_noise = {"uniform": zeros, "normal": zeros, "temperature": np.ones(1, np.float32)}
             if self.chance.dropout:
-                self._idle["mask"] = np.ones((len(latent), self.hidden_size), np.float32)
-        feed = {**self._idle, "latent": latent, "action": action, "state": self._models(state)}
-        (found,) = self._run([output], feed, self._only)
+                self._zero_noise["mask"] = np.ones((len(latent), self.hidden_size), np.float32)
+        feed = {**self._zero_noise, "latent": latent, "action": action, "state": self._model_state(state)}
+        (found,) = self._run([output], feed, self._run_options)
         return np.asarray(found, dtype=np.float32)
 
-    def _models(self, state: Floats) -> Floats:
+    def _model_state(self, state: Floats) -> Floats:
         """The world model's part of a state."""
         return np.ascontiguousarray(state[:, : self.memory_size]) if self._choices.columns else state
 
-    def _after(self, models: Floats, state: Floats, chosen: Floats) -> Floats:
+    def _next_state(self, models: Floats, state: Floats, chosen: Floats) -> Floats:
         """The world model's next state with what the controllers keep behind it."""
         if not self._choices.columns:
             return models
-        return np.concatenate([models, self._choices.after(state, chosen)], axis=1)
+        return np.concatenate([models, self._choices.next_columns(state, chosen)], axis=1)
 
     def zero_state(self, rows: int) -> Floats:
         """The state before the first step."""

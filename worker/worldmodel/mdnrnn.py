@@ -58,7 +58,7 @@ class MDNRNN(nn.Module):
 
     def forward(self, inputs: Tensor) -> Prediction:
         """Predict from a zero state at the first step on."""
-        hidden: Tensor = self._attentive(inputs) if self.config.window else self.lstm(inputs)[0]
+        hidden: Tensor = self._run_with_attention(inputs) if self.config.window else self.lstm(inputs)[0]
         return self.predict(hidden)
 
     def predict(self, hidden: Tensor) -> Prediction:
@@ -69,7 +69,7 @@ class MDNRNN(nn.Module):
         shape = (*out.shape[:-1], config.latent, config.mixtures)
         weights, means, deviations = (part.reshape(shape) for part in out[..., :ends].chunk(3, dim=-1))
         none = out.new_zeros(out.shape[:-1])
-        reward = out[..., ends] if config.rewarded else none
+        reward = out[..., ends] if config.has_reward_head else none
         done = out[..., -1] if config.done else none
         return Prediction(functional.log_softmax(weights, dim=-1), means, deviations, reward, done)
 
@@ -89,7 +89,7 @@ class MDNRNN(nn.Module):
         hidden, cell = self._cell(torch.cat(inputs, dim=1), hidden, cell)
         return hidden, torch.cat([hidden, cell, previous, window], dim=1)
 
-    def _attentive(self, inputs: Tensor) -> Tensor:
+    def _run_with_attention(self, inputs: Tensor) -> Tensor:
         config = self.config
         steps = functional.pad(inputs[..., : config.latent + config.actions], (0, 0, config.window - 1, 0))
         keys = self.keys(steps)
@@ -133,11 +133,11 @@ def reward_labels(kind: Reward, rewards: Tensor, done: Tensor) -> Tensor:
     return positive if kind == "positive" else (1 - positive) * (1 - done)
 
 
-def reward_loss(kind: Reward, told: Tensor, labels: Tensor, mask: Tensor) -> Tensor:
+def reward_loss(kind: Reward, predicted: Tensor, labels: Tensor, mask: Tensor) -> Tensor:
     """Mean squared error of a value, else binary cross-entropy in nats."""
     if kind == "value":
-        return ((told - labels).square() * mask).sum() / mask.sum().clamp(min=1)
-    return binary_loss(told, labels, mask)
+        return ((predicted - labels).square() * mask).sum() / mask.sum().clamp(min=1)
+    return binary_loss(predicted, labels, mask)
 
 
 def binary_loss(logits: Tensor, labels: Tensor, mask: Tensor) -> Tensor:

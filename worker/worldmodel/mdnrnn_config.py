@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from dreamfleet.common.config import option
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.worldmodel.factors import check_factors, factor, later
+from dreamfleet.worker.worldmodel.loss_factors import added_option, check_factors, loss_factor
 
 Reward = Literal["none", "positive", "notebook", "value"]
 MOST_REWARD = 1000
@@ -34,10 +34,10 @@ class MDNRNNConfig:
     dropout: float = option(0.0, "share of the LSTM's outputs that the heads do not see while it learns and dreams")
     window: int = option(0, "inputs that attention looks at, the current one among them; 0: none")
     attention_units: int = option(64, "units of the attention's score")
-    lost: int = later(0, "steps without reward that the done head foretells as an end; 0: none")
-    z_factor: float = factor("weighs the likelihood of the next latents")
-    reward_factor: float = factor("weighs the reward head's loss")
-    first_reward: float = later(0.0, "what a drive's first step has as the previous reward's label")
+    lost: int = added_option(0, "steps without reward that the done head foretells as an end; 0: none")
+    z_factor: float = loss_factor("weighs the likelihood of the next latents")
+    reward_factor: float = loss_factor("weighs the reward head's loss")
+    first_reward: float = added_option(0.0, "what a drive's first step has as the previous reward's label")
 
     def __post_init__(self) -> None:
         if min(self.latent, self.actions, self.hidden, self.mixtures, self.attention_units) < 1 or self.window < 0:
@@ -67,7 +67,7 @@ class MDNRNNConfig:
         return self.inputs + (self.latent + self.actions if self.window else 0)
 
     @property
-    def rewarded(self) -> bool:
+    def has_reward_head(self) -> bool:
         """Whether there is a reward head."""
         return self.reward != "none"
 
@@ -79,7 +79,7 @@ class MDNRNNConfig:
     @property
     def outputs(self) -> int:
         """Of the heads: log weights, means, log deviations `(3, latent, mixtures)`, reward, done."""
-        return 3 * self.mixtures * self.latent + self.rewarded + self.done
+        return 3 * self.mixtures * self.latent + self.has_reward_head + self.done
 
     @property
     def state(self) -> int:
@@ -88,7 +88,7 @@ class MDNRNNConfig:
 
 
 # What a trained model may be given behind its other heads as it learns on, and what that foretells.
-HEADS_TO_COME = frozenset({"done", "lost"})
+ADDABLE_HEADS = frozenset({"done", "lost"})
 REWARDED = MDNRNNConfig()
 PAPER = MDNRNNConfig(reward="none")
 ARTICLE = MDNRNNConfig(previous_reward=True)

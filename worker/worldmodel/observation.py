@@ -8,9 +8,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from dreamfleet.common.bundle import Bundle
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.store import find_bundle
 
 Floats = NDArray[np.float32]
 FEATURES = ("z", "zh")
@@ -32,7 +32,7 @@ class Observation:
         most = float(np.finfo(np.float32).max)
         return spaces.Box(-most, most, (self.size,), np.float32)
 
-    def of(self, latent: Floats, state: Floats) -> Floats:
+    def observe(self, latent: Floats, state: Floats) -> Floats:
         """The observations `(N, size)`, a copy, of `latent` `(N, latent)` and the model's `state` `(N, state)`."""
         return np.concatenate([latent, state[:, : self._hidden]], axis=1)
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dreamfleet.worker.worldmodel.vae_config import LEAK, Layer, VAEConfig
+from dreamfleet.worker.worldmodel.vae_config import LEAK, ConvolutionLayer, VAEConfig
 
 
-class Loss(NamedTuple):
+class VAELoss(NamedTuple):
     """What is learnt from, the same at an error factor of 1, and of each picture: squared error, KL in nats."""
 
     weighted: Tensor
@@ -23,7 +23,7 @@ class Loss(NamedTuple):
 class Down(nn.Conv2d):
     """A convolution that may pad one row and column more behind than before."""
 
-    def __init__(self, layer: Layer) -> None:
+    def __init__(self, layer: ConvolutionLayer) -> None:
         super().__init__(layer.inputs, layer.outputs, layer.kernel, layer.stride, layer.before)
         self._more = layer.after - layer.before
 
@@ -35,7 +35,7 @@ class Down(nn.Conv2d):
 class Up(nn.ConvTranspose2d):
     """A transposed convolution that may crop one row and column more behind than before."""
 
-    def __init__(self, layer: Layer) -> None:
+    def __init__(self, layer: ConvolutionLayer) -> None:
         super().__init__(layer.inputs, layer.outputs, layer.kernel, layer.stride, layer.before)
         self._more = layer.after - layer.before
 
@@ -53,7 +53,7 @@ class VAE(nn.Module):
         self.config = config
         layers: list[nn.Module] = []
         for each in config.down:
-            layers += [Down(each), *_after(config, each.outputs)]
+            layers += [Down(each), *_layers_after(config, each.outputs)]
         self.encoder = nn.Sequential(*layers, nn.Flatten())
         self.mu = nn.Linear(config.flat, config.latent)
         self.logvar = nn.Linear(config.flat, config.latent)
@@ -61,7 +61,7 @@ class VAE(nn.Module):
         self.dense = nn.Linear(config.latent, self._start[0] * self._start[1] ** 2)
         layers = []
         for each in config.up:
-            layers += [Up(each), *_after(config, each.outputs)]
+            layers += [Up(each), *_layers_after(config, each.outputs)]
         self.decoder = nn.Sequential(*layers[: 1 - config.modules_a_layer], nn.Sigmoid())
 
     def encode(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
@@ -79,7 +79,7 @@ class VAE(nn.Module):
         pictures: Tensor = self.decoder(self.dense(latents).reshape(-1, *self._start))
         return pictures
 
-    def loss(self, pictures: Tensor, noise: Tensor) -> Loss:
+    def loss(self, pictures: Tensor, noise: Tensor) -> VAELoss:
         """The configured loss and its parts; `noise` `(N, latent)` normal.
 
         The paper's: F error + max(KL, tolerance). The notebook's: F 1000 x mean square + KL. F is the error factor.
@@ -93,10 +93,10 @@ class VAE(nn.Module):
         else:
             cost, floored = error, divergence.clamp(min=self.config.kl_tolerance * self.config.latent)
         weighted = self.config.error_factor * cost + floored.mean()
-        return Loss(weighted, cost + floored.mean(), error, divergence.mean())
+        return VAELoss(weighted, cost + floored.mean(), error, divergence.mean())
 
 
-def _after(config: VAEConfig, channels: int) -> list[nn.Module]:
+def _layers_after(config: VAEConfig, channels: int) -> list[nn.Module]:
     """What stands behind a convolution."""
     modules: list[nn.Module] = [nn.BatchNorm2d(channels)] if config.batch_norm else []
     modules.append(nn.ReLU() if config.activation == "relu" else nn.LeakyReLU(LEAK))

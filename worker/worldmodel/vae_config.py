@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
-from dreamfleet.common.config import option
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.worldmodel.factors import check_factors, factor, later
+from dreamfleet.worker.worldmodel.loss_factors import added_option, check_factors, loss_factor
 
 LEAK = 0.2  # slope of the leaky activation below zero
 KERNEL, STRIDE = 4, 2
 PAPER_SIDES = (1, 5, 13, 30, 64)  # of the paper's decoder; its kernels 5, 5, 6, 6 follow
 
 
-class Layer(NamedTuple):
+class ConvolutionLayer(NamedTuple):
     """A convolution, or a transposed one: of what it pads, or crops, the most lies behind, as in TensorFlow."""
 
     inputs: int
@@ -44,13 +44,15 @@ class VAEConfig:
     )
     kl_tolerance: float = option(0.5, "of the paper's loss: nats a latent below which the divergence costs nothing")
     dense: int = option(0, "inputs of a decoder that begins at 1x1; 0: as many as the encoder's outputs")
-    error_factor: float = factor("weighs the reconstruction error against the divergence; above 1 latents keep more")
-    kernels: tuple[int, ...] = later((), "kernel of each of the encoder's convolutions, else 4")
-    strides: tuple[int, ...] = later((), "stride of each; the decoder's are the same from behind, else 2")
-    decoder_channels: tuple[int, ...] = later(
+    error_factor: float = loss_factor(
+        "weighs the reconstruction error against the divergence; above 1 latents keep more"
+    )
+    kernels: tuple[int, ...] = added_option((), "kernel of each of the encoder's convolutions, else 4")
+    strides: tuple[int, ...] = added_option((), "stride of each; the decoder's are the same from behind, else 2")
+    decoder_channels: tuple[int, ...] = added_option(
         (), "outputs of the decoder's transposed convolutions but the last, else the encoder's from behind"
     )
-    decoder_kernels: tuple[int, ...] = later(
+    decoder_kernels: tuple[int, ...] = added_option(
         (), "kernel of each of the decoder's transposed convolutions, else what leads to the picture's size"
     )
 
@@ -92,7 +94,7 @@ class VAEConfig:
         return self.channels[-1] * self.sides[-1] ** 2
 
     @property
-    def down(self) -> tuple[Layer, ...]:
+    def down(self) -> tuple[ConvolutionLayer, ...]:
         """The encoder's convolutions."""
         same = self.padding == "same"
         channels = pairwise((3, *self.channels))
@@ -103,7 +105,7 @@ class VAEConfig:
         )
 
     @property
-    def up(self) -> tuple[Layer, ...]:
+    def up(self) -> tuple[ConvolutionLayer, ...]:
         """The decoder's transposed convolutions."""
         sizes = zip(pairwise(self.decoder_sides), self._up_kernels, self._strides[::-1], strict=True)
         return tuple(
@@ -154,9 +156,9 @@ class VAEConfig:
         return tuple(large - stride * (small - 1) for (small, large), stride in sizes)
 
 
-def _layer(inputs: int, outputs: int, kernel: int, stride: int, beyond: int) -> Layer:
+def _layer(inputs: int, outputs: int, kernel: int, stride: int, beyond: int) -> ConvolutionLayer:
     """`beyond`: rows and columns to pad or crop in all."""
-    return Layer(inputs, outputs, kernel, stride, beyond // 2, beyond - beyond // 2)
+    return ConvolutionLayer(inputs, outputs, kernel, stride, beyond // 2, beyond - beyond // 2)
 
 
 PAPER = VAEConfig()

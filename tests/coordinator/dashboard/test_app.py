@@ -12,14 +12,15 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from dreamfleet.common.network import Network
-from dreamfleet.coordinator.dashboard import past
-from dreamfleet.coordinator.dashboard.app import _Answers, make_app
+from dreamfleet.common.transport.network import Network
+from dreamfleet.coordinator.dashboard import stored_runs
+from dreamfleet.coordinator.dashboard.app import _Handlers, make_app
+from dreamfleet.coordinator.dashboard.assets import Assets
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.dashboard.feed import Feed
-from dreamfleet.coordinator.dashboard.files import Files
-from dreamfleet.coordinator.dashboard.views import Views
-from dreamfleet.coordinator.dashboard.watching import Watcher
+from dreamfleet.coordinator.dashboard.live_runs import Watcher
+from dreamfleet.coordinator.dashboard.view_processes import ViewProcesses
+from tests.support.processes import DEADLINE
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 HOME = "http://127.0.0.1:8420"
@@ -36,7 +37,9 @@ def runs(tmp_path):
 
 def client_of(runs, host="127.0.0.1", base=HOME, **config):
     feed = Feed(Watcher(Network(connect=("tcp/127.0.0.1:1",)), None, runs))
-    app = make_app(feed, Views(("--connect", "tcp/127.0.0.1:1"), runs, 1), runs, DashboardConfig(host=host, **config))
+    app = make_app(
+        feed, ViewProcesses(("--connect", "tcp/127.0.0.1:1"), runs, 1), runs, DashboardConfig(host=host, **config)
+    )
     return TestClient(app, base_url=base, follow_redirects=False)
 
 
@@ -253,12 +256,12 @@ def test_the_list_is_read_once_for_all_who_ask_meanwhile(runs, monkeypatch):
 
     def slowly(folder):
         read.append(folder)
-        assert held.wait(10)
+        assert held.wait(DEADLINE)
         return []
 
-    monkeypatch.setattr(past, "listed", slowly)
+    monkeypatch.setattr(stored_runs, "list_runs", slowly)
     feed = Feed(Watcher(Network(connect=("tcp/127.0.0.1:1",)), None, runs))
-    answers = _Answers(feed, Views((), runs, 1), runs, Files())
+    answers = _Handlers(feed, ViewProcesses((), runs, 1), runs, Assets())
 
     async def ask():
         asked = [asyncio.create_task(answers.runs(None)) for _ in range(5)]

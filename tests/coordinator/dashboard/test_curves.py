@@ -6,44 +6,51 @@ from itertools import pairwise
 
 import pytest
 
-from dreamfleet.common.effort import Effort, GenerationEffort
-from dreamfleet.common.stored import StoredConfirmation, StoredEvaluation
-from dreamfleet.coordinator.dashboard.curves import MOST_POINTS, Course, cumulated, curves, sampled, step_of
+from dreamfleet.common.runs.effort import Effort, GenerationEffort
+from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
+from dreamfleet.coordinator.dashboard.curves import (
+    MOST_POINTS,
+    RunData,
+    cumulative_effort,
+    curves,
+    downsample,
+    sampling_step,
+)
 from tests.support.samples import CLOSED, STATUS
 
 
-def course(generations, **changes):
+def data(generations, **changes):
     history = [dataclasses.replace(CLOSED, number=number, mean=float(number)) for number in range(generations)]
     looks = [StoredEvaluation(number, 16, 100.0 + number, 20.0) for number in range(4, generations, 5)]
-    return Course(changes.pop("settings", STATUS.settings), history, looks, changes.pop("confirmed", None))
+    return RunData(changes.pop("settings", STATUS.settings), history, looks, changes.pop("confirmed", None))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, MOST_POINTS, MOST_POINTS + 1, 1234, 5000, 99_999])
 def test_however_long_a_run_is_its_ends_are_drawn_and_no_more_points_than_fit(count):
-    kept = sampled(range(count))
+    kept = downsample(range(count))
     assert len(kept) <= MOST_POINTS + 1
     assert list(kept[:1]) == list(range(count))[:1]
     assert list(kept[-1:]) == list(range(count))[-1:]
     steps = {after - before for before, after in pairwise(kept)}
-    assert steps <= {step_of(count), *range(1, step_of(count))}
+    assert steps <= {sampling_step(count), *range(1, sampling_step(count))}
 
 
 def test_columns_are_equally_long_and_the_band_says_what_it_is():
-    drawn = curves(course(10), None)
+    drawn = curves(data(10), None)
     lengths = {len(drawn[name]) for name in ("generation", "mean", "best", "low", "high", "sigma")}
     assert lengths == {10}
     assert drawn["band"] == "± 1 standard deviation"
     assert (drawn["low"][3], drawn["high"][3]) == (3.0 - CLOSED.std, 3.0 + CLOSED.std)
-    drawn = curves(course(10), {number: (number - 1.0, number + 2.0) for number in range(10)})
+    drawn = curves(data(10), {number: (number - 1.0, number + 2.0) for number in range(10)})
     assert drawn["band"] == "the middle half of the candidates"
     assert (drawn["low"][3], drawn["high"][3]) == (2.0, 5.0)
 
 
 def test_only_a_dream_has_a_temperature_and_two_axes():
-    plain = curves(course(3), None)
+    plain = curves(data(3), None)
     assert (plain["temperature"], plain["dreamt"], plain["fitness_axis"]) == (None, False, "fitness over 1000 steps")
     task = dataclasses.replace(STATUS.settings.task, task="dream", temperature=1.5)
-    dream = curves(course(3, settings=dataclasses.replace(STATUS.settings, task=task)), None)
+    dream = curves(data(3, settings=dataclasses.replace(STATUS.settings, task=task)), None)
     assert (dream["temperature"], dream["dreamt"]) == ([1.5, 1.5, 1.5], True)
     assert (dream["fitness_axis"], dream["score_axis"]) == (
         "fitness over 1000 dreamt steps", "score in reality, 16 whole episodes",
@@ -55,24 +62,24 @@ def test_what_a_run_took_is_summed_up_with_its_start_and_without_what_confirmed_
         GenerationEffort(0, False, Effort(10, 0, 0, 36 * 10**8)), GenerationEffort(0, True, Effort(0, 99, 0, 1)),
         GenerationEffort(2, False, Effort(5, 7, 0, 36 * 10**8)),
     ]  # fmt: skip
-    spent = cumulated(Effort(100), efforts, 3)
+    spent = cumulative_effort(Effort(100), efforts, 3)
     assert [each.steps for each in spent] == [110, 110, 122]
-    drawn = curves(course(3), None, spent)
+    drawn = curves(data(3), None, spent)
     assert (drawn["steps"], drawn["core_hours"]) == ([110, 110, 122], [1.0, 1.0, 2.0])
 
 
 def test_an_evaluation_of_a_generation_that_is_still_open_stands_over_all_that_was_spent():
-    spent = cumulated(Effort(), [], 3)
-    odd = dataclasses.replace(course(3), evaluations=[StoredEvaluation(2**62, 1, 1.0, 0.0)])
+    spent = cumulative_effort(Effort(), [], 3)
+    odd = dataclasses.replace(data(3), evaluations=[StoredEvaluation(2**62, 1, 1.0, 0.0)])
     assert curves(odd, None, spent)["evaluations"]["steps"] == [0]
-    empty = Course(STATUS.settings, [], [], StoredConfirmation(3, 4, 1.0, 0.5, 9))
+    empty = RunData(STATUS.settings, [], [], StoredConfirmation(3, 4, 1.0, 0.5, 9))
     assert curves(empty, None, [])["confirmed"]["steps"] == 0
 
 
 @pytest.mark.parametrize("strange", [math.inf, -math.inf, math.nan, 1.797e308])
 def test_a_number_that_cannot_be_drawn_is_a_gap(strange):
     history = [dataclasses.replace(CLOSED, number=0, mean=strange, best=strange)]
-    drawn = curves(Course(STATUS.settings, history, [], None), None)
+    drawn = curves(RunData(STATUS.settings, history, [], None), None)
     assert all(
         value is None or math.isfinite(value) for name in ("mean", "low", "high", "best") for value in drawn[name]
     )

@@ -6,7 +6,8 @@ import threading
 import pytest
 
 from dreamfleet.coordinator.dashboard.feed import Feed
-from dreamfleet.coordinator.dashboard.watching import Picture
+from dreamfleet.coordinator.dashboard.live_runs import DashboardSnapshot
+from tests.support.processes import DEADLINE
 
 
 class Looks:
@@ -18,16 +19,16 @@ class Looks:
         self.gate = threading.Event()
         self.gate.set()
 
-    def look(self):
-        assert self.gate.wait(10)
+    def poll(self):
+        assert self.gate.wait(DEADLINE)
         self.count += 1
         if self.count == 2:
             raise ValueError("a look that fails")
         if self.are_single:
             self.gate.clear()
-        return Picture({}, None, str(self.count).encode())
+        return DashboardSnapshot({}, None, str(self.count).encode())
 
-    def rest(self):
+    def suspend(self):
         self.rests += 1
 
 
@@ -44,9 +45,9 @@ def looks():
 def test_every_viewer_gets_the_same_pictures_from_one_look_each(looks):
     looks.are_single = True
 
-    async def viewer(feed, pictures, everybody):
-        source, seen = feed.pictures(), []
-        for _ in range(pictures):
+    async def viewer(feed, snapshots, everybody):
+        source, seen = feed.snapshots(), []
+        for _ in range(snapshots):
             seen.append(await anext(source))
             if await everybody.wait() == 0:  # all have it: let the next look begin
                 looks.gate.set()
@@ -64,11 +65,11 @@ def test_every_viewer_gets_the_same_pictures_from_one_look_each(looks):
 def test_a_slow_viewer_misses_pictures_and_holds_back_nobody(looks):
     async def play():
         feed = Feed(looks, refresh=0.0, linger=0.05)
-        slow, fast = feed.pictures(), feed.pictures()
+        slow, fast = feed.snapshots(), feed.snapshots()
         first = await anext(slow)
         for _ in range(20):
             last = await anext(fast)
-        assert int((await anext(slow)).absent) >= int(last.absent) > int(first.absent) + 10
+        assert int((await anext(slow)).absent_event) >= int(last.absent_event) > int(first.absent_event) + 10
 
     run(play())
 
@@ -76,19 +77,19 @@ def test_a_slow_viewer_misses_pictures_and_holds_back_nobody(looks):
 def test_nobody_is_asked_while_nobody_looks_and_a_later_viewer_gets_no_old_picture(looks):
     async def play():
         feed = Feed(looks, refresh=0.01, linger=0.02)
-        async for _ in feed.pictures():
+        async for _ in feed.snapshots():
             break
         while looks.rests == 0:
             await asyncio.sleep(0)
-        assert not feed.is_looking
+        assert not feed.is_polling
         before = looks.count
         looks.gate.clear()
-        later = asyncio.ensure_future(anext(feed.pictures()))
-        while not feed.is_looking:
+        later = asyncio.ensure_future(anext(feed.snapshots()))
+        while not feed.is_polling:
             await asyncio.sleep(0)
         assert not later.done()
         looks.gate.set()
-        assert int((await later).absent) > before
+        assert int((await later).absent_event) > before
 
     run(play())
 
@@ -96,7 +97,7 @@ def test_nobody_is_asked_while_nobody_looks_and_a_later_viewer_gets_no_old_pictu
 def test_a_feed_that_closes_lets_every_viewer_go(looks):
     async def play():
         feed = Feed(looks, refresh=0.01, linger=10)
-        viewer = feed.pictures()
+        viewer = feed.snapshots()
         await anext(viewer)
         feed.close()
         assert [picture async for picture in viewer] == []

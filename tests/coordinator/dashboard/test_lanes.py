@@ -14,34 +14,34 @@ def test_a_lane_says_how_fast_a_slot_was_beside_the_fleets_fastest():
     lanes = Lanes()
     fleet = [worker("a/1", 90.0), worker("b/1", 90.0, slots=2), worker("c/1"), worker("d/1", state="silent"),
              worker("e/1", 5.0, state="lost")]  # fmt: skip
-    lanes.take(fleet, 100.0)
-    told = lanes.told(fleet)
-    assert {len(lane) for lane in told} == {LENGTH}
-    assert [lane[-1] for lane in told] == ["9", "4", IDLE, SILENT, LOST]
+    lanes.update(fleet, 100.0)
+    render = lanes.render(fleet)
+    assert {len(lane) for lane in render} == {LENGTH}
+    assert [lane[-1] for lane in render] == ["9", "4", IDLE, SILENT, LOST]
 
 
 def test_one_stretch_keeps_what_was_seen_last_in_it():
     lanes, present, lost = Lanes(), worker("a/1", 10.0), worker("a/1", state="lost")
-    lanes.take([present], 100.0)
-    lanes.take([lost], 100.0 + 0.9 * STRETCH)
-    assert lanes.told([lost])[0].strip() == LOST
+    lanes.update([present], 100.0)
+    lanes.update([lost], 100.0 + 0.9 * STRETCH)
+    assert lanes.render([lost])[0].strip() == LOST
 
 
 def test_what_nobody_watched_is_unknown_and_what_is_old_is_forgotten():
     lanes, present = Lanes(), worker("a/1", 10.0)
-    lanes.take([present], 100.0)
-    lanes.take([present], 100.0 + 3 * STRETCH)
-    assert lanes.told([present])[0].endswith("9  9")
-    lanes.take([present], 100.0 + 1e6 * STRETCH)
-    assert lanes.told([present])[0] == " " * (LENGTH - 1) + "9"
+    lanes.update([present], 100.0)
+    lanes.update([present], 100.0 + 3 * STRETCH)
+    assert lanes.render([present])[0].endswith("9  9")
+    lanes.update([present], 100.0 + 1e6 * STRETCH)
+    assert lanes.render([present])[0] == " " * (LENGTH - 1) + "9"
 
 
 def test_a_clock_that_is_set_back_does_no_harm():
     lanes, present = Lanes(), worker("a/1", 10.0)
-    lanes.take([present], 1000.0)
-    lanes.take([present], 10.0)
-    assert lanes.told([present])[0].endswith("9")
+    lanes.update([present], 1000.0)
+    lanes.update([present], 10.0)
+    assert lanes.render([present])[0].endswith("9")
 
 
 def test_a_worker_that_was_never_seen_has_an_empty_lane():
-    assert Lanes().told([worker("a/1")]) == [" " * LENGTH]
+    assert Lanes().render([worker("a/1")]) == [" " * LENGTH]

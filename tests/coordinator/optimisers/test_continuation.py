@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import JournalError
-from dreamfleet.coordinator.checkpoint import Checkpoint
-from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
+from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.optimisers.registry import known_optimisers
 
 OWN = "tests.support.optimisers:ParentsAndChildren"
@@ -95,7 +95,6 @@ def test_a_full_matrix_continues_at_hundreds_of_parameters(optimiser):
 
 @pytest.mark.long
 @pytest.mark.parametrize("optimiser", ["cma", "cmaes-lra"])
-@pytest.mark.timeout(600)
 def test_a_full_matrix_continues_at_the_real_size(optimiser):
     assert_continues(config(optimiser, "full" if optimiser == "cma" else "diagonal", 867, 16), (0, 2), 4)
 

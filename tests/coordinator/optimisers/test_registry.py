@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import DreamfleetError, UsageError
-from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.optimisers import registry
+from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 
 MODULE = "tests.support.optimisers"
 
@@ -28,7 +28,7 @@ def test_an_optimiser_of_ones_own_is_found_by_entry_point(tmp_path):
     (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nothers = {MODULE}:ParentsAndChildren\n")
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "from dreamfleet.coordinator.evolution import Evolution, EvolutionConfig\n"
+        "from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig\n"
         "evolution = Evolution(EvolutionConfig(2, 4, 0.1, 'diagonal', 3, 'others'))\n"
         "print(evolution.state().head.requirement)"
     )
@@ -125,7 +125,7 @@ def test_two_candidates_are_enough_for_pycma_below_its_two_point_step_size():
 
 def test_starting_the_command_line_imports_no_optimiser():
     code = (
-        "import sys; from dreamfleet.common.cli import main\n"
+        "import sys; from dreamfleet.common.cli.command_line import main\n"
         "try: main(['coordinator', '--help'])\n"
         "except SystemExit: print({'cma', 'cmaes'} & set(sys.modules))"
     )

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.controller import ControllerShape
-from dreamfleet.common.messages import Result
-from dreamfleet.common.runs import RunFolder
-from dreamfleet.coordinator.start import latest
-from tests.coordinator.test_run import SETTINGS, Bench
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.settings.start import latest_mean_and_sigma
+from tests.coordinator.run.test_run import SETTINGS, Bench
 
 GENERATIONS = 6
 OPTIMISERS = ["cma", "cmaes-lra", "cmaes-sep", "tests.support.optimisers:ParentsAndChildren"]
@@ -33,7 +33,7 @@ def drive(path, bundle, optimiser, restart_at=()):
     assert bench.run.ended is not None
     bench.journal.close()
     with RunFolder(path) as stored:
-        mean, sigma = latest(stored)
+        mean, sigma = latest_mean_and_sigma(stored)
         return [stored.candidate(each, 5).tobytes() for each in range(GENERATIONS)], mean.tobytes(), sigma
 
 

@@ -5,30 +5,30 @@ import os
 import pytest
 
 from dreamfleet.coordinator.spawn import agent
-from dreamfleet.coordinator.spawn.agent import MARK, WHOLE, Line, Place
+from dreamfleet.coordinator.spawn.agent import COMPLETE, MARK, Channel, HostFolder
 
 
 def test_a_file_that_is_missing_inside_is_told_and_the_folder_is_let_go(tmp_path, capsys):
     asked = {"do": "start", "root": str(tmp_path / "place"), "name": "box", "python": str(tmp_path / "gone"),
              "words": [], "env": {}, "slots": 1, "held": False, "digest": "1"}  # fmt: skip
     for _ in range(2):
-        agent.obey(asked, Line())
+        agent.handle_request(asked, Channel())
         said = capsys.readouterr().out
         assert said.startswith(f'{MARK}{{"failed"'), said
         assert "No such file" in said
 
 
 def test_who_removed_the_folder_that_is_waited_for_is_followed(tmp_path, monkeypatch):
-    place, take = Place(str(tmp_path / "place"), Line()), Place._take
+    host_folder, take = HostFolder(str(tmp_path / "place"), Channel()), HostFolder._acquire
 
     def removed(self, lock):
-        monkeypatch.setattr(Place, "_take", take)
+        monkeypatch.setattr(HostFolder, "_acquire", take)
         self.remove()
         take(self, lock)
 
-    monkeypatch.setattr(Place, "_take", removed)
-    with place.locked():
-        assert (place.root / "lock").exists()
+    monkeypatch.setattr(HostFolder, "_acquire", removed)
+    with host_folder.locked():
+        assert (host_folder.root / "lock").exists()
 
 
 def test_a_folder_that_is_somebodys_own_is_left_alone(tmp_path, capsys):
@@ -36,20 +36,20 @@ def test_a_folder_that_is_somebodys_own_is_left_alone(tmp_path, capsys):
     for path in kept:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
-    agent.obey({"do": "end", "root": str(tmp_path), "names": None, "now": False, "keep": False}, Line())
+    agent.handle_request({"do": "end", "root": str(tmp_path), "names": None, "now": False, "keep": False}, Channel())
     assert '"ok"' in capsys.readouterr().out
-    agent.obey({"do": "start", "root": str(tmp_path), "name": "box"}, Line())
+    agent.handle_request({"do": "start", "root": str(tmp_path), "name": "box"}, Channel())
     assert "of something else: name another --remote-dir" in capsys.readouterr().out
     assert all(path.exists() for path in kept)
 
 
 def test_a_folder_that_was_there_stays_and_what_else_is_in_it(tmp_path):
-    place = Place(str(tmp_path), Line())
+    host_folder = HostFolder(str(tmp_path), Channel())
     (tmp_path / "notes").touch()
-    with place.locked():
+    with host_folder.locked():
         (tmp_path / "cache").mkdir()
-    with place.locked():
-        place.remove()
+    with host_folder.locked():
+        host_folder.remove()
     assert [path.name for path in tmp_path.iterdir()] == ["notes"]
 
 
@@ -57,7 +57,7 @@ def test_a_folder_that_was_there_stays_and_what_else_is_in_it(tmp_path):
 def test_an_environment_whose_python_is_gone_is_none(tmp_path, there):
     folder = tmp_path / "environments" / "one"
     (folder / "bin").mkdir(parents=True)
-    (folder / WHOLE).touch()
+    (folder / COMPLETE).touch()
     (folder / "bin" / "python").symlink_to(os.devnull if there else tmp_path / "gone")
-    found = agent.look({"root": str(tmp_path)}, Line())
+    found = agent.inspect_host({"root": str(tmp_path)}, Channel())
     assert found["environments"] == (["one"] if there else [])

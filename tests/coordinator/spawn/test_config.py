@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.cli.global_config import read_config_file
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.site import read_file
-from dreamfleet.coordinator.spawn.config import Host, SpawnConfig, name_of, read_hosts, told_apart
+from dreamfleet.coordinator.spawn.config import Host, SpawnConfig, check_unique, default_name, read_hosts
 from tests.support.processes import ROOT
 
 LOOPBACK, WIDE = "tcp/127.0.0.1:7447", "tcp/10.0.0.1:7447"
@@ -37,7 +37,7 @@ def test_the_documented_file_is_one(tmp_path):
     text = re.search(r"```toml\n(.*?)```", (Path(ROOT) / "docs" / "hosts.md").read_text(), re.DOTALL)[1]
     path = tmp_path / "hosts.toml"
     path.write_text(text.replace("/data/wheels", str(tmp_path)))
-    file = read_file(path)
+    file = read_config_file(path)
     big, node = hosts(*file["host"], file=file)
     assert (big.name, big.spawn.slots, big.flags) == ("big", 16, ["--run", "night", "--exit-when-done"])
     assert (node.name, node.spawn.wheelhouse, node.environment) == ("node-7", tmp_path, {"OMP_NUM_THREADS": "1"})
@@ -70,7 +70,7 @@ def test_hosts_are_told_apart_by_name():
     with pytest.raises(UsageError, match="several hosts are called h"):
         hosts({"address": "a@h"}, {"address": "b@h"})
     with pytest.raises(UsageError, match="no host is named"):
-        told_apart([])
+        check_unique([])
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_hosts_are_told_apart_by_name():
     [("me@big.example", "big.example"), ("ssh://me@big:2222", "big"), ("[fe80::1]", "fe80-1"), ("node_1", "node-1")],
 )
 def test_a_host_is_called_by_its_address(address, name):
-    assert Host(name_of(address), address, SpawnConfig()).name == name
+    assert Host(default_name(address), address, SpawnConfig()).name == name
 
 
 def test_a_tunnel_is_the_default_to_a_loopback_alone():

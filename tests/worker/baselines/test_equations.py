@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from dreamfleet.worker.baselines.epsilon import epsilon_of
 from dreamfleet.worker.baselines.equations import double_q_target, duelling, masked_loss
-from dreamfleet.worker.baselines.learning_config import LearningConfig
-from dreamfleet.worker.baselines.returns import n_step
+from dreamfleet.worker.baselines.learning_config import LearningConfig, epsilon_of
+from dreamfleet.worker.baselines.replay_buffer import n_step
 
 REWARDS = [1.0, 2.0, 4.0, 8.0]
 

@@ -12,23 +12,23 @@ import numpy as np
 import pytest
 import torch
 
-from dreamfleet.common.agent import MANIFEST, NETWORK, TrainedAgent
-from dreamfleet.common.bundle import DREAM
-from dreamfleet.common.cli import main
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH
+from dreamfleet.common.artifacts.trained_agent import MANIFEST, NETWORK, TrainedAgent
+from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError
-from dreamfleet.common.judgement import read_judgement
-from dreamfleet.common.shelf import find_agent, find_controller
+from dreamfleet.common.runs.evaluation_report import read_evaluation_report
+from dreamfleet.common.runs.lookup import find_agent, find_controller
 from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.export import export_agent, export_network
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 from dreamfleet.worker.baselines.network import Networks
 from dreamfleet.worker.baselines.policies import QPolicy
 from dreamfleet.worker.baselines.train import CHECKPOINT, train_drqn
-from dreamfleet.worker.car_racing.agents import NOTHING, NetworkPolicy
-from dreamfleet.worker.car_racing.check import make_car_racing
-from dreamfleet.worker.scoring.agents import agent_of
-from dreamfleet.worker.scoring.episode import Course, play
-from dreamfleet.worker.tools import judge
+from dreamfleet.worker.car_racing.agents import NO_PARAMETERS, NetworkPolicy
+from dreamfleet.worker.car_racing.native_check import make_car_racing
+from dreamfleet.worker.scoring.agents import make_agent
+from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
+from dreamfleet.worker.tools import agent_evaluator
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.worldmodel.inference import open_graph
 
@@ -39,7 +39,7 @@ LEARNING = LearningConfig(episodes=2, random_episodes=1, steps=12, batch=2, repo
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setattr(judge, "Course", lambda seed, _horizon: Course(seed, STEPS))
+    monkeypatch.setattr(agent_evaluator, "EpisodeConfig", lambda seed, _horizon: EpisodeConfig(seed, STEPS))
 
 
 def networks_of(layers, seed=0):
@@ -75,16 +75,16 @@ def file(trained, tmp_path):
 )  # fmt: skip
 def test_it_chooses_what_the_network_chooses_all_episode_long(layers, tmp_path):
     networks = networks_of(layers, 1)
-    agent = agent_of(export_agent(keep(tmp_path, networks)))
+    agent = make_agent(export_agent(keep(tmp_path, networks)))
     environment = make_car_racing(preprocessing=agent.preprocessing)
     torchs, exported = QPolicy(networks.online), agent.make_policies()(SEED)
     chosen = []
     for each in (torchs, exported):
-        each.begin(NOTHING)
-    for moment in play(environment, torchs, Course(SEED, 1000)):
+        each.begin(NO_PARAMETERS)
+    for moment in run_episode(environment, torchs, EpisodeConfig(SEED, 1000)):
         chosen.append(torchs.choice)
         assert exported.act(moment.seen).tolist() == moment.action.tolist()
-        assert exported.decided == torchs.decided
+        assert exported.is_new_decision == torchs.is_new_decision
     assert len(chosen) > 100
     assert len(set(chosen)) > 1
     environment.close()
@@ -124,7 +124,7 @@ def test_evaluate_and_baseline_evaluate_give_the_same_report_and_compare_takes_b
     one, other = str(tmp_path / "one.json"), str(tmp_path / "other.json")
     assert main(["evaluate", "--controller", str(file), "--jobs", "1", *drives, one]) == 0
     assert main(["baseline", "evaluate", "drqn", "--data", str(trained), "--jobs", "1", *drives, other]) == 0
-    found = [read_judgement(tmp_path / name) for name in ("one.json", "other.json")]
+    found = [read_evaluation_report(tmp_path / name) for name in ("one.json", "other.json")]
     assert replace(found[0], name="", seconds=0) == replace(found[1], name="", seconds=0)
     assert {each.steps for each in found[0].drives} == {STEPS}
     assert all(each.speed is not None for each in found[0].drives)
@@ -136,9 +136,9 @@ def test_evaluate_and_baseline_evaluate_give_the_same_report_and_compare_takes_b
 
 
 def test_it_goes_to_other_processes(file):
-    agent = agent_of(TrainedAgent.load(file))
+    agent = make_agent(TrainedAgent.load(file))
     again = pickle.loads(pickle.dumps(agent))
-    assert judge.Judge(again).drive(SEED) == judge.Judge(agent).drive(SEED)
+    assert agent_evaluator.AgentEvaluator(again).drive(SEED) == agent_evaluator.AgentEvaluator(agent).drive(SEED)
 
 
 def test_a_video_shows_the_same_drive(trained, file, tmp_path, capsys):
@@ -146,7 +146,7 @@ def test_a_video_shows_the_same_drive(trained, file, tmp_path, capsys):
     assert main(["record", "--controller", str(file), *drive]) == 0
     assert main(["baseline", "record", "drqn", "--data", str(trained), *drive]) == 0
     scores = [json.loads(line)["score"] for line in capsys.readouterr().out.splitlines()]
-    assert scores == [judge.Judge(agent_of(TrainedAgent.load(file))).drive(SEED).score] * 2
+    assert scores == [agent_evaluator.AgentEvaluator(make_agent(TrainedAgent.load(file))).drive(SEED).score] * 2
 
 
 def test_neither_torch_nor_onnx_is_needed_to_drive(file):
@@ -206,7 +206,7 @@ def rewritten(file, change=lambda about: about, network=None):
 )
 def test_a_wrong_manifest_is_one_line(file, tmp_path, change, says):
     with pytest.raises(ControllerError, match=says) as told:
-        agent_of(find_agent(str(rewritten(file, change)), tmp_path)[0])
+        make_agent(find_agent(str(rewritten(file, change)), tmp_path)[0])
     assert "\n" not in str(told.value)
 
 
@@ -215,13 +215,16 @@ def test_a_wrong_network_is_one_line(file, tmp_path, random_bundle):
     weights = networks_of(LAYERS).online.state_dict()
     spoilt = {name: tensor.numpy() * np.float32("nan") for name, tensor in weights.items()}
     wrong = {
-        "empty graph": b"", "cannot be run": random_bundle.read(DREAM), "cannot be run ": content[: len(content) // 2],
-        "NaN or infinite": export_network(spoilt, LAYERS), "cannot be run  ": b"no network at all",
-    }  # fmt: skip
+        "empty graph": b"",
+        "cannot be run": random_bundle.read(DREAM_GRAPH),
+        "cannot be run ": content[: len(content) // 2],
+        "NaN or infinite": export_network(spoilt, LAYERS),
+        "cannot be run  ": b"no network at all",
+    }
     for says, network in wrong.items():
         file.write_bytes(whole)
         with pytest.raises(ControllerError, match=says.strip()) as told:
-            agent_of(find_agent(str(rewritten(file, network=network)), tmp_path)[0])
+            make_agent(find_agent(str(rewritten(file, network=network)), tmp_path)[0])
         assert "\n" not in str(told.value)
 
 

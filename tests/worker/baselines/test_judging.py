@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.common.judgement import read_judgement
+from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.agents import find_baseline
 from dreamfleet.worker.baselines.names import DISCRETE, DRQN, NAMES, RANDOM
 from dreamfleet.worker.baselines.network import Networks
 from dreamfleet.worker.baselines.train import CHECKPOINT
-from dreamfleet.worker.scoring.episode import Course
-from dreamfleet.worker.tools import judge
+from dreamfleet.worker.scoring.episode import EpisodeConfig
+from dreamfleet.worker.tools import agent_evaluator
 from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.verbs import baseline_evaluate, baseline_record
@@ -29,7 +29,7 @@ LAYERS = AgentConfig(channels=(2,), kernels=(8,), strides=(8,), hidden=4, frame_
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setattr(judge, "Course", lambda seed, _horizon: Course(seed, STEPS))
+    monkeypatch.setattr(agent_evaluator, "EpisodeConfig", lambda seed, _horizon: EpisodeConfig(seed, STEPS))
 
 
 def keep(folder, model):
@@ -57,13 +57,13 @@ def test_a_judgement_is_a_controllers_and_the_same_again(name, trained, tmp_path
     assert call(baseline_evaluate, *words) == 0
     told = capsys.readouterr()
     assert "note:" not in told.err
-    found = read_judgement(out)
-    assert json.loads(told.out)["scores"] == list(found.evaluated.scores)
-    assert (found.world, found.bundle, found.evaluated.seeds) == ("car-racing", "", (SEED, SEED + 1))
+    found = read_evaluation_report(out)
+    assert json.loads(told.out)["scores"] == list(found.results.scores)
+    assert (found.world, found.bundle, found.results.seeds) == ("car-racing", "", (SEED, SEED + 1))
     assert {each.steps for each in found.drives} == {STEPS}
     assert all(each.speed is not None and each.braking is not None for each in found.drives)
     assert call(baseline_evaluate, *words) == 0
-    assert read_judgement(out).drives == found.drives
+    assert read_evaluation_report(out).drives == found.drives
 
 
 def test_chance_is_the_episodes_and_within_the_world():
@@ -84,7 +84,7 @@ def test_a_video_has_a_frame_a_step_and_the_drives_score(trained, tmp_path, caps
     out = tmp_path / "drive.mp4"
     assert call(baseline_record, DRQN, "--data", trained, "--seed", SEED, "--steps", STEPS, "--out", out, "--json") == 0
     score = json.loads(capsys.readouterr().out)["score"]
-    assert score == judge.Judge(find_baseline(DRQN, trained)).drive(SEED).score
+    assert score == agent_evaluator.AgentEvaluator(find_baseline(DRQN, trained)).drive(SEED).score
     assert score == record(find_baseline(DRQN, trained), SEED, STEPS, out)
     with av.open(str(out)) as container:
         assert len(list(container.decode(container.streams.video[0]))) == STEPS

@@ -9,7 +9,7 @@ from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.learner import Learner
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 from dreamfleet.worker.baselines.network import Networks
-from dreamfleet.worker.baselines.traces import Episode, Replay
+from dreamfleet.worker.baselines.replay_buffer import Episode, ReplayBuffer
 
 LAYERS = AgentConfig(channels=(2,), kernels=(8,), strides=(8,), hidden=8)
 CONFIG = LearningConfig(batch=8, trace=3, burn_in=1, gamma=0.5, rate=1e-2, target_every=5)
@@ -24,7 +24,7 @@ def made():
     torch.manual_seed(0)
     networks = Networks(LAYERS)
     optimiser = torch.optim.Adam(networks.online.parameters(), lr=CONFIG.rate)
-    replay = Replay(CONFIG)
+    replay = ReplayBuffer(CONFIG)
     replay.add(EPISODE)
     return networks, Learner(networks, optimiser, CONFIG, 0), replay
 

@@ -12,13 +12,13 @@ import torch
 from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.worker.baselines import train
 from dreamfleet.worker.baselines.agent_config import AgentConfig
-from dreamfleet.worker.baselines.kept import kept_episode
+from dreamfleet.worker.baselines.episode_files import episode_file
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 from dreamfleet.worker.baselines.network import Networks
 from dreamfleet.worker.baselines.policies import QPolicy
 from dreamfleet.worker.baselines.presets import LEARNING, NOTEBOOK
 from dreamfleet.worker.baselines.train import CHECKPOINT, CURVE, train_drqn
-from dreamfleet.worker.car_racing.agents import NOTHING
+from dreamfleet.worker.car_racing.agents import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights, save_checkpoint
 from dreamfleet.worker.verbs import baseline_train
 
@@ -143,7 +143,7 @@ def test_a_damaged_or_missing_file_is_one_line(whole, tmp_path):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes((whole[0] / name).read_bytes())
     longer = replace(SHORT, episodes=6)
-    path = kept_episode(tmp_path, 3)
+    path = episode_file(tmp_path, 3)
     content = path.read_bytes()
     path.write_bytes(content[:-30])
     with pytest.raises(DatasetError, match=r"000003\.npz is missing or damaged .*--new"):
@@ -237,18 +237,18 @@ def test_a_memory_goes_through_time_as_along_a_trace():
     network = Networks(LAYERS).online
     pictures = np.random.default_rng(0).integers(0, 256, (5, 64, 64, 3), dtype=np.uint8)
     policy = QPolicy(network)
-    policy.begin(NOTHING)
+    policy.begin(NO_PARAMETERS)
     chosen = []
     for picture in np.repeat(pictures, LAYERS.frame_skip, axis=0):
         policy.act(picture)
-        if policy.decided:
+        if policy.is_new_decision:
             chosen.append(policy.choice)
     with torch.no_grad():
         features = network.features(torch.from_numpy(pictures[None]))
         worth, memory = network(features)
         padded = torch.cat([torch.zeros(1, 2, features.shape[2]), features[:, :3]], dim=1)
-        warm = network.warm(padded, torch.tensor([[0.0, 0, 1, 1, 1]]))
-        later, _ = network(features[:, 3:], warm)
+        warm_up = network.warm_up(padded, torch.tensor([[0.0, 0, 1, 1, 1]]))
+        later, _ = network(features[:, 3:], warm_up)
     assert chosen == worth[0].argmax(dim=-1).tolist()
     torch.testing.assert_close(policy._memory, memory)
     torch.testing.assert_close(later, worth[:, 3:])

@@ -23,10 +23,10 @@ def prompt():
 
 
 def test_a_peer_is_measured_in_a_process_of_its_own():
-    assert dispatch.in_time(prompt).keys() == {"efficiency_50ms", "null_jobs_per_second"}
+    assert dispatch.run_peer(prompt).keys() == {"efficiency_50ms", "null_jobs_per_second"}
 
 
 def test_a_peer_that_hangs_or_fails_has_no_figures(monkeypatch):
-    assert dispatch.in_time(failing) is None
+    assert dispatch.run_peer(failing) is None
     monkeypatch.setattr(dispatch, "PEER_SECONDS", 1.0)
-    assert dispatch.in_time(hanging) is None
+    assert dispatch.run_peer(hanging) is None

@@ -10,13 +10,13 @@ import pytest
 from gymnasium.error import InvalidAction
 
 import dreamfleet.worker.car_racing  # noqa: F401 - registers the environment
-from dreamfleet.common.store import find_bundle
-from dreamfleet.worker.bench.environment import completed_lap, discrete, policy_of
-from dreamfleet.worker.car_racing.check import compare, leap, make_car_racing, native_is_exact
-from dreamfleet.worker.car_racing.environment import GRASS, WHEEL, CarRacing, _native, available, score_text
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.worker.bench.environment import drive_lap, make_random_controller, random_discrete_action
+from dreamfleet.worker.car_racing.environment import GRASS, WHEEL, CarRacing, _native, is_native_available, render_score
+from dreamfleet.worker.car_racing.native_check import compare, make_car_racing, native_is_exact, random_action
 from dreamfleet.worker.car_racing.preprocessing import BOX
 
-needs_native = pytest.mark.skipif(not available(), reason="no native module was built")
+needs_native = pytest.mark.skipif(not is_native_available(), reason="no native module was built")
 
 
 @needs_native
@@ -27,19 +27,19 @@ def test_the_quick_look_at_a_workers_start_finds_it_exact():
 @needs_native
 @pytest.mark.parametrize("seed", [3, 4])
 def test_random_driving_looks_the_same(seed):
-    assert compare(seed, 160, leap) is None
+    assert compare(seed, 160, random_action) is None
 
 
 @needs_native
 def test_evolved_driving_looks_the_same():
-    act = policy_of(find_bundle("tiny"))
+    act = make_random_controller(find_bundle("tiny"))
     assert compare(5, 160, lambda _step, seen, _random: act(seen)) is None
 
 
 @needs_native
 @pytest.mark.long
 def test_a_completed_lap_looks_the_same_to_its_end():
-    lap = completed_lap(3)
+    lap = drive_lap(3)
     assert compare(lap.seed, len(lap.actions) + 1, lambda step, _seen, _random: lap.actions[step]) is None
 
 
@@ -70,7 +70,11 @@ def test_leaving_the_field_looks_the_same():
 @needs_native
 @pytest.mark.parametrize(
     ("settings", "actions"),
-    [({"domain_randomize": True}, leap), ({"continuous": False}, discrete), ({"lap_complete_percent": 0.3}, leap)],
+    [
+        ({"domain_randomize": True}, random_action),
+        ({"continuous": False}, random_discrete_action),
+        ({"lap_complete_percent": 0.3}, random_action),
+    ],
 )
 def test_every_option_looks_the_same(settings, actions):
     assert compare(7, 100, actions, **settings) is None
@@ -161,11 +165,11 @@ def test_an_episode_ends_after_a_thousand_steps():
 
 
 def test_a_score_is_written_after_somebody_closed_pygame():
-    before = score_text("0012").copy()
+    before = render_score("0012").copy()
     pygame.quit()
-    score_text.cache_clear()
-    assert np.array_equal(score_text("0012"), before)
+    render_score.cache_clear()
+    assert np.array_equal(render_score("0012"), before)
 
 
 def test_score_texts_are_kept():
-    assert score_text("0123") is score_text("0123")
+    assert render_score("0123") is render_score("0123")

@@ -3,7 +3,7 @@ import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.car_racing.preprocessing import BOX, RAW, find_preprocessing
-from dreamfleet.worker.training.world import preprocessing_to
+from dreamfleet.worker.training.data.world import preprocessing_of_size
 
 
 def overlap(target, step, source, unit):
@@ -44,9 +44,9 @@ def test_the_raw_picture_is_the_whole_observation():
 
 def test_a_preprocessing_is_found_by_name_and_by_size():
     for each in (BOX, RAW):
-        assert find_preprocessing(each.name) is preprocessing_to(each.size) is each
+        assert find_preprocessing(each.name) is preprocessing_of_size(each.size) is each
         assert each.picture(np.zeros((96, 96, 3), np.uint8)).shape == each.shape
     with pytest.raises(UsageError, match=r"'bilinear-64'.*box-64, raw-96"):
         find_preprocessing("bilinear-64")
     with pytest.raises(UsageError, match="64 or 96 pixels wide, not 32"):
-        preprocessing_to(32)
+        preprocessing_of_size(32)

@@ -5,7 +5,7 @@ from gymnasium.utils.env_checker import check_env
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.dream import ENVIRONMENT
-from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreams
+from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreamVector
 from dreamfleet.worker.worldmodel.inference import DreamStep
 
 ACTION = np.array([0.1, 0.5, 0.0], np.float32)
@@ -52,7 +52,7 @@ def test_many_dreams_are_the_single_ones(random_bundle, features):
         ENVIRONMENT, num_envs=3, bundle=random_bundle, vectorization_mode="vector_entry_point", horizon=4,
         features=features,
     )  # fmt: skip
-    assert isinstance(many.unwrapped, CarRacingDreams)
+    assert isinstance(many.unwrapped, CarRacingDreamVector)
     single = [CarRacingDream(random_bundle, horizon=4, features=features) for _ in range(3)]
     latents, _ = many.reset(seed=10)
     assert np.array_equal(latents, np.stack([each.reset(seed=10 + index)[0] for index, each in enumerate(single)]))

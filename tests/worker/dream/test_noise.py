@@ -1,15 +1,15 @@
 import numpy as np
 
-from dreamfleet.worker.dream.beginnings import Beginnings
-from dreamfleet.worker.dream.noise import PIECE, Noise, SharedNoise
-from dreamfleet.worker.worldmodel.inference import Chance
+from dreamfleet.worker.dream.noise import BLOCK_STEPS, EpisodeNoise, SharedNoise
+from dreamfleet.worker.dream.start_states import StartStates
+from dreamfleet.worker.worldmodel.inference import NoiseSize
 
 FIRST = np.random.default_rng(0).normal(size=(5, 2, 3)).astype(np.float32)
-BEGINNINGS = Beginnings(FIRST, np.zeros((0, 6), np.float32))
+BEGINNINGS = StartStates(FIRST, np.zeros((0, 6), np.float32))
 
 
 def drawn(seed, steps):
-    noise, drawn = Noise(seed, Chance(3, 4, 0.0)), []
+    noise, drawn = EpisodeNoise(seed, NoiseSize(3, 4, 0.0)), []
     drawn.append(noise.begin(BEGINNINGS).latent)
     for _ in range(steps):
         draw = noise.next()
@@ -18,14 +18,14 @@ def drawn(seed, steps):
 
 
 def test_it_is_a_function_of_the_seed():
-    first, again, other = (drawn(seed, 2 * PIECE) for seed in (1, 1, 2))
+    first, again, other = (drawn(seed, 2 * BLOCK_STEPS) for seed in (1, 1, 2))
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     assert not any(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
 
 
 def test_the_choice_of_a_mixture_is_uniform_and_the_rest_normal():
-    noise = Noise(3, Chance(1000, 1, 0.0))
-    noise.begin(Beginnings(np.zeros((1, 2, 1000), np.float32), np.zeros((0, 2000), np.float32)))
+    noise = EpisodeNoise(3, NoiseSize(1000, 1, 0.0))
+    noise.begin(StartStates(np.zeros((1, 2, 1000), np.float32), np.zeros((0, 2000), np.float32)))
     draw = noise.next()
     assert 0 <= draw.uniform.min() < 0.01 < 0.99 < draw.uniform.max() < 1
     assert abs(draw.normal.mean()) < 0.15
@@ -34,7 +34,7 @@ def test_the_choice_of_a_mixture_is_uniform_and_the_rest_normal():
 
 
 def test_rows_of_one_seed_share_their_noise_whichever_rows_still_dream():
-    shared = SharedNoise(np.array([7, 8, 7, 9]), Chance(3, 4, 0.0), BEGINNINGS)
+    shared = SharedNoise(np.array([7, 8, 7, 9]), NoiseSize(3, 4, 0.0), BEGINNINGS)
     assert np.array_equal(shared.first.latent[0], shared.first.latent[2])
     assert np.array_equal(shared.first.latent[1], drawn(8, 0)[0])
     shared.next(np.arange(4))
@@ -44,8 +44,8 @@ def test_rows_of_one_seed_share_their_noise_whichever_rows_still_dream():
 
 
 def test_dropout_keeps_the_mean_and_is_shared_too():
-    chance = Chance(3, 1000, 0.25)
-    shared, alone = SharedNoise(np.array([7, 8]), chance, BEGINNINGS), Noise(8, chance)
+    chance = NoiseSize(3, 1000, 0.25)
+    shared, alone = SharedNoise(np.array([7, 8]), chance, BEGINNINGS), EpisodeNoise(8, chance)
     alone.begin(BEGINNINGS)
     mask = shared.next(np.array([1])).mask
     assert np.array_equal(mask, alone.next().mask)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.messages import TaskSpec
-from dreamfleet.worker.dream.batch import Dreamer
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.dream.environment import CarRacingDream
 from dreamfleet.worker.dream.policy import DreamPolicy
 from dreamfleet.worker.scoring import episode
-from dreamfleet.worker.scoring.episode import Course
+from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
@@ -20,7 +20,7 @@ HORIZON = 20
 
 @pytest.fixture(scope="module")
 def dreaming(random_bundle):
-    return Dreamer(random_bundle, spec(random_bundle))
+    return DreamBatch(random_bundle, spec(random_bundle))
 
 
 def spec(bundle, **changes):
@@ -45,13 +45,13 @@ def test_the_environment_dreams_the_same_bits(dreaming, random_bundle):
     environment = CarRacingDream(random_bundle, temperature=1.3, horizon=HORIZON)
     for vector, seed in zip(candidates(random_bundle, 3), (5, 6, 7), strict=True):
         (batched,) = dreaming.score([(vector, seed)])
-        assert episode.score(environment, DreamPolicy(random_bundle), vector, Course(seed, HORIZON)) == batched
+        assert episode.score(environment, DreamPolicy(random_bundle), vector, EpisodeConfig(seed, HORIZON)) == batched
 
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_a_variant_dreams_the_same_bits_alone_in_any_batch_and_step_by_step(random_bundle, name):
-    bundle = random_bundle.under(None, VARIANTS[name])
-    dreamer = Dreamer(bundle, spec(bundle))
+    bundle = random_bundle.with_controllers(None, VARIANTS[name])
+    dreamer = DreamBatch(bundle, spec(bundle))
     dreams = [(vector, seed) for vector in candidates(bundle, 9) for seed in (1, 2)]
     together = dreamer.score(dreams)
     assert len({score.fitness for score in together}) == len(dreams)
@@ -60,14 +60,14 @@ def test_a_variant_dreams_the_same_bits_alone_in_any_batch_and_step_by_step(rand
     environment = CarRacingDream(bundle, temperature=1.3, horizon=HORIZON)
     for dream, found in zip(dreams[:4], together[:4], strict=True):
         assert dreamer.score([dream]) == [found]
-        assert episode.score(environment, DreamPolicy(bundle), dream[0], Course(dream[1], HORIZON)) == found
+        assert episode.score(environment, DreamPolicy(bundle), dream[0], EpisodeConfig(dream[1], HORIZON)) == found
 
 
 def test_rows_that_leave_a_batch_take_along_what_they_held(tmp_path):
     rnn = MDNRNNConfig(latent=3, hidden=4, done=True)
     plain = write_random_bundle(tmp_path / "b.zip", vae=VAEConfig(latent=3, channels=(2, 2, 2, 2)), rnn=rnn)
-    bundle = plain.under(None, VARIANTS["all"])
-    dreamer = Dreamer(bundle, spec(bundle, temperature=3.0))
+    bundle = plain.with_controllers(None, VARIANTS["all"])
+    dreamer = DreamBatch(bundle, spec(bundle, temperature=3.0))
     dreams = [(vector, seed) for vector in candidates(bundle, 20) for seed in range(3)]
     together = dreamer.score(dreams)
     assert len({score.steps for score in together}) > 2
@@ -76,12 +76,12 @@ def test_rows_that_leave_a_batch_take_along_what_they_held(tmp_path):
 
 def test_dropout_is_part_of_the_dream_and_changes_no_promise(tmp_path):
     bundle = write_random_bundle(tmp_path / "b.zip", rnn=MDNRNNConfig(dropout=0.3))
-    dreamer, environment = Dreamer(bundle, spec(bundle)), CarRacingDream(bundle, temperature=1.3, horizon=HORIZON)
+    dreamer, environment = DreamBatch(bundle, spec(bundle)), CarRacingDream(bundle, temperature=1.3, horizon=HORIZON)
     dreams = [(vector, seed) for vector in candidates(bundle, 3) for seed in (1, 2)]
     together = dreamer.score(dreams)
     assert [dreamer.score([dream])[0] for dream in dreams] == together
     assert [
-        episode.score(environment, DreamPolicy(bundle), vector, Course(seed, HORIZON)) for vector, seed in dreams
+        episode.score(environment, DreamPolicy(bundle), vector, EpisodeConfig(seed, HORIZON)) for vector, seed in dreams
     ] == together
 
 
@@ -93,7 +93,7 @@ def test_steps_are_told_as_they_are_made(dreaming, random_bundle):
 
 def test_another_temperature_is_another_dream(dreaming, random_bundle):
     dreams = [(candidates(random_bundle, 1)[0], 1)]
-    colder = Dreamer(random_bundle, spec(random_bundle, temperature=0.5))
+    colder = DreamBatch(random_bundle, spec(random_bundle, temperature=0.5))
     assert colder.score(dreams) != dreaming.score(dreams)
 
 

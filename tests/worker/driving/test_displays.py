@@ -9,15 +9,15 @@ from tests.support.processes import DEADLINE, ROOT
 
 WITHOUT_A_SCREEN = """
 from dreamfleet.common.errors import NoDisplayError
-from dreamfleet.worker.driving.window import Window
+from dreamfleet.worker.driving.drive_window import DriveWindow
 try:
-    Window("nothing", (64, 64), 1)
+    DriveWindow("nothing", (64, 64), 1)
 except NoDisplayError:
     pass
 """
 DRIVING_UNSEEN = """
-from dreamfleet.common.shelf import bundle_for
-from dreamfleet.worker.car_racing.check import make_car_racing
+from dreamfleet.common.runs.lookup import find_bundle_of
+from dreamfleet.worker.car_racing.native_check import make_car_racing
 environment = make_car_racing(preprocessing="box-64", render_mode="rgb_array")
 environment.reset(seed=1)
 environment.step([0.0, 0.0, 0.0])
@@ -35,9 +35,9 @@ pygame.display.set_mode((100, 100))
 AN_OPTIMISER = """
 from pathlib import Path
 import torch
-from dreamfleet.worker.training.schedule import Schedule
+from dreamfleet.worker.training.training_state import TrainingState
 from dreamfleet.worker.training.train_config import TrainConfig
-Schedule(Path("nothing.safetensors"), torch.nn.Linear(2, 2), TrainConfig(updates=1, batch=1, rate=1e-3), 1)
+TrainingState(Path("nothing.safetensors"), torch.nn.Linear(2, 2), TrainConfig(updates=1, batch=1, rate=1e-3), 1)
 print("goes on")
 """
 

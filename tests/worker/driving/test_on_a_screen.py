@@ -2,19 +2,16 @@
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 
 import pytest
 
-from dreamfleet.worker.car_racing.check import make_car_racing
+from dreamfleet.worker.car_racing.native_check import make_car_racing
 from tests.support.processes import DEADLINE, environment
 
 SEED, STEPS = 20_003, 60
-pytestmark = pytest.mark.skipif(
-    not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Debian's packages xvfb and xdotool"
-)
+pytestmark = pytest.mark.needs_programs("Xvfb", "xdotool")
 
 
 @pytest.fixture

@@ -4,12 +4,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from dreamfleet.common.actions import Continuous, Discrete
-from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.artifacts.actions import Continuous, Discrete
+from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError, UsageError
-from dreamfleet.common.messages import TaskSpec
-from dreamfleet.common.tasks import describe_task, family_of
-from dreamfleet.worker.gym.task import MOST_STEPS
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.protocol.tasks import describe_task, family_of
+from dreamfleet.worker.gym.task import DEFAULT_MAX_STEPS
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
 
@@ -149,7 +149,7 @@ def test_whatever_an_environment_does_as_it_is_made_is_one_error(strange, argume
 def test_an_environment_without_a_time_limit_is_bounded(strange):
     assert describe_task(strange, {"normalise": True}).observations == 2
     scorer = Scorer(spec(strange))
-    assert scorer.score("evaluate", np.zeros(3, np.float32), 1).steps == MOST_STEPS
+    assert scorer.score("evaluate", np.zeros(3, np.float32), 1).steps == DEFAULT_MAX_STEPS
     scorer.close()
 
 
@@ -166,5 +166,5 @@ def test_a_controller_of_other_outputs_is_refused():
 
 
 def test_of_equal_outputs_the_first_action_is_taken_and_numbers_begin_where_the_environment_says():
-    assert Discrete(3, first=2).of(np.array([0.0, 1.0, 1.0])) == 3
-    assert Continuous.between([0, -2], [1, 2]).of(np.array([0.0, 100.0])) == pytest.approx([0.5, 2.0])
+    assert Discrete(3, first=2).to_action(np.array([0.0, 1.0, 1.0])) == 3
+    assert Continuous.between([0, -2], [1, 2]).to_action(np.array([0.0, 100.0])) == pytest.approx([0.5, 2.0])

@@ -2,8 +2,8 @@
 
 import pytest
 
-from dreamfleet.common.shelf import find_controller
-from dreamfleet.common.store import find_bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.runs.lookup import find_controller
 
 
 @pytest.fixture(scope="module")

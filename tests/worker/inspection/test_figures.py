@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 
+from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.shelf import find_controller
-from dreamfleet.common.store import find_bundle
+from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.worker.inspection import probe
-from dreamfleet.worker.inspection.losses import LossConfig
-from dreamfleet.worker.inspection.measuring import Driving, dream_losses
-from dreamfleet.worker.inspection.witness import WitnessConfig
+from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDriveConfig
+from dreamfleet.worker.inspection.measurements import DriverChoice, measure_dream_losses
+from dreamfleet.worker.inspection.road_losses import RoadLossConfig
 from dreamfleet.worker.verbs import inspect
 
 FOUND = {"z_linear", "z_network", "zh_linear", "zh_network"}
@@ -96,6 +96,6 @@ def test_what_cannot_be_measured_is_told_before_anything_is_driven(call, argumen
 
 def test_a_controller_of_another_world_model_dreams_nothing(tmp_path):
     bundle, (controller, _) = find_bundle("tiny"), find_controller("tiny", tmp_path)
-    other = Driving(replace(controller, bundle="0" * 64), bundle)
+    other = DriverChoice(replace(controller, bundle="0" * 64), bundle)
     with pytest.raises(UsageError, match="evolved with this world model"):
-        dream_losses(bundle, other, WitnessConfig(), LossConfig(), lambda _: None)
+        measure_dream_losses(bundle, other, DisturbedDriveConfig(), RoadLossConfig(), lambda _: None)

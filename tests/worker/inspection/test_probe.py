@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.worker.inspection.estimate import Estimate
-from dreamfleet.worker.inspection.knowledge import explained
-from dreamfleet.worker.inspection.probe import LayeredProbe, LinearProbe, folds, others
+from dreamfleet.worker.inspection.knowledge import explained_variance
+from dreamfleet.worker.inspection.probe import LinearProbe, NetworkProbe, folds, other_rows
 
 
 @pytest.fixture
@@ -28,11 +28,11 @@ def test_weights_say_which_samples_count(features):
 
 def test_a_network_finds_what_no_line_does_and_the_same_each_time(features):
     targets = np.abs(features[:, :1] - 3)
-    linear, layered = (kind.fit(features[:2000], targets[:2000]) for kind in (LinearProbe, LayeredProbe))
+    linear, layered = (kind.fit(features[:2000], targets[:2000]) for kind in (LinearProbe, NetworkProbe))
     told = layered.predict(features[2000:])
-    assert explained([targets[2000:]], [linear.predict(features[2000:])])[0].value < 0.1
-    assert explained([targets[2000:]], [told])[0].value > 0.9
-    assert np.array_equal(told, LayeredProbe.fit(features[:2000], targets[:2000]).predict(features[2000:]))
+    assert explained_variance([targets[2000:]], [linear.predict(features[2000:])])[0].value < 0.1
+    assert explained_variance([targets[2000:]], [told])[0].value > 0.9
+    assert np.array_equal(told, NetworkProbe.fit(features[:2000], targets[:2000]).predict(features[2000:]))
 
 
 @pytest.mark.parametrize("drives", [2, 3, 4, 9])
@@ -40,7 +40,7 @@ def test_every_drive_is_judged_once_by_what_was_fitted_without_it(drives):
     parts = folds(drives)
     assert sorted(row for part in parts for row in part) == list(range(drives))
     for part in parts:
-        rest = others(part, drives)
+        rest = other_rows(part, drives)
         assert rest
         assert sorted([*part, *rest]) == list(range(drives))
 
@@ -49,18 +49,18 @@ def test_r_squared_is_one_for_the_truth_and_zero_for_the_mean():
     random = np.random.default_rng(1)
     truths = [random.normal(size=(50, 2)) for _ in range(8)]
     mean = np.concatenate(truths).mean(axis=0)
-    assert explained(truths, truths) == [Estimate(1.0, 0.0)] * 2
-    for share in explained(truths, [np.tile(mean, (50, 1))] * 8):
+    assert explained_variance(truths, truths) == [Estimate(1.0, 0.0)] * 2
+    for share in explained_variance(truths, [np.tile(mean, (50, 1))] * 8):
         assert share.value == pytest.approx(0)
     noisy = [each + random.normal(size=each.shape) * 0.5 for each in truths]
-    for share in explained(truths, noisy):
+    for share in explained_variance(truths, noisy):
         assert share.value == pytest.approx(0.75, abs=0.06)
         assert 0 < share.error < 0.05
 
 
 def test_of_what_never_changes_nothing_is_explained():
     straight = [np.stack([np.zeros(20), np.arange(20.0)], axis=1) for _ in range(3)]
-    assert explained(straight, [each + 0.1 for each in straight])[0] == Estimate(0, 0)
+    assert explained_variance(straight, [each + 0.1 for each in straight])[0] == Estimate(0, 0)
 
 
 def test_an_estimate_is_a_mean_and_its_standard_error():

@@ -6,23 +6,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.controller import Controller
-from dreamfleet.common.runs import CONTROLLER, run_paths
-from dreamfleet.common.shelf import find_controller
-from dreamfleet.common.store import find_bundle
-from dreamfleet.common.stored import RunSettings, StoredGeneration
-from dreamfleet.coordinator.evaluation import Evaluation
-from dreamfleet.coordinator.jobs import travelling
-from dreamfleet.coordinator.journal import Journal
-from dreamfleet.worker.inspection import measuring
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.runs.lookup import find_controller
+from dreamfleet.common.runs.records import RunSettings, StoredGeneration
+from dreamfleet.common.runs.run_folder import CONTROLLER, run_paths
+from dreamfleet.coordinator.jobs.evaluation import Evaluation
+from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.worker.inspection import measurements
+from dreamfleet.worker.inspection.encoded_rollout import DriveConfig, record_drive
 from dreamfleet.worker.inspection.estimate import Estimate
-from dreamfleet.worker.inspection.inspection import find_subject, inspect
-from dreamfleet.worker.inspection.losses import Compared
-from dreamfleet.worker.inspection.rollout import DriveConfig, drive
+from dreamfleet.worker.inspection.page_builder import find_subject, write_page
+from dreamfleet.worker.inspection.road_losses import RoadLossComparison
 from dreamfleet.worker.verbs import inspect as verb
 from tests.support.samples import SPEC
 
-COMPARED = Compared("40 steps before", 30, {"lost": {"reality": Estimate(1.0, 0.0)}})
+COMPARED = RoadLossComparison("40 steps before", 30, {"lost": {"reality": Estimate(1.0, 0.0)}})
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def runs_dir(tmp_path, random_bundle):
         replace(SPEC, bundle=random_bundle.sha256, temperature=1.25), shape, 2, 1, 0.1, "diagonal", 1, 1, 2
     )
     journal = Journal.create(path, settings, random_bundle.path)
-    vectors = [travelling(np.full(shape.size, value)) for value in (0.5, 1.5)]
+    vectors = [vector_bytes(np.full(shape.size, value)) for value in (0.5, 1.5)]
     for number in range(3):
         journal.open_generation(number, b"", 0.1, [7], vectors)
         closed = StoredGeneration(number, number, 1.0, number + 1, 0.0, 0.1, 20, 1.0)
@@ -48,7 +48,7 @@ def runs_dir(tmp_path, random_bundle):
 
 def test_a_run_that_goes_on_is_driven_at_random_and_shows_its_fitness(runs_dir, tmp_path):
     with find_subject("night", runs_dir) as subject:
-        page = inspect(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
+        page = write_page(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
     assert 'id="fitness"' in page
     assert "a fresh drive by a random driver" in page
 
@@ -59,21 +59,21 @@ def test_a_run_that_has_ended_is_driven_by_its_controller(runs_dir, random_bundl
     Controller(shape, parameters, "dream", random_bundle.sha256).save(next(run_paths(runs_dir)) / CONTROLLER)
     with find_subject("night", runs_dir) as subject:
         assert np.array_equal(subject.controller.parameters, parameters)
-        page = inspect(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
+        page = write_page(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
     assert "a fresh drive by the controller" in page
 
 
 def test_a_bundle_is_shown_a_drive_of_another_ones_controller(random_bundle, tmp_path):
     controller, _ = find_controller("tiny", tmp_path)
     own = find_bundle("tiny")
-    seen, driven = (drive(each, controller, DriveConfig(steps=30), own) for each in (random_bundle, own))
+    seen, driven = (record_drive(each, controller, DriveConfig(steps=30), own) for each in (random_bundle, own))
     assert np.array_equal(seen.action, driven.action)
     assert seen.mu.shape != driven.mu.shape or not np.array_equal(seen.mu, driven.mu)
 
 
 def test_a_runs_own_controller_is_measured_at_the_runs_temperature(runs_dir, random_bundle, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(measuring, "dream_losses", lambda *given: asked.append(given) or ([COMPARED], 1))
+    monkeypatch.setattr(measurements, "measure_dream_losses", lambda *given: asked.append(given) or ([COMPARED], 1))
     shape = random_bundle.controller_shape
     Controller(shape, np.zeros(shape.size, np.float32), "dream", random_bundle.sha256).save(
         next(run_paths(runs_dir)) / CONTROLLER

@@ -3,22 +3,22 @@
 import numpy as np
 import pytest
 
-from dreamfleet.common.variants import Variant
-from dreamfleet.worker.inspection.imagination import Beginning, Imagination
-from dreamfleet.worker.inspection.measuring import Driving
-from dreamfleet.worker.inspection.witness import WitnessConfig, witness
-from dreamfleet.worker.worldmodel.mind import Mind
+from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDriveConfig, witness
+from dreamfleet.worker.inspection.drive_dreams import DreamSegment, DriveDreamer
+from dreamfleet.worker.inspection.measurements import DriverChoice
+from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 from tests.support.bundles import write_random_bundle
 from tests.support.variants import controller_of
 
 VARIANT = Variant(pedals="one", pedal_shift=0.25, decide_every=3, feedback="last")
 
 
-def witnessed(watching, own, noise):
+def witnessed(observing_model, own, noise):
     """A drive of eleven steps by a controller of `own`, with `watching` looking on."""
-    driving = Driving(controller_of(own.under(None, VARIANT)), own)
-    mind = Mind(driving.watching(watching))
-    drives = witness(watching, mind, driving.hands(watching, mind), WitnessConfig(noise, steps=11))
+    driving = DriverChoice(controller_of(own.with_controllers(None, VARIANT)), own)
+    mind = RecurrentState(driving.observing_model(observing_model))
+    drives = witness(observing_model, mind, driving.hands(observing_model, mind), DisturbedDriveConfig(noise, steps=11))
     drive = next(drives)
     drives.close()
     return drive, driving.controller
@@ -37,7 +37,7 @@ def test_a_choice_is_held_whatever_is_pushed_meanwhile(random_bundle, noise):
 
 def test_a_dream_that_begins_between_two_choices_holds_on_to_the_one_before(random_bundle):
     drive, controller = witnessed(random_bundle, random_bundle, 0.0)
-    imagination, begun = Imagination(random_bundle, controller, 1.0, 2), Beginning(drive, 4, 6)
+    imagination, begun = DriveDreamer(random_bundle, controller, 1.0, 2), DreamSegment(drive, 4, 6)
     own, same = (imagination.dream(begun, own=each)[0] for each in (True, False))
     assert np.array_equal(own[:, :3], same[:, :3]), "steps 4 and 5 do what step 3 chose"
     assert not np.array_equal(own[:, 4:], same[:, 4:])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from dreamfleet.worker.scoring.episode import STRAYS, Course, score
+from dreamfleet.worker.scoring.episode import MAX_STRAYS, EpisodeConfig, score
 
 PARAMETERS = np.zeros(3, np.float32)
 
@@ -48,25 +48,27 @@ class Listening(Still):
 
 def test_a_policy_that_listens_hears_every_reward():
     policy = Listening()
-    score(Scripted([1.0, 2.0, 3.5]), policy, PARAMETERS, Course(1, 100))
+    score(Scripted([1.0, 2.0, 3.5]), policy, PARAMETERS, EpisodeConfig(1, 100))
     assert policy.heard == [1.0, 2.0, 3.5]
 
 
 def test_fitness_is_the_sum_of_rewards_until_the_end():
-    assert score(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 100)) == (
-        score(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 3))
+    assert score(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, EpisodeConfig(1, 100)) == (
+        score(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, EpisodeConfig(1, 3))
     )
-    driven = score(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, Course(1, 100))
+    driven = score(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, EpisodeConfig(1, 100))
     assert (driven.fitness, driven.steps) == (6.5, 3)
 
 
 def test_the_horizon_ends_an_episode():
-    assert score(Scripted([1.0] * 10), Still(), PARAMETERS, Course(1, 4)).steps == 4
+    assert score(Scripted([1.0] * 10), Still(), PARAMETERS, EpisodeConfig(1, 4)).steps == 4
 
 
 def test_a_hopeless_episode_is_cut_and_charged_what_standing_still_costs():
-    driven = score(Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, Course(1, 100, patience=20, idle_cost=0.1))
-    whole = score(Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, Course(1, 100))
+    driven = score(
+        Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, EpisodeConfig(1, 100, patience=20, idle_cost=0.1)
+    )
+    whole = score(Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, EpisodeConfig(1, 100))
     assert driven.steps == 21
     assert driven.fitness == pytest.approx(whole.fitness)
 
@@ -82,7 +84,7 @@ def test_a_hopeless_episode_is_cut_and_charged_what_standing_still_costs():
     ],
 )
 def test_time_costs_until_the_course_is_finished_and_to_crash_saves_nothing(rewards, info, paid):
-    free = Course(1, 20, patience=5, finish="lap")
+    free = EpisodeConfig(1, 20, patience=5, finish="lap")
     found = [score(Scripted(rewards, info), Still(), PARAMETERS, each) for each in (free, replace(free, time_cost=0.5))]
     assert found[0].fitness - found[1].fitness == 0.5 * paid
     assert found[0].steps == found[1].steps
@@ -100,9 +102,9 @@ class Straying(Scripted):
         return (*given, {"off": self._step in self._strays})
 
 
-@pytest.mark.parametrize(("strays", "paid"), [((), 0), ((3,), 1), (range(5, 9), 4), (range(1, 180), STRAYS)])
+@pytest.mark.parametrize(("strays", "paid"), [((), 0), ((3,), 1), (range(5, 9), 4), (range(1, 180), MAX_STRAYS)])
 def test_steps_off_the_course_cost_so_much_and_one_loss_no_more(strays, paid):
-    free = Course(1, 200, stray="off")
+    free = EpisodeConfig(1, 200, stray="off")
     course = [free, replace(free, stray_cost=2.0)]
     found = [score(Straying([0.0] * 199, strays), Still(), PARAMETERS, each) for each in course]
     assert found[0].fitness - found[1].fitness == 2 * paid
@@ -111,18 +113,18 @@ def test_steps_off_the_course_cost_so_much_and_one_loss_no_more(strays, paid):
 
 def test_reward_restores_patience():
     rewards = ([-0.1] * 9 + [1.0]) * 5
-    assert score(Scripted(rewards), Still(), PARAMETERS, Course(1, 100, patience=10)).steps == 50
+    assert score(Scripted(rewards), Still(), PARAMETERS, EpisodeConfig(1, 100, patience=10)).steps == 50
 
 
 def test_steps_are_told_as_they_are_made():
     told = []
-    score(Scripted([0.0] * 5), Still(), PARAMETERS, Course(1, 100), told.append)
+    score(Scripted([0.0] * 5), Still(), PARAMETERS, EpisodeConfig(1, 100), told.append)
     assert told == [1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_what_is_no_number_is_an_error_and_no_fitness(value):
     with pytest.raises(ValueError, match="NaN"):
-        score(Scripted([1.0]), Still(), np.full(3, value, np.float32), Course(1, 10))
+        score(Scripted([1.0]), Still(), np.full(3, value, np.float32), EpisodeConfig(1, 10))
     with pytest.raises(ValueError, match="add up"):
-        score(Scripted([value]), Still(), PARAMETERS, Course(1, 10))
+        score(Scripted([value]), Still(), PARAMETERS, EpisodeConfig(1, 10))

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import Manifest, write_bundle
-from dreamfleet.common.messages import MAX_PART
-from dreamfleet.common.store import BundleStore, default_cache
+from dreamfleet.common.artifacts.bundle import BundleManifest, write_bundle
+from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
+from dreamfleet.common.protocol.messages import MAX_PART
 from tests.support.bundles import npy
 from tests.support.stage import Stage, listening
 
@@ -15,16 +15,16 @@ def small_bundle(tmp_path_factory):
     """No world model, only as many bytes: the toy tasks do not look inside."""
     parts = dict.fromkeys(("encoder.onnx", "decoder.onnx"), b"x")
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
-    manifest = Manifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
+    manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
     path = tmp_path_factory.mktemp("bundle") / "small.zip"
     return write_bundle(path, manifest, {**parts, "policy.onnx": bytes((PARTS - 1) * MAX_PART)})
 
 
 @pytest.fixture
 def cached(small_bundle):
-    with BundleStore(default_cache()).downloading(small_bundle.sha256) as path:
+    with BundleStore(default_cache()).lock_download(small_bundle.sha256) as path:
         path.write_bytes(small_bundle.path.read_bytes())
-    BundleStore(default_cache()).complete(small_bundle.sha256)
+    BundleStore(default_cache()).finish_download(small_bundle.sha256)
 
 
 @pytest.fixture

@@ -1,9 +1,9 @@
 import dataclasses
 import hashlib
 
-from dreamfleet.common.messages import MAX_LEASES, MAX_PART, JobBatch, VectorPart
+from dreamfleet.common.protocol.messages import MAX_LEASES, MAX_PART, JobBatch, VectorPart
 from dreamfleet.worker.service import backlog as room
-from dreamfleet.worker.service.backlog import KEPT_VECTORS, MOST_AHEAD, Backlog
+from dreamfleet.worker.service.backlog import MAX_BATCHES_AHEAD, MAX_UNUSED_VECTORS, Backlog
 from tests.support.samples import HEAD, SPEC, VECTOR, VECTOR_ID, job
 
 WHOLE = VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR)
@@ -17,16 +17,16 @@ def batch(number, jobs=(), vectors=(WHOLE,), cancels=()):
 
 def test_jobs_come_out_in_order_with_their_vector():
     backlog = Backlog(SPEC)
-    backlog.take_in(batch(1, (job(0), job(1))))
+    backlog.add_batch(batch(1, (job(0), job(1))))
     assert [backlog.take(1), backlog.take(5), backlog.take(1)] == [[(job(0), VECTOR)], [(job(1), VECTOR)], []]
 
 
 def test_a_batch_that_comes_twice_counts_once():
     backlog = Backlog(SPEC)
     for _ in range(2):
-        backlog.take_in(batch(1, (job(0),)))
+        backlog.add_batch(batch(1, (job(0),)))
     assert backlog.take(1)
-    backlog.take_in(batch(1, (job(0),)))
+    backlog.add_batch(batch(1, (job(0),)))
     assert not backlog.take(1)
 
 
@@ -34,7 +34,7 @@ def test_seen_is_the_last_number_without_a_gap():
     backlog = Backlog(SPEC)
     seen = []
     for number in (1, 3, 4, 2):
-        backlog.take_in(batch(number))
+        backlog.add_batch(batch(number))
         seen.append(backlog.seen)
     assert seen == [1, 1, 1, 4]
 
@@ -42,63 +42,63 @@ def test_seen_is_the_last_number_without_a_gap():
 def test_a_vector_may_be_spread_over_batches_that_come_in_any_order():
     backlog = Backlog(SPEC)
     first, second = (dataclasses.replace(WHOLE, offset=at, data=VECTOR[at : at + 32]) for at in (0, 32))
-    backlog.take_in(batch(2, (job(0),), (second,)))
+    backlog.add_batch(batch(2, (job(0),), (second,)))
     assert not backlog.take(1)
-    backlog.take_in(batch(1, (), (first,)))
+    backlog.add_batch(batch(1, (), (first,)))
     assert backlog.take(1) == [(job(0), VECTOR)]
 
 
 def test_a_cancelled_job_is_not_started():
     backlog = Backlog(SPEC)
-    backlog.take_in(batch(1, (job(0), job(1)), cancels=()))
-    backlog.take_in(batch(2, cancels=(job(0).digest,)))
+    backlog.add_batch(batch(1, (job(0), job(1)), cancels=()))
+    backlog.add_batch(batch(2, cancels=(job(0).digest,)))
     assert backlog.take(1) == [(job(1), VECTOR)]
 
 
 def test_a_job_that_a_slot_has_in_hand_is_not_queued_again():
     backlog = Backlog(SPEC)
-    backlog.take_in(batch(1, (job(0), job(1))), {job(0).digest})
+    backlog.add_batch(batch(1, (job(0), job(1))), {job(0).digest})
     assert backlog.take(5) == [(job(1), VECTOR)]
 
 
 def test_a_job_whose_digest_is_of_something_else_is_refused():
     backlog = Backlog(SPEC)
     wrong = dataclasses.replace(job(0), seeds=(5,))
-    assert backlog.take_in(batch(1, (wrong,))) == [(wrong, "the job's digest is not of its content")]
+    assert backlog.add_batch(batch(1, (wrong,))) == [(wrong, "the job's digest is not of its content")]
     assert not backlog.take(1)
 
 
 def test_a_job_is_of_the_temperature_that_it_names():
     backlog, warm = Backlog(SPEC), job(1, temperature=1.5)
     renamed = [dataclasses.replace(warm, temperature=wrong) for wrong in (None, 1.25)]
-    assert [each for each, _ in backlog.take_in(batch(1, (warm, *renamed)))] == renamed
+    assert [each for each, _ in backlog.add_batch(batch(1, (warm, *renamed)))] == renamed
     assert backlog.take(5) == [(warm, VECTOR)]
 
 
 def test_a_turn_is_of_one_temperature():
     jobs = [job(episode, temperature=each) for episode, each in enumerate((None, None, 1.5, 1.5, 2.25))]
     backlog = Backlog(SPEC)
-    backlog.take_in(batch(1, jobs))
+    backlog.add_batch(batch(1, jobs))
     assert [[each.episode for each, _ in backlog.take(5)] for _ in range(4)] == [[0, 1], [2, 3], [4], []]
 
 
 def test_a_job_is_of_the_horizon_and_patience_that_it_names():
     backlog, short = Backlog(SPEC), job(1, horizon=400, patience=0)
     renamed = [dataclasses.replace(short, **wrong) for wrong in ({"horizon": None}, {"patience": 1}, {"horizon": 401})]
-    assert [each for each, _ in backlog.take_in(batch(1, (short, *renamed)))] == renamed
+    assert [each for each, _ in backlog.add_batch(batch(1, (short, *renamed)))] == renamed
     assert backlog.take(5) == [(short, VECTOR)]
 
 
 def test_a_turn_is_of_one_stage():
     named = ({}, {}, {"horizon": 400}, {"horizon": 400}, {"horizon": 400, "patience": 5}, {"patience": 5})
     backlog = Backlog(SPEC)
-    backlog.take_in(batch(1, [job(episode, **each) for episode, each in enumerate(named)]))
+    backlog.add_batch(batch(1, [job(episode, **each) for episode, each in enumerate(named)]))
     assert [[each.episode for each, _ in backlog.take(5)] for _ in range(5)] == [[0, 1], [2, 3], [4], [5], []]
 
 
 def test_a_damaged_vector_is_never_scored():
     backlog = Backlog(SPEC)
-    backlog.take_in(batch(1, (job(0),), (dataclasses.replace(WHOLE, data=VECTOR[::-1]),)))
+    backlog.add_batch(batch(1, (job(0),), (dataclasses.replace(WHOLE, data=VECTOR[::-1]),)))
     assert not backlog.take(1)
 
 
@@ -107,56 +107,56 @@ def test_vectors_that_no_job_needs_are_let_go():
     for number in range(1, 500):
         data = number.to_bytes(8, "little")
         part = dataclasses.replace(WHOLE, id=hashlib.sha256(data).digest(), shape=(2,), data=data)
-        backlog.take_in(batch(number, vectors=(part,)))
-    assert len(backlog._vectors) <= KEPT_VECTORS
+        backlog.add_batch(batch(number, vectors=(part,)))
+    assert len(backlog._vectors) <= MAX_UNUSED_VECTORS
 
 
 def test_a_new_life_of_the_coordinator_counts_from_one_again():
     backlog = Backlog(SPEC)
-    backlog.take_in(batch(1, (job(0),)))
-    backlog.begin(1)
+    backlog.add_batch(batch(1, (job(0),)))
+    backlog.start_numbering(1)
     backlog.clear()
     assert not backlog.take(1)
-    backlog.take_in(batch(1, (job(1),)))
+    backlog.add_batch(batch(1, (job(1),)))
     assert backlog.take(1) == [(job(1), VECTOR)]
 
 
 def test_a_number_that_no_coordinator_has_reached_counts_for_nothing():
     backlog = Backlog(SPEC)
-    for number in (MOST_AHEAD + 1, 2**40, 2**62):
-        backlog.take_in(batch(number, (job(0),)))
+    for number in (MAX_BATCHES_AHEAD + 1, 2**40, 2**62):
+        backlog.add_batch(batch(number, (job(0),)))
     assert not backlog.queued
-    assert not backlog._ahead
-    backlog.take_in(batch(1, (job(1),)))
+    assert not backlog._received_ahead
+    backlog.add_batch(batch(1, (job(1),)))
     assert backlog.seen == 1
 
 
 def test_more_jobs_than_a_worker_may_hold_are_let_go():
     backlog = Backlog(SPEC)
     for number in range(3):
-        backlog.take_in(batch(number + 1, tuple(job(number * 500 + each) for each in range(500))))
+        backlog.add_batch(batch(number + 1, tuple(job(number * 500 + each) for each in range(500))))
     assert len(backlog.queued) == MAX_LEASES
     backlog.clear()
-    backlog.take_in(batch(4, (job(0),)))
+    backlog.add_batch(batch(4, (job(0),)))
     assert backlog.take(1) == [(job(0), VECTOR)]
 
 
 def test_vectors_have_so_much_room_and_no_more(monkeypatch):
-    monkeypatch.setattr(room, "MOST_BYTES", 4 * MAX_PART)
+    monkeypatch.setattr(room, "MAX_VECTOR_BYTES", 4 * MAX_PART)
     backlog = Backlog(SPEC)
     for number in range(100):
         rubbish = VectorPart(id=bytes([number]) * 32, dtype="<f4", shape=(2**40,), offset=0, data=bytes(MAX_PART))
-        backlog.take_in(batch(number + 1, vectors=(rubbish,)))
+        backlog.add_batch(batch(number + 1, vectors=(rubbish,)))
     assert len(backlog._vectors) == 4
-    backlog.take_in(batch(101, (job(0),)))
+    backlog.add_batch(batch(101, (job(0),)))
     assert not backlog.queued, "it is given again, to whoever has room"
 
 
 def test_a_vector_that_others_have_spoilt_costs_its_jobs_which_are_given_again():
     backlog = Backlog(SPEC)
-    backlog.take_in(batch(1, vectors=(dataclasses.replace(WHOLE, data=bytes(64)),)))
-    backlog.take_in(batch(2, (job(0), job(1))))
+    backlog.add_batch(batch(1, vectors=(dataclasses.replace(WHOLE, data=bytes(64)),)))
+    backlog.add_batch(batch(2, (job(0), job(1))))
     assert not backlog.take(2)
     assert not backlog.queued
-    backlog.take_in(batch(3, (job(0),)))
+    backlog.add_batch(batch(3, (job(0),)))
     assert backlog.take(2) == [(job(0), VECTOR)]

@@ -8,20 +8,19 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import Manifest, write_bundle
-from dreamfleet.common.codec import Inbox
+from dreamfleet.common.artifacts.bundle import BundleManifest, write_bundle
+from dreamfleet.common.artifacts.bundle_store import BundleStore
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.messages import MAX_PART
-from dreamfleet.common.session import Network, open_session
-from dreamfleet.common.store import BundleStore
+from dreamfleet.common.protocol.codec import CountingDecoder
+from dreamfleet.common.protocol.messages import MAX_PART
+from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.worker.service import bundle_fetch
-from dreamfleet.worker.service.bundle_fetch import WINDOW, obtain
+from dreamfleet.worker.service.bundle_fetch import WINDOW, fetch_bundle
 from tests.support import tasks
 from tests.support.bundles import npy
 from tests.support.hand import DEADLINE, Hand
 from tests.support.processes import free_port
 
-pytestmark = pytest.mark.timeout(60)
 PARTS = 5
 
 
@@ -29,7 +28,7 @@ PARTS = 5
 def bundle(tmp_path_factory):
     parts = dict.fromkeys(("encoder.onnx", "decoder.onnx"), b"x")
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
-    manifest = Manifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
+    manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
     content = hashlib.sha256(b"a").digest() * ((PARTS - 1) * MAX_PART // 32)
     return write_bundle(tmp_path_factory.mktemp("bundle") / "small.zip", manifest, {**parts, "policy.onnx": content})
 
@@ -59,13 +58,13 @@ def store(tmp_path):
 
 
 def begun(store, bundle, data):
-    with store.downloading(bundle.sha256) as path:
+    with store.lock_download(bundle.sha256) as path:
         path.write_bytes(data)
     return path
 
 
 def fetch(session, hand, store, stopped=lambda: False):
-    return obtain(session, hand.run, hand.spec.bundle, store, Inbox(), stopped)
+    return fetch_bundle(session, hand.run, hand.spec.bundle, store, CountingDecoder(), stopped)
 
 
 def asked(hand):
@@ -114,7 +113,7 @@ def test_a_stop_in_the_middle_keeps_what_has_come_and_the_next_life_goes_on(sess
     stop = threading.Event()
     hand.damage = lambda offset, data: stop.set() if offset >= 2 * MAX_PART else data  # no answer from here on
     assert fetch(session, hand, store, stop.is_set) is None
-    with store.downloading(bundle.sha256) as partial:
+    with store.lock_download(bundle.sha256) as partial:
         kept = partial.stat().st_size
     assert kept in (MAX_PART, 2 * MAX_PART)
     asked(hand)
@@ -131,7 +130,7 @@ def test_two_workers_of_a_host_fetch_it_once(session, hand, store, bundle):
 
 
 def test_a_coordinator_that_stays_silent_is_an_error_and_what_has_come_stays(session, hand, store, bundle, monkeypatch):
-    monkeypatch.setattr(bundle_fetch, "SILENCES", 2)
+    monkeypatch.setattr(bundle_fetch, "MAX_ROUNDS_WITHOUT_PROGRESS", 2)
     monkeypatch.setattr(bundle_fetch, "QUERY_TIMEOUT", 0.1)
     monkeypatch.setattr(bundle_fetch, "PAUSE", 0.0)
     partial = begun(store, bundle, bundle.path.read_bytes()[:100])
@@ -151,7 +150,7 @@ def test_a_bundle_that_is_said_to_be_endless_writes_nothing(session, hand, store
     monkeypatch.setattr(hand, "total", lambda: 2**62)
     with pytest.raises(BundleError, match=r"is 4,611,686,018,427 MB long, 268 at most"):
         fetch(session, hand, store)
-    with store.downloading(bundle.sha256) as partial:
+    with store.lock_download(bundle.sha256) as partial:
         assert not partial.stat().st_size
 
 

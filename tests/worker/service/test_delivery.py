@@ -2,16 +2,12 @@
 
 import hashlib
 
-import pytest
-
-from dreamfleet.common.codec import encode
-from dreamfleet.common.messages import MAX_MESSAGE, MAX_PART, Beat, UploadPart
+from dreamfleet.common.protocol.codec import encode
+from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_PART, Heartbeat, UploadPart
 from tests.support import tasks
 from tests.support.hand import SECOND, tag
 from tests.support.samples import MSGPACK
 from tests.support.stage import drained, wait_for
-
-pytestmark = pytest.mark.timeout(60)
 
 
 def test_a_result_is_repeated_until_its_verdict_and_then_no_more(stage, cached):
@@ -92,7 +88,7 @@ def test_a_drive_is_uploaded_again_until_its_verdict_and_then_no_more(stage, cac
     hand.send(2, other, accepted=(kept,))
     hand.beat(lambda beat: beat.seen == 2 and tag(kept) not in beat.unacked)
     for _ in range(3):
-        assert isinstance(hand.next((UploadPart, Beat)), Beat)
+        assert isinstance(hand.next((UploadPart, Heartbeat)), Heartbeat)
 
 
 def test_a_cancelled_job_is_not_started(stage, cached):

@@ -2,16 +2,14 @@
 
 import pytest
 
-from dreamfleet.common import keys
-from dreamfleet.common.codec import encode
+from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.messages import MAX_PART, BundlePart
-from dreamfleet.common.session import Network, open_session
-from dreamfleet.common.store import BundleStore, default_cache
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import encode
+from dreamfleet.common.protocol.messages import MAX_PART, BundlePart
+from dreamfleet.common.transport.session import Network, open_session
 from tests.support.hand import DEADLINE
 from tests.support.stage import wait_for
-
-pytestmark = pytest.mark.timeout(60)
 
 
 def test_a_damaged_part_costs_one_more_download(stage, said):
@@ -64,7 +62,7 @@ def test_rubbish_beside_the_truth_keeps_no_worker_from_it(stage, said):
 @pytest.mark.parametrize(("beginning", "first"), [(3 * MAX_PART + 17, 3 * MAX_PART + 17), (9 * MAX_PART, 9 * MAX_PART)])
 def test_an_interrupted_download_goes_on_and_a_longer_one_begins_again(stage, beginning, first):
     hand = stage.hand()
-    with BundleStore(default_cache()).downloading(stage.bundle.sha256) as path:
+    with BundleStore(default_cache()).lock_download(stage.bundle.sha256) as path:
         path.write_bytes((stage.bundle.path.read_bytes() + bytes(9 * MAX_PART))[:beginning])
     stage.worker()
     hand.ready()

@@ -1,9 +1,10 @@
 """What a coordinator says, or a task of its worker, ends no worker."""
 
-from dreamfleet.common.codec import encode
-from dreamfleet.common.messages import MAX_TEXT, Result, ResultBatch
-from dreamfleet.worker.service.joined import JoinedRun
+from dreamfleet.common.protocol.codec import encode
+from dreamfleet.common.protocol.messages import Result, ResultBatch
+from dreamfleet.common.serialization.constraints import MAX_TEXT
 from dreamfleet.worker.service.outbox import Outbox
+from dreamfleet.worker.service.run_session import RunSession
 from tests.support.samples import HEAD
 from tests.support.stage import wait_for
 
@@ -12,11 +13,11 @@ def test_a_batch_that_raises_costs_itself_alone(stage, cached, said, monkeypatch
     hand = stage.hand()
     stage.worker()
     hand.ready()
-    take = JoinedRun._take_batch
-    monkeypatch.setattr(JoinedRun, "_take_batch", lambda *_: 1 / 0)
+    take = RunSession._handle_batch
+    monkeypatch.setattr(RunSession, "_handle_batch", lambda *_: 1 / 0)
     hand.send(1, hand.job())
     assert "ZeroDivisionError" in wait_for(said, "dropped a job")
-    monkeypatch.setattr(JoinedRun, "_take_batch", take)
+    monkeypatch.setattr(RunSession, "_handle_batch", take)
     hand.send(1, hand.job())
     assert hand.result(hand.job()).fitness is not None
 

@@ -7,12 +7,10 @@ from tests.support import tasks
 from tests.support.hand import DEADLINE
 from tests.support.stage import drained, wait_for
 
-pytestmark = pytest.mark.timeout(60)
-
 
 @pytest.mark.parametrize("when", ["before it joined", "afterwards"])
 def test_it_leaves_when_its_run_is_over_if_it_shall(stage, cached, monkeypatch, when):
-    monkeypatch.setattr(membership, "GONE", 0.3)
+    monkeypatch.setattr(membership, "COORDINATOR_GONE_AFTER", 0.3)
     hand = stage.hand()
     if when == "before it joined":
         hand.vanish()
@@ -82,7 +80,7 @@ def test_its_lifetime_ends_although_no_run_has_come(stage, coordinator):
 
 
 def test_the_next_run_does_not_hear_the_last_words_of_the_last_runs_slots(stage, said, cached, monkeypatch):
-    monkeypatch.setattr(membership, "GONE", 0.3)
+    monkeypatch.setattr(membership, "COORDINATOR_GONE_AFTER", 0.3)
     hand = stage.hand(run="one")
     hand.slots = 0
     stage.worker(run=None, any=True)

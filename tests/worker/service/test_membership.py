@@ -7,38 +7,45 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from dreamfleet.worker.service.membership import GONE, SILENT_BEATS, UPLOAD_GRACE, Hands, Membership, Terms
+from dreamfleet.worker.service.membership import (
+    COORDINATOR_GONE_AFTER,
+    SILENT_BEATS,
+    UPLOAD_GRACE,
+    LeaveConditions,
+    Membership,
+    WorkerLoad,
+)
 
 BEAT = 1.0
 PATIENCE = SILENT_BEATS * BEAT
-IDLE = Hands(idle=True, owed=False, uploading=False)
-BUSY = Hands(idle=False, owed=False, uploading=False)
-OWED = Hands(idle=False, owed=True, uploading=False)
-UPLOADING = Hands(idle=True, owed=True, uploading=True)
+IDLE = WorkerLoad(idle=True, awaits_verdict=False, uploading=False)
+BUSY = WorkerLoad(idle=False, awaits_verdict=False, uploading=False)
+OWED = WorkerLoad(idle=False, awaits_verdict=True, uploading=False)
+UPLOADING = WorkerLoad(idle=True, awaits_verdict=True, uploading=True)
 
 
 def joined(visible=True, **terms):
     """At time 0, in the first life of a coordinator."""
-    made = Membership(Terms(**terms), now=0.0)
+    made = Membership(LeaveConditions(**terms), now=0.0)
     made.join("first", BEAT, now=0.0)
     if visible:
-        made.appear("first")
+        made.add_coordinator("first")
     return made
 
 
 def test_a_member_whose_coordinator_is_in_sight_and_speaks_says_nothing():
     member = joined()
     for second in range(1, 20):
-        member.hear(float(second))
+        member.note_activity(float(second))
         assert not any(member.must_rejoin(float(second), hands) for hands in (IDLE, BUSY, OWED))
 
 
 def test_a_run_that_ends_with_its_workers_is_left_at_once_and_the_next_one_is_not():
     member = joined()
-    member.disband()
-    assert member.over(1.0, busy=True)
+    member.end_run()
+    assert member.is_over(1.0, busy=True)
     member.join("another run's", BEAT, now=2.0)
-    assert not member.over(3.0, busy=False)
+    assert not member.is_over(3.0, busy=False)
 
 
 @pytest.mark.parametrize(("hands", "after"), [(IDLE, PATIENCE), (OWED, PATIENCE), (UPLOADING, PATIENCE + UPLOAD_GRACE)])
@@ -54,10 +61,10 @@ def test_silence_while_jobs_run_means_nothing():
 
 def test_a_coordinator_that_was_out_of_sight_is_asked_at_once_and_only_when_it_is_back():
     member = joined()
-    member.vanish("first", 1.0)
+    member.remove_coordinator("first", 1.0)
     assert not member.must_rejoin(1.0, BUSY)
-    assert member.appear("first")
-    assert not member.appear("first")
+    assert member.add_coordinator("first")
+    assert not member.add_coordinator("first")
     assert member.must_rejoin(1.0, BUSY)
     member.rejoin("first", 1.1)
     assert not member.must_rejoin(1.1, BUSY)
@@ -65,8 +72,8 @@ def test_a_coordinator_that_was_out_of_sight_is_asked_at_once_and_only_when_it_i
 
 def test_another_life_of_the_coordinator_is_asked_and_then_obeyed():
     member = joined()
-    member.vanish("first", 1.0)
-    assert not member.appear("second")
+    member.remove_coordinator("first", 1.0)
+    assert not member.add_coordinator("second")
     assert member.must_rejoin(1.0, BUSY)
     member.rejoin("second", 1.1)
     assert not member.must_rejoin(1.1, BUSY)
@@ -74,86 +81,88 @@ def test_another_life_of_the_coordinator_is_asked_and_then_obeyed():
 
 def test_a_question_without_an_answer_is_asked_again_after_a_pause():
     member = joined()
-    member.vanish("first", 1.0)
-    member.appear("first")
-    member.ask(1.0, pause=2.0)
+    member.remove_coordinator("first", 1.0)
+    member.add_coordinator("first")
+    member.note_hello_sent(1.0, pause=2.0)
     assert not member.must_rejoin(2.9, BUSY)
     assert member.must_rejoin(3.0, BUSY)
 
 
 def test_told_once_it_drains_until_all_is_delivered():
     member = joined(drain_timeout=30.0)
-    assert not member.must_drain(1.0)
+    assert not member.start_draining_if_due(1.0)
     member.stop()
-    assert member.must_drain(1.0)
-    assert not member.must_drain(1.1), "it begins once"
-    assert (member.leaving(1.1), member.draining) == (True, True)
-    assert not member.over(30.9, busy=True)
-    assert member.over(1.1, busy=False)
-    assert member.over(31.1, busy=True), "but not for ever"
+    assert member.start_draining_if_due(1.0)
+    assert not member.start_draining_if_due(1.1), "it begins once"
+    assert (member.is_leaving(1.1), member.draining) == (True, True)
+    assert not member.is_over(30.9, busy=True)
+    assert member.is_over(1.1, busy=False)
+    assert member.is_over(31.1, busy=True), "but not for ever"
 
 
 def test_told_twice_it_leaves_at_once():
     member = joined()
     member.stop()
     member.stop()
-    assert member.over(0.0, busy=True)
+    assert member.is_over(0.0, busy=True)
 
 
 def test_it_drains_at_the_end_of_its_lifetime_which_begins_before_any_run():
-    member = Membership(Terms(lifetime=10.0), now=0.0)
-    assert not member.leaving(9.9)
-    assert member.leaving(10.0)
+    member = Membership(LeaveConditions(lifetime=10.0), now=0.0)
+    assert not member.is_leaving(9.9)
+    assert member.is_leaving(10.0)
     member.join("first", BEAT, now=9.0)
-    assert not member.must_drain(9.9)
-    assert member.must_drain(10.0)
+    assert not member.start_draining_if_due(9.9)
+    assert member.start_draining_if_due(10.0)
 
 
 @pytest.mark.parametrize("seen", [True, False])
 def test_it_leaves_a_run_that_is_gone_if_it_shall(seen):
-    leaves, stays = (joined(visible=seen, leaves_alone=each) for each in (True, False))
+    leaves, stays = (joined(visible=seen, leaves_without_coordinator=each) for each in (True, False))
     for member in (leaves, stays):
         if seen:
-            assert not member.over(1e6, busy=False)
-            member.vanish("first", 1e6)
+            assert not member.is_over(1e6, busy=False)
+            member.remove_coordinator("first", 1e6)
         since = 1e6 if seen else 0.0
-        member.vanish("never seen", since + GONE)  # a token that is lost twice starts no clock anew
-        assert not member.over(since + GONE, busy=True)
-    assert leaves.over(since + GONE + 0.1, busy=True)
-    assert not stays.over(math.inf, busy=False)
+        member.remove_coordinator(
+            "never seen", since + COORDINATOR_GONE_AFTER
+        )  # a token that is lost twice starts no clock anew
+        assert not member.is_over(since + COORDINATOR_GONE_AFTER, busy=True)
+    assert leaves.is_over(since + COORDINATOR_GONE_AFTER + 0.1, busy=True)
+    assert not stays.is_over(math.inf, busy=False)
 
 
 class AnyOrder(RuleBasedStateMachine):
     """A worker among coordinators that come and go, beside a plain account of what happened."""
 
     nonces = st.sampled_from(["first", "second", "third"])
-    hands = st.builds(Hands, idle=st.booleans(), owed=st.booleans(), uploading=st.booleans())
+    hands = st.builds(WorkerLoad, idle=st.booleans(), awaits_verdict=st.booleans(), uploading=st.booleans())
 
     def __init__(self):
         super().__init__()
         self.now = 0.0
-        self.terms = Terms(lifetime=200.0, drain_timeout=30.0, leaves_alone=True)
-        self.member = joined(visible=False, lifetime=200.0, drain_timeout=30.0, leaves_alone=True)
+        self.terms = LeaveConditions(lifetime=200.0, drain_timeout=30.0, leaves_without_coordinator=True)
+        self.member = joined(visible=False, lifetime=200.0, drain_timeout=30.0, leaves_without_coordinator=True)
         self.seen, self.of, self.doubt = set(), "first", False
         self.spoke = self.alone = self.allowed = 0.0
         self.stops = self.drains = 0
 
     @rule(nonce=nonces)
     def a_token_appears(self, nonce):
-        self.member.appear(nonce)
+        self.member.add_coordinator(nonce)
         self.seen.add(nonce)
 
     @rule(nonce=nonces)
     def a_token_vanishes(self, nonce):
         if self.seen == {nonce}:
             self.alone = self.now
-        self.member.vanish(nonce, self.now)
+        self.member.remove_coordinator(nonce, self.now)
         self.seen.discard(nonce)
         self.doubt |= nonce == self.of
 
     @rule()
     def the_coordinator_speaks(self):
-        self.member.hear(self.now)
+        self.member.note_activity(self.now)
         self.spoke = self.now
 
     @rule(seconds=st.floats(0.01, 20.0))
@@ -169,12 +178,12 @@ class AnyOrder(RuleBasedStateMachine):
     def it_asks_if_it_must(self, hands, answers, pause):
         must = self.member.must_rejoin(self.now, hands)
         patience = PATIENCE + (UPLOAD_GRACE if hands.uploading else 0)
-        forgotten = self.now - self.spoke > patience and (hands.idle or hands.owed)
+        forgotten = self.now - self.spoke > patience and (hands.idle or hands.awaits_verdict)
         reason = self.doubt or self.of not in self.seen or forgotten
         assert must == (bool(self.seen) and self.now >= self.allowed and reason)
         if not must:
             return
-        self.member.ask(self.now, pause)
+        self.member.note_hello_sent(self.now, pause)
         self.allowed = self.now + pause
         if answers:
             self.of, self.doubt, self.spoke = min(self.seen), False, self.now
@@ -184,7 +193,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     @rule()
     def it_drains_if_it_must(self):
-        if self.member.must_drain(self.now):
+        if self.member.start_draining_if_due(self.now):
             self.drains += 1
             self.drain_until = self.now + self.terms.drain_timeout
 
@@ -202,17 +211,19 @@ class AnyOrder(RuleBasedStateMachine):
 
     @invariant()
     def it_leaves_for_a_reason_and_then_only(self):
-        assert self.member.leaving(self.now) == (self.stops > 0 or self.now >= self.terms.lifetime)
+        assert self.member.is_leaving(self.now) == (self.stops > 0 or self.now >= self.terms.lifetime)
         assert self.drains <= 1
         for busy in (True, False):
-            over = self.member.over(self.now, busy)
+            is_over = self.member.is_over(self.now, busy)
             if self.stops > 1:
-                assert over
+                assert is_over
             elif self.drains:
-                alone = not self.seen and self.now - self.alone > GONE  # nobody takes what it would deliver
-                assert over == (not busy or self.now > self.drain_until or alone)
+                alone = (
+                    not self.seen and self.now - self.alone > COORDINATOR_GONE_AFTER
+                )  # nobody takes what it would deliver
+                assert is_over == (not busy or self.now > self.drain_until or alone)
             else:
-                assert over == (not self.seen and self.now - self.alone > GONE)
+                assert is_over == (not self.seen and self.now - self.alone > COORDINATOR_GONE_AFTER)
 
 
 TestAnyOrder = AnyOrder.TestCase

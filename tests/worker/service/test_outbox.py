@@ -1,5 +1,5 @@
-from dreamfleet.common.messages import Result
-from dreamfleet.worker.service.outbox import BATCH, Outbox
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.worker.service.outbox import MAX_RESULTS, Outbox
 
 
 def result(number):
@@ -12,7 +12,7 @@ def test_a_result_leaves_at_once_and_again_until_its_verdict():
     assert outbox.due(0.0) == [(result(1),)]
     assert outbox.due(0.5) == []
     assert outbox.due(1.0) == [(result(1),)]
-    outbox.settle([result(1).digest])
+    outbox.acknowledge([result(1).digest])
     assert outbox.due(9.0) == []
     assert len(outbox) == 0
 
@@ -25,9 +25,9 @@ def test_repetitions_of_what_nobody_answers_become_rarer():
 
 def test_many_results_are_cut_into_messages():
     outbox = Outbox(repeat=1.0)
-    for number in range(BATCH + 5):
+    for number in range(MAX_RESULTS + 5):
         outbox.add(result(number))
-    assert [len(results) for results in outbox.due(0.0)] == [BATCH, 5]
+    assert [len(results) for results in outbox.due(0.0)] == [MAX_RESULTS, 5]
 
 
 def test_a_new_coordinator_hears_everything_again():
@@ -39,4 +39,4 @@ def test_a_new_coordinator_hears_everything_again():
 
 
 def test_verdicts_on_nothing_are_harmless():
-    Outbox(repeat=1.0).settle([b"x" * 32])
+    Outbox(repeat=1.0).acknowledge([b"x" * 32])

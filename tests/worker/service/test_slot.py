@@ -17,16 +17,14 @@ from time import monotonic
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import hash_file
+from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.messages import TaskSpec
-from dreamfleet.worker.service.slot import FAILED_STARTS, LONGEST_PAUSE, RESPITE, START_LIMIT, Slot
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.service.slot import FAILED_STARTS, MAX_START_DELAY, START_LIMIT, START_RETRY_DELAY, Slot
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
-from tests.support.processes import environment
+from tests.support.processes import DEADLINE, environment
 from tests.support.samples import VECTOR, job
-
-TIMEOUT = 60
 
 
 @cache
@@ -55,7 +53,7 @@ class Harness:
         self.slot.check(monotonic(), 0.0)
         while self.slot.pid == 0:
             self.slot.check(monotonic(), 0.0)
-        return self.slot.handle(self.events.get(timeout=TIMEOUT)[1])
+        return self.slot.handle(self.events.get(timeout=DEADLINE)[1])
 
     def result(self):
         while True:
@@ -66,13 +64,13 @@ class Harness:
     def outcome(self):
         """The result, and the file that came with it."""
         while True:
-            event = self.events.get(timeout=TIMEOUT)[1]
+            event = self.events.get(timeout=DEADLINE)[1]
             if results := self.slot.handle(event):
                 return results[0], event.upload
 
     def gone(self):
         """The event that the child is gone, not handled yet."""
-        while (event := self.events.get(timeout=TIMEOUT)[1]).word is not None:
+        while (event := self.events.get(timeout=DEADLINE)[1]).message is not None:
             self.slot.handle(event)
         return event
 
@@ -179,7 +177,7 @@ def test_a_job_that_is_given_up_ends_without_a_result_and_the_child_lives_on(har
     slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
     slot.slot.abandon(job(0, spec=slot.spec).digest)
     while slot.slot.running:
-        assert slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1]) == ()
+        assert slot.slot.handle(slot.events.get(timeout=DEADLINE)[1]) == ()
     assert slot.score(1).fitness is not None
     assert slot.slot.pid == pid
 
@@ -187,11 +185,11 @@ def test_a_job_that_is_given_up_ends_without_a_result_and_the_child_lives_on(har
 def test_after_short_turns_the_next_one_waits_in_the_child(harness):
     slot = harness(tasks.TOY)
     slot.wait_ready()
-    assert not slot.slot.takes_more
+    assert not slot.slot.can_queue_another
     slot.score()
     for number in (1, 2):
         slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
-        assert slot.slot.takes_more == (number == 1)
+        assert slot.slot.can_queue_another == (number == 1)
     assert [each.digest for each in slot.slot.waiting] == [job(2, spec=slot.spec).digest]
     assert [slot.result().digest for _ in range(2)] == [job(number, spec=slot.spec).digest for number in (1, 2)]
 
@@ -216,13 +214,13 @@ def test_of_a_turn_of_several_jobs_all_must_be_given_up_to_end_it(harness):
     slot.slot.abandon(jobs[0].digest)
     results = ()
     while not results:
-        results = slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1])
+        results = slot.slot.handle(slot.events.get(timeout=DEADLINE)[1])
     assert [each.digest for each in results] == [each.digest for each in jobs]
     slot.slot.submit([(each, VECTOR) for each in jobs])
     for each in jobs:
         slot.slot.abandon(each.digest)
     while slot.slot.running:
-        assert slot.slot.handle(slot.events.get(timeout=TIMEOUT)[1]) == ()
+        assert slot.slot.handle(slot.events.get(timeout=DEADLINE)[1]) == ()
 
 
 def test_a_hung_job_is_killed_and_its_child_replaced(harness):
@@ -256,7 +254,7 @@ def test_a_child_that_cannot_start_ends_with_its_reason(harness, tmp_path):
     slot = harness(tasks.TOY, broken)
     for _ in range(FAILED_STARTS - 1):
         slot.slot.handle(slot.gone())
-        slot.slot.check(monotonic() + LONGEST_PAUSE, 0.0)
+        slot.slot.check(monotonic() + MAX_START_DELAY, 0.0)
     last = slot.gone()
     with pytest.raises(DreamfleetError, match=r"cannot start: BundleError.*not a whole bundle"):
         slot.slot.handle(last)
@@ -281,20 +279,20 @@ def test_a_slot_waits_a_while_for_descriptors_and_then_says_what_is_lacking(harn
     try:
         slot = harness(tasks.TOY)
         now = monotonic()
-        slot.slot.check(now + RESPITE / 2, 0.0)
-        slot.slot.check(now + 2 * RESPITE, 0.0)
+        slot.slot.check(now + START_RETRY_DELAY / 2, 0.0)
+        slot.slot.check(now + 2 * START_RETRY_DELAY, 0.0)
         assert slot.slot.pid == 0
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    slot.slot.check(now + 4 * RESPITE, 0.0)
+    slot.slot.check(now + 4 * START_RETRY_DELAY, 0.0)
     assert slot.score().fitness is not None
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
     try:
         os.kill(slot.slot.pid, signal.SIGKILL)
         slot.slot.handle(slot.gone())
-        slot.slot.check(monotonic() + 2 * RESPITE, 0.0)
+        slot.slot.check(monotonic() + 2 * START_RETRY_DELAY, 0.0)
         with pytest.raises(DreamfleetError, match=r"cannot start: .*Too many open files; .*--slots"):
-            slot.slot.check(monotonic() + 4 * RESPITE, 0.0)
+            slot.slot.check(monotonic() + 4 * START_RETRY_DELAY, 0.0)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
@@ -308,7 +306,7 @@ def test_a_child_that_is_killed_again_and_again_before_it_did_anything_keeps_no_
         assert (slot.slot.pid == 0) == (number > 0)
         slot.slot.check(monotonic() + 0.4 * 2 ** (number - 1), 0.0)
         assert (slot.slot.pid == 0) == (number > 0)
-        slot.slot.check(monotonic() + LONGEST_PAUSE, 0.0)
+        slot.slot.check(monotonic() + MAX_START_DELAY, 0.0)
     assert slot.score().fitness is not None
 
 
@@ -393,7 +391,7 @@ def test_a_bundle_that_was_swapped_is_never_scored_with(harness, random_bundle, 
 def test_a_bundle_that_others_took_away_or_damaged_is_obtained_again(harness, random_bundle, tmp_path, damage):
     path = tmp_path / "cached.zip"
     shutil.copyfile(random_bundle.path, path)
-    slot = harness(tasks.TOY, path, renew=lambda: shutil.copyfile(random_bundle.path, path))
+    slot = harness(tasks.TOY, path, restore_bundle=lambda: shutil.copyfile(random_bundle.path, path))
     before = slot.score()
     damage(path)
     os.kill(slot.slot.pid, signal.SIGKILL)

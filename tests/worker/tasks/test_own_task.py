@@ -23,7 +23,6 @@ version = "1.0"
 [tool.setuptools]
 py-modules = ["field"]
 """
-pytestmark = pytest.mark.timeout(180)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +52,7 @@ def run(code, *folders):
 
 def test_a_package_registers_a_task_that_needs_no_bundle(installed):
     code = """
-from dreamfleet.common.tasks import describe_task
+from dreamfleet.common.protocol.tasks import describe_task
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
 print("field" in known_tasks(), find_task("field").name, describe_task("field", {}).observations)
 """
@@ -64,7 +63,7 @@ def test_candidates_are_scored_in_it(installed):
     code = """
 import numpy as np
 from dreamfleet import Scorer, TaskSpec
-from dreamfleet.common.controller import ControllerShape
+from dreamfleet.common.artifacts.controller import ControllerShape
 shape = ControllerShape(2, 2)
 scorer = Scorer(TaskSpec("field", "", 20, 0, shape))
 still, inwards = np.zeros(6, np.float32), np.array([-1, 0, 0, -1, 0, 0], np.float32)

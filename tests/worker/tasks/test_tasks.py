@@ -4,12 +4,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import Manifest, write_bundle
+from dreamfleet.common.artifacts.bundle import BundleManifest, write_bundle
+from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
-from dreamfleet.common.messages import TaskSpec
-from dreamfleet.common.variants import Variant
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
-from dreamfleet.worker.scoring.episode import play, score
+from dreamfleet.worker.scoring.episode import run_episode, score
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
@@ -53,7 +53,7 @@ def test_a_bundle_of_another_task_or_of_pictures_that_it_does_not_give_is_refuse
 ):
     parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "policy.onnx"), b"x")
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
-    manifest = Manifest("moon", of, preprocessing, shape, latent=4, hidden=4, actions=3)
+    manifest = BundleManifest("moon", of, preprocessing, shape, latent=4, hidden=4, actions=3)
     bundle, found = write_bundle(tmp_path / "moon.zip", manifest, parts), find_task(task)
     for make in (found.make_environment, found.make_judge, found.make_policy):
         asked = task == "dream" and of == "moon"  # the dream asks the bundle's own world
@@ -115,11 +115,11 @@ def varied(bundle, task="car-racing", horizon=5, **named):
     return spec, np.random.default_rng(1).normal(0, 0.1, shape.size).astype(np.float32)
 
 
-def judged(spec, bundle, vector, course):
+def judged(spec, bundle, vector, episode_config):
     """The score of a course in the task's judge."""
     task, assignment = find_task(spec.task), Assignment(spec, bundle)
     judge = task.make_judge(assignment)
-    found = score(judge, task.make_policy(assignment), vector, course)
+    found = score(judge, task.make_policy(assignment), vector, episode_config)
     judge.close()
     return found
 
@@ -131,7 +131,7 @@ def test_a_job_is_scored_under_the_variant_that_its_run_names(random_bundle, nam
     scores = [scorer.score("score", vector, 3) for _ in range(2)]
     assert scores[0] == scores[1]
     scorer.close()
-    assert judged(spec, random_bundle, vector, scorer.course("score", 3)) == scores[0]
+    assert judged(spec, random_bundle, vector, scorer.episode_config("score", 3)) == scores[0]
 
 
 def test_only_candidates_pay_for_time(random_bundle):
@@ -140,7 +140,7 @@ def test_only_candidates_pay_for_time(random_bundle):
     free, paid = (each.score("score", vector, 3).fitness for each in scorers)
     assert free - paid == pytest.approx(0.5 * 5)
     for kind in ("evaluate", "collect"):
-        assert scorers[1].course(kind, 3) == scorers[0].course(kind, 3)
+        assert scorers[1].episode_config(kind, 3) == scorers[0].episode_config(kind, 3)
     for each in scorers:
         each.close()
 
@@ -154,15 +154,15 @@ def test_only_candidates_pay_for_steps_off_the_road(random_bundle):
     assert free.steps == paid.steps
     assert 2 <= free.fitness - paid.fitness <= 200
     for kind in ("evaluate", "collect"):
-        assert scorers[1].course(kind, 3).stray_cost == 0
-    assert judged(dear, random_bundle, vector, scorers[1].course("score", 3)) == paid
+        assert scorers[1].episode_config(kind, 3).stray_cost == 0
+    assert judged(dear, random_bundle, vector, scorers[1].episode_config("score", 3)) == paid
     for each in scorers:
         each.close()
 
 
 def test_a_lap_that_is_over_costs_no_more_time(random_bundle):
-    course = Scorer(varied(random_bundle, time_cost=0.5)[0], random_bundle).course("score", 3)
-    assert (course.time_cost, course.finish) == (0.5, "lap_finished")
+    episode_config = Scorer(varied(random_bundle, time_cost=0.5)[0], random_bundle).episode_config("score", 3)
+    assert (episode_config.time_cost, episode_config.finish) == (0.5, "lap_finished")
     environment = find_task("car-racing").make_environment(Assignment.of("car-racing", random_bundle))
 
     class HomeAtOnce:
@@ -172,7 +172,7 @@ def test_a_lap_that_is_over_costs_no_more_time(random_bundle):
             environment.unwrapped.tile_visited_count = len(environment.unwrapped.track)
             return np.zeros(3, np.float32)
 
-    *_, last = play(environment, HomeAtOnce(), course)
+    *_, last = run_episode(environment, HomeAtOnce(), episode_config)
     assert last.ended
     assert last.info["lap_finished"]
     environment.close()
@@ -205,10 +205,10 @@ def test_a_turn_is_scored_at_its_jobs_temperature_as_a_run_of_that_temperature_s
     jobs = [("score", random.normal(size=867).astype(np.float32), seed) for seed in (1, 2, 3)]
     scorer, found = Scorer(spec, random_bundle), {}
     for temperature in (None, 1.5, None, 2.25, 1.5):
-        scores = scorer.score_all(jobs, lambda _: None, spec.at(temperature))
-        assert scores == [scorer.score(*each, spec=spec.at(temperature)) for each in jobs]
+        scores = scorer.score_all(jobs, lambda _: None, spec.with_overrides(temperature))
+        assert scores == [scorer.score(*each, spec=spec.with_overrides(temperature)) for each in jobs]
         assert scores == found.setdefault(temperature, scores)
-        assert scores == Scorer(spec.at(temperature), random_bundle).score_all(jobs, lambda _: None)
+        assert scores == Scorer(spec.with_overrides(temperature), random_bundle).score_all(jobs, lambda _: None)
     assert len({score.fitness for scores in found.values() for score in scores}) == 9
 
 
@@ -218,19 +218,19 @@ def test_a_turn_is_as_long_as_its_stage_and_scored_as_a_run_of_that_horizon_scor
     jobs = [("score", np.random.default_rng(1).normal(size=867).astype(np.float32), seed) for seed in (1, 2)]
     scorer = Scorer(spec, random_bundle)
     for horizon in horizons:
-        scores = scorer.score_all(jobs, lambda _: None, spec.at(horizon=horizon))
+        scores = scorer.score_all(jobs, lambda _: None, spec.with_overrides(horizon=horizon))
         assert max(each.steps for each in scores) <= horizon
-        assert scores == Scorer(spec.at(horizon=horizon), random_bundle).score_all(jobs, lambda _: None)
+        assert scores == Scorer(spec.with_overrides(horizon=horizon), random_bundle).score_all(jobs, lambda _: None)
     scorer.close()
 
 
 def test_only_what_is_scored_or_kept_is_cut_by_a_stages_horizon_and_patience(random_bundle):
     spec = TaskSpec("car-racing", random_bundle.sha256, 1000, 0)
-    scorer, stage = Scorer(spec, random_bundle), spec.at(horizon=300, patience=40)
+    scorer, stage = Scorer(spec, random_bundle), spec.with_overrides(horizon=300, patience=40)
     for kind in ("score", "collect"):
-        course = scorer.course(kind, 5, stage)
-        assert (course.horizon, course.patience) == (300, 40)
-    assert scorer.course("evaluate", 5, stage) == scorer.course("evaluate", 5)
+        episode_config = scorer.episode_config(kind, 5, stage)
+        assert (episode_config.horizon, episode_config.patience) == (300, 40)
+    assert scorer.episode_config("evaluate", 5, stage) == scorer.episode_config("evaluate", 5)
     scorer.close()
 
 

@@ -1,7 +1,17 @@
 import numpy as np
 import pytest
 
-from dreamfleet.worker.tools.canvas import AWAKE, BACKGROUND, DREAMING, MARGIN, SIDE, Canvas, Dreamt, Mind, Moment
+from dreamfleet.worker.tools.canvas import (
+    AWAKE,
+    BACKGROUND,
+    DREAMING,
+    MARGIN,
+    SIDE,
+    Canvas,
+    DreamPicture,
+    DriveFrame,
+    ModelPictures,
+)
 
 SEED = 10_003
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
@@ -15,7 +25,7 @@ def plain(colour):
 def test_a_frame_shows_the_track_what_is_seen_and_what_is_decoded():
     green = plain(GREEN)
     green[:, ::2] = 0  # an edge a pixel: enlarging must not blur it
-    frame = Canvas(SEED).draw(Moment(plain(RED), ACTION, 7, 12.5, Mind(green, plain(BLUE))))
+    frame = Canvas(SEED).draw(DriveFrame(plain(RED), ACTION, 7, 12.5, ModelPictures(green, plain(BLUE))))
     assert frame.shape[1::-1] == AWAKE.size
     assert (frame[200, 300] == RED).all()
     assert {tuple(pixel) for pixel in frame[100, 620:812].tolist()} == {GREEN, (0, 0, 0)}
@@ -25,7 +35,9 @@ def test_a_frame_shows_the_track_what_is_seen_and_what_is_decoded():
 
 @pytest.mark.parametrize("since", [0, 9900])
 def test_a_dream_is_whole_below_them_and_its_label_within_the_frame(since):
-    moment = Moment(plain(RED), ACTION, 7, 12.5, Mind(plain(GREEN), plain(BLUE), Dreamt(plain(WHITE), since)))
+    moment = DriveFrame(
+        plain(RED), ACTION, 7, 12.5, ModelPictures(plain(GREEN), plain(BLUE), DreamPicture(plain(WHITE), since))
+    )
     frame = Canvas(SEED, DREAMING).draw(moment)
     assert frame.shape[1::-1] == DREAMING.size
     column = frame[:, DREAMING.track[0] + 20 :][:, :SIDE]

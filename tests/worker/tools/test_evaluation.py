@@ -4,14 +4,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.controller import Controller
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import BundleError, ControllerError, DreamfleetError, UsageError
-from dreamfleet.common.fingerprint import fingerprint
-from dreamfleet.common.judgement import read_judgement
-from dreamfleet.common.shelf import bundle_for
+from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.runs.evaluation_report import read_evaluation_report
+from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.worker.scoring import episode
-from dreamfleet.worker.scoring.agents import agent_of
-from dreamfleet.worker.scoring.episode import Course
+from dreamfleet.worker.scoring.agents import make_agent
+from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.tools.evaluation import evaluate
 from tests.support import tasks
@@ -33,12 +33,12 @@ def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
     task = find_task(tasks.JUDGED)
     alone = {
         seed: episode.score(
-            task.make_judge(None), task.make_policy(None), controller().parameters, Course(seed, 10**6)
+            task.make_judge(None), task.make_policy(None), controller().parameters, EpisodeConfig(seed, 10**6)
         ).fitness
         for seed in SEEDS
     }
     for jobs in (1, 2):
-        drives = list(evaluate(agent_of(controller(tasks.JUDGED), random_bundle), SEEDS, jobs))
+        drives = list(evaluate(make_agent(controller(tasks.JUDGED), random_bundle), SEEDS, jobs))
         assert {each.seed: each.score for each in drives} == alone
         assert {each.steps for each in drives} == {10}
 
@@ -53,22 +53,22 @@ def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
 )
 def test_what_goes_wrong_in_a_process_ends_the_evaluation_and_says_why(controller, random_bundle, task, error, says):
     with pytest.raises(error, match=says):
-        list(evaluate(agent_of(controller(task), random_bundle), SEEDS, 2))
+        list(evaluate(make_agent(controller(task), random_bundle), SEEDS, 2))
 
 
 def test_a_world_model_is_found_beside_its_controller_or_by_name(controller, random_bundle):
-    assert bundle_for(controller(), str(random_bundle.path)).sha256 == random_bundle.sha256
-    assert bundle_for(controller(), None, random_bundle.path).sha256 == random_bundle.sha256
+    assert find_bundle_of(controller(), str(random_bundle.path)).sha256 == random_bundle.sha256
+    assert find_bundle_of(controller(), None, random_bundle.path).sha256 == random_bundle.sha256
     with pytest.raises(BundleError, match="is not the world model that is wanted"):
-        bundle_for(replace(controller(), bundle="ab" * 32), None, random_bundle.path)
+        find_bundle_of(replace(controller(), bundle="ab" * 32), None, random_bundle.path)
     with pytest.raises(BundleError, match="name it with --bundle"):
-        bundle_for(controller(), None)
+        find_bundle_of(controller(), None)
 
 
 def test_a_controller_that_does_not_fit_is_refused(random_bundle):
     small = Controller(type(random_bundle.controller_shape)(4), np.zeros(15, np.float32), "car-racing", "ab" * 32)
     with pytest.raises(ControllerError, match="15 parameters"):
-        bundle_for(small, str(random_bundle.path))
+        find_bundle_of(small, str(random_bundle.path))
 
 
 def test_the_verb_reports_every_score_and_warns_of_tracks_that_are_no_test_tracks(
@@ -95,7 +95,7 @@ def test_what_it_writes_is_what_it_prints_and_drives_again_to_the_bit(processes,
     code, said, err = processes.call(*judged, "--json")
     assert code == 0, err
     assert json.loads(said) == json.loads(out.read_text())
-    recorded = read_judgement(out)
+    recorded = read_evaluation_report(out)
     assert (recorded.controller, recorded.bundle) == (controller().sha256, random_bundle.sha256)
     assert (recorded.task, recorded.world, recorded.threshold) == (tasks.TOY, tasks.TOY, None)
     assert recorded.fingerprint == fingerprint(find_task(tasks.TOY).world.packages)

@@ -4,12 +4,12 @@ import av
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import DREAM, write_bundle
-from dreamfleet.common.controller import Controller
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.worker.scoring import episode
-from dreamfleet.worker.scoring.agents import agent_of
-from dreamfleet.worker.scoring.episode import Course
+from dreamfleet.worker.scoring.agents import make_agent
+from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.tools.canvas import AWAKE, DREAMING
@@ -26,11 +26,11 @@ def controller(random_bundle):
 
 
 def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_bundle, tmp_path):
-    told, agent = [], agent_of(controller, random_bundle)
+    told, agent = [], make_agent(controller, random_bundle)
     score = record(agent, SEED, STEPS, tmp_path / "new" / "drive.mp4", on_step=told.append)
     task, assignment = find_task("car-racing"), Assignment.of("car-racing", random_bundle)
     judge = task.make_judge(assignment)
-    driven = episode.score(judge, task.make_policy(assignment), controller.parameters, Course(SEED, STEPS))
+    driven = episode.score(judge, task.make_policy(assignment), controller.parameters, EpisodeConfig(SEED, STEPS))
     judge.close()
     assert score == driven.fitness
     assert told == list(range(1, STEPS + 1))
@@ -45,7 +45,7 @@ def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_
 def test_a_recording_that_is_told_to_stop_can_be_played_as_far_as_it_came(controller, random_bundle, tmp_path, after):
     told = [0]
     record(
-        agent_of(controller, random_bundle), SEED, STEPS, tmp_path / "drive.mp4", on_step=told.append,
+        make_agent(controller, random_bundle), SEED, STEPS, tmp_path / "drive.mp4", on_step=told.append,
         stop=lambda: told[-1] >= after,
     )  # fmt: skip
     assert told[-1] == max(after, 1)
@@ -55,16 +55,18 @@ def test_a_recording_that_is_told_to_stop_can_be_played_as_far_as_it_came(contro
 
 def test_a_controller_that_was_evolved_in_the_dream_is_recorded_in_reality(controller, random_bundle, tmp_path):
     dreamer = Controller(controller.shape, controller.parameters, "dream", controller.bundle)
-    scores = [record(agent_of(each, random_bundle), SEED, 3, tmp_path / "drive.mp4") for each in (controller, dreamer)]
+    scores = [
+        record(make_agent(each, random_bundle), SEED, 3, tmp_path / "drive.mp4") for each in (controller, dreamer)
+    ]
     assert scores[0] == scores[1]
 
 
 def test_a_bundle_that_cannot_dream_is_recorded_with_two_pictures(controller, random_bundle, tmp_path):
     manifest = random_bundle.manifest
-    parts = {name: random_bundle.read(name) for name in manifest.parts if name != DREAM}
+    parts = {name: random_bundle.read(name) for name in manifest.parts if name != DREAM_GRAPH}
     awake = write_bundle(tmp_path / "awake.zip", replace(manifest, parts={}), parts)
     own = replace(controller, bundle=awake.sha256)
-    record(agent_of(own, awake), SEED, 2, tmp_path / "drive.mp4")
+    record(make_agent(own, awake), SEED, 2, tmp_path / "drive.mp4")
     with av.open(str(tmp_path / "drive.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.width, stream.height) == AWAKE.size
@@ -73,7 +75,7 @@ def test_a_bundle_that_cannot_dream_is_recorded_with_two_pictures(controller, ra
 def test_another_task_or_an_impossible_place_is_refused(controller, random_bundle, tmp_path):
     moon = Controller(controller.shape, controller.parameters, "moon", controller.bundle)
     with pytest.raises(UsageError, match="unknown task"):
-        record(agent_of(moon, random_bundle), SEED, STEPS, tmp_path / "drive.mp4")
+        record(make_agent(moon, random_bundle), SEED, STEPS, tmp_path / "drive.mp4")
     (tmp_path / "file").write_text("")
     with pytest.raises(DreamfleetError, match="choose another --out"):
-        record(agent_of(controller, random_bundle), SEED, STEPS, tmp_path / "file" / "drive.mp4")
+        record(make_agent(controller, random_bundle), SEED, STEPS, tmp_path / "file" / "drive.mp4")

@@ -3,10 +3,8 @@ import sqlite3
 
 import pytest
 
-from dreamfleet.common.runs import JOURNAL
+from dreamfleet.common.runs.run_folder import JOURNAL
 from tests.support import tasks
-
-pytestmark = pytest.mark.timeout(60)
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ import numpy as np
 import onnx
 import pytest
 
-from dreamfleet.common.bundle import DREAM, INITIAL, POLICY, RECORDED, write_bundle
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, INITIAL_LATENTS_PART, POLICY, RECORDED_STATES, write_bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.onnx_checks import has_finite_weights
 from dreamfleet.common.errors import BundleError, DatasetError
-from dreamfleet.common.store import find_bundle
-from dreamfleet.common.tensors import weights_finite
 from dreamfleet.worker.training import train_mdnrnn, train_vae
-from dreamfleet.worker.training.assemble import assemble, graphs, manifest
-from dreamfleet.worker.training.dataset import load
+from dreamfleet.worker.training.assemble import assemble, export_graphs, make_manifest
+from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep
@@ -41,17 +41,17 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path, name, value):
     model = next(each for each in models if name in each)
     model[name] = model[name].copy()
     model[name].flat[3] = value
-    parts = graphs(*models, np.zeros((1, 2, 4), np.float32), LAYERS, RNN)
+    parts = export_graphs(*models, np.zeros((1, 2, 4), np.float32), LAYERS, RNN)
     with pytest.raises(BundleError, match="NaN or infinite; train the model again"):
-        write_bundle(tmp_path / "b.zip", manifest("b", {}, LAYERS, RNN), parts)
+        write_bundle(tmp_path / "b.zip", make_manifest("b", {}, LAYERS, RNN), parts)
 
 
 def test_what_ships_and_what_is_no_model_have_no_wrong_weights():
-    assert weights_finite(find_bundle("tiny").read(POLICY))
-    assert weights_finite(b"x")
+    assert has_finite_weights(find_bundle("tiny").read(POLICY))
+    assert has_finite_weights(b"x")
     data = find_bundle("tiny").read(POLICY)[:2000]
     for cut in range(0, 2000, 7):
-        assert weights_finite(data[:cut])
+        assert has_finite_weights(data[:cut])
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,9 @@ def test_what_ships_and_what_is_no_model_have_no_wrong_weights():
 )
 def test_a_dream_begins_at_real_latents(random_bundle, tmp_path, initial, said):
     with pytest.raises(BundleError, match=said):
-        write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts_of(random_bundle), INITIAL: initial})
+        write_bundle(
+            tmp_path / "b.zip", random_bundle.manifest, {**parts_of(random_bundle), INITIAL_LATENTS_PART: initial}
+        )
 
 
 @pytest.mark.parametrize(
@@ -87,14 +89,14 @@ def test_a_dream_begins_at_real_latents(random_bundle, tmp_path, initial, said):
     ],
 )
 def test_damaged_recorded_states_are_one_clear_line(random_bundle, tmp_path, recorded, said):
-    parts = {**parts_of(random_bundle), RECORDED: recorded}
+    parts = {**parts_of(random_bundle), RECORDED_STATES: recorded}
     with pytest.raises(BundleError, match=rf"b\.zip: recorded_states\.npy .*{said}.*; build the bundle again") as told:
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)
     assert "\n" not in str(told.value)
 
 
 def test_graphs_of_other_sizes_than_the_manifest_says_are_refused(random_bundle, tmp_path):
-    parts = {**parts_of(random_bundle), INITIAL: npy(np.zeros((1, 2, 16), np.float32))}
+    parts = {**parts_of(random_bundle), INITIAL_LATENTS_PART: npy(np.zeros((1, 2, 16), np.float32))}
     other = write_bundle(tmp_path / "b.zip", replace(random_bundle.manifest, latent=16), parts)
     for part in (PolicyStep, DreamStep, Encoder):
         with pytest.raises(BundleError, match="its manifest says"):
@@ -103,7 +105,7 @@ def test_graphs_of_other_sizes_than_the_manifest_says_are_refused(random_bundle,
 
 def test_a_truncated_dream_is_an_error_of_the_bundle(random_bundle, tmp_path):
     parts = parts_of(random_bundle)
-    cut = write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, DREAM: parts[DREAM][:5000]})
+    cut = write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, DREAM_GRAPH: parts[DREAM_GRAPH][:5000]})
     with pytest.raises(BundleError, match=r"dream\.onnx cannot be run"):
         DreamStep(cut)
 
@@ -139,7 +141,7 @@ def test_a_half_written_episode_stops_training_before_its_first_update(folder):
 
 def test_an_episode_without_its_actions_is_refused(folder):
     path = sorted((folder / "episodes").glob("*.npz"))[0]
-    arrays = load(path, "picture", "reward", "preprocessing", "ended")
+    arrays = load_arrays(path, "picture", "reward", "preprocessing", "ended")
     np.savez(path, **arrays)
     with pytest.raises(DatasetError, match=r"lacks action\.npy"):
         list(encode(folder))
@@ -147,10 +149,10 @@ def test_an_episode_without_its_actions_is_refused(folder):
 
 def test_a_half_written_encoded_episode_is_encoded_again(folder):
     path = sorted((folder / "encoded").glob("*.npz"))[1]
-    whole = load(path, "mu")["mu"]
+    whole = load_arrays(path, "mu")["mu"]
     path.write_bytes(path.read_bytes()[:100])
     assert len(list(encode(folder))) == 1
-    assert np.array_equal(load(path, "mu")["mu"], whole)
+    assert np.array_equal(load_arrays(path, "mu")["mu"], whole)
 
 
 def test_an_mdnrnn_of_other_latents_is_refused(folder):
@@ -234,12 +236,12 @@ def test_a_graph_reads_no_other_file(random_bundle, tmp_path, monkeypatch, chang
 )
 def test_what_the_runtime_might_read_otherwise_is_not_run(random_bundle, tmp_path, graph, says):
     path = tmp_path / "b.zip"
-    bundle = write_bundle(path, random_bundle.manifest, {**parts_of(random_bundle), DREAM: graph})
+    bundle = write_bundle(path, random_bundle.manifest, {**parts_of(random_bundle), DREAM_GRAPH: graph})
     with pytest.raises(BundleError, match=rf"dream\.onnx cannot be run \(.*{says}"):
         DreamStep(bundle)
 
 
 def test_a_graph_of_endless_fields_is_not_looked_through(random_bundle, tmp_path):
-    parts = {**parts_of(random_bundle), DREAM: b"\x40\x00" * 10**6}
+    parts = {**parts_of(random_bundle), DREAM_GRAPH: b"\x40\x00" * 10**6}
     with pytest.raises(BundleError, match="has more than 500000 fields"):
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.worker.training.dataset import check_whole, load, load_pictures, load_steps
-from dreamfleet.worker.training.intake import take_in
-from dreamfleet.worker.training.rollouts import load_rollouts
+from dreamfleet.worker.training.data.dataset import check_whole, load_arrays, load_pictures, load_steps
+from dreamfleet.worker.training.data.import_rollouts import import_rollouts
+from dreamfleet.worker.training.data.rollouts import load_rollouts
 from tests.support.drives import write_drive
 from tests.support.mutations import Watched, archives
 
@@ -24,7 +24,7 @@ def read(path):
     check_whole([path], "picture", "action")
     assert len(load_pictures(path)) > 0
     assert len(load_steps(path)["reward"]) > 0
-    load(path, "driver")
+    load_arrays(path, "driver")
 
 
 def test_damaged_drives(tmp_path, watched):
@@ -71,5 +71,5 @@ def test_a_drive_of_another_kind_is_never_taken_in(tmp_path, changed):
         arrays = dict(archive)
     np.savez(path, **{**arrays, **changed})
     with pytest.raises(DatasetError):
-        list(take_in(tmp_path / "data", [path]))
+        list(import_rollouts(tmp_path / "data", [path]))
     assert not list((tmp_path / "data").rglob("*.npz"))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.training.rollouts import Rollouts, ends
+from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
 CONFIG = MDNRNNConfig(latent=1, hidden=4, done=True, lost=3)
@@ -36,22 +36,22 @@ def drives(*rewards, ended=False):
     ],
 )
 def test_a_step_is_lost_where_no_reward_follows_for_so_long(rewards, lost):
-    found = ends(CONFIG, drives(rewards))
+    found = done_labels(CONFIG, drives(rewards))
     assert "".join(str(int(each)) for each in found[0]) == lost
 
 
 def test_padding_is_no_loss_and_changes_none():
     short, long = [1.0, -1, -1, -1, -1], [1.0] * 12
-    found = ends(CONFIG, drives(short, long))
-    assert (found[0, :5] == ends(CONFIG, drives(short))[0]).all()
+    found = done_labels(CONFIG, drives(short, long))
+    assert (found[0, :5] == done_labels(CONFIG, drives(short))[0]).all()
     assert not found[0, 5:].any()
     assert not found[1].any()
 
 
 def test_where_an_episode_ended_it_ends_too():
-    assert ends(CONFIG, drives([1.0] * 5, ended=True))[0].tolist() == [0, 0, 0, 0, 1]
+    assert done_labels(CONFIG, drives([1.0] * 5, ended=True))[0].tolist() == [0, 0, 0, 0, 1]
     plain = replace(CONFIG, lost=0)
-    assert ends(plain, drives([1.0, -1, -1, -1, -1, -1], ended=True))[0].tolist() == [0, 0, 0, 0, 0, 1]
+    assert done_labels(plain, drives([1.0, -1, -1, -1, -1, -1], ended=True))[0].tolist() == [0, 0, 0, 0, 0, 1]
 
 
 @pytest.mark.parametrize("values", [{"lost": -1}, {"lost": 5, "done": False}])

@@ -9,19 +9,19 @@ import pytest
 import torch
 
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.coordinator.iteration.config import IterateConfig
+from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.worker.training import train_mdnrnn, train_vae
-from dreamfleet.worker.training.assemble import assemble, manifest
+from dreamfleet.worker.training.assemble import assemble, make_manifest
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
+from dreamfleet.worker.training.data.rollouts import load_rollouts
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.rollouts import load_rollouts
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.verbs import train_vae as verb
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.coordinator.iteration.test_commands import commands
+from tests.coordinator.experiments.iteration.test_commands import commands
 from tests.support.drives import write_drives
 
 LAYERS, RNN = VAEConfig(latent=4, channels=(4, 4, 8, 8)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
@@ -96,7 +96,7 @@ def test_at_one_nothing_is_written_and_files_from_before_factors_open(trained, t
     bundle = assemble(trained, tmp_path / "b.zip", "b", with_weights=False)
     assert not any("factor" in name for model in bundle.manifest.models.values() for name in model)
     assert load_config(trained / train_vae.CHECKPOINT, VAEConfig).error_factor == 1.0
-    weighed = manifest("b", {}, replace(LAYERS, error_factor=4.0), replace(RNN, reward_factor=2.0))
+    weighed = make_manifest("b", {}, replace(LAYERS, error_factor=4.0), replace(RNN, reward_factor=2.0))
     assert weighed.models["vae"]["error_factor"] == 4.0
     assert weighed.models["mdnrnn"]["reward_factor"] == 2.0
 

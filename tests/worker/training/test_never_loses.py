@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
-from dreamfleet.common.stopping import heeding_signals
-from dreamfleet.worker.training import checkpoint, schedule, train_mdnrnn, train_vae
+from dreamfleet.common.host.stop_signals import stop_on_signals
+from dreamfleet.worker.training import checkpoint, train_mdnrnn, train_vae, training_state
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
-from dreamfleet.worker.training.curve import append_curve
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.schedule import kept_path
-from dreamfleet.worker.training.telling import show
+from dreamfleet.worker.training.loss_curve import append_point
 from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.training_cli import run_training
+from dreamfleet.worker.training.training_state import numbered_path
 from dreamfleet.worker.verbs import train_vae as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -111,14 +111,14 @@ def test_a_kill_at_any_write_of_a_checkpoint_leads_to_the_same_files(drives, tmp
             (folder / each).symlink_to(drives / each)
         return folder
 
-    monkeypatch.setattr(schedule, "save_checkpoint", killed_at(0))
+    monkeypatch.setattr(training_state, "save_checkpoint", killed_at(0))
     run(whole := begin("whole"))
     expected = files(whole, "mdnrnn")
     assert (expected["mdnrnn.safetensors"][1].get("stopped") is not None) == (rate == 1e-12)
     for number in range(1, len(writes) + 1):
         folder = begin(f"{number}")
         writes.clear()
-        monkeypatch.setattr(schedule, "save_checkpoint", killed_at(number))
+        monkeypatch.setattr(training_state, "save_checkpoint", killed_at(number))
         with pytest.raises(KilledError):
             run(folder)
         run(folder)
@@ -145,14 +145,14 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(drives, data):
 
 def test_a_point_of_the_curve_is_whole_or_not_there(tmp_path):
     path, (soft, hard) = tmp_path / "vae.jsonl", resource.getrlimit(resource.RLIMIT_FSIZE)
-    append_curve(path, update=20, error=1.0)
+    append_point(path, update=20, error=1.0)
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 5, hard))
     try:
         with pytest.raises(DatasetError, match="make room"):
-            append_curve(path, update=40, error=1.0)
+            append_point(path, update=40, error=1.0)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    append_curve(path, update=60, error=1.0)
+    append_point(path, update=60, error=1.0)
     assert [json.loads(line)["update"] for line in path.read_text().splitlines()] == [20, 60]
 
 
@@ -165,7 +165,7 @@ def test_signals_wait_until_a_checkpoint_is_written(data, monkeypatch):
         return real(*given)
 
     monkeypatch.setattr(checkpoint, "save", signalled)
-    with pytest.raises(KeyboardInterrupt), heeding_signals() as stop:
+    with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:
         train(data, stop=stop)
     assert load_progress(data / train_vae.CHECKPOINT)["update"] == 2
     assert made(data) == ["vae.jsonl", "vae.safetensors"]
@@ -180,12 +180,12 @@ def test_a_second_signal_says_what_is_kept(data, new, command):
 
     args = argparse.Namespace(data=data, new=new, json=False)
     with pytest.raises(StoppedError, match=rf"vae\.safetensors keeps what was made up to update 2; .*{command}"):
-        show(args, "VAE", 6, data / train_vae.CHECKPOINT, lambda _, stop: train(data, SHORT, twice, stop=stop))
+        run_training(args, "VAE", 6, data / train_vae.CHECKPOINT, lambda _, stop: train(data, SHORT, twice, stop=stop))
 
 
 def test_checkpoints_are_kept_beside_the_last_one(drives, data):
     train(data, replace(SHORT, keep_every=4, updates=5))
-    last, kept = data / train_vae.CHECKPOINT, kept_path(data / train_vae.CHECKPOINT, 4)
+    last, kept = data / train_vae.CHECKPOINT, numbered_path(data / train_vae.CHECKPOINT, 4)
     assert kept.name == "vae.000004.safetensors"
     assert (load_progress(last)["update"], load_progress(kept)["update"]) == (5, 4)
     last.write_bytes(kept.read_bytes())
@@ -236,7 +236,7 @@ def test_new_begins_anew_and_leaves_nothing_of_the_old_training(drives, data, ca
 
 def test_new_begins_from_a_kept_checkpoint_and_never_from_what_it_replaces(data):
     train(data, replace(SHORT, keep_every=2))
-    last, kept = data / train_vae.CHECKPOINT, kept_path(data / train_vae.CHECKPOINT, 4)
+    last, kept = data / train_vae.CHECKPOINT, numbered_path(data / train_vae.CHECKPOINT, 4)
     before = last.read_bytes()
     with pytest.raises(UsageError, match="leave one of the two out"):
         train(data, continue_from=data / "." / last.name, new=True)

@@ -1,18 +1,26 @@
+"""None"""
+
+import argparse
+import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import WEIGHTS
-from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.artifacts.bundle import WEIGHTS, Bundle
+from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.checkpoint import load_weights
-from dreamfleet.worker.training.dataset import load
+from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.foresight import area_under_curve
-from dreamfleet.worker.training.presets import find_preset
+from dreamfleet.worker.training.pipeline import STAGES, Pipeline
+from dreamfleet.worker.training.prediction_quality import area_under_curve
+from dreamfleet.worker.training.presets import PRESETS, find_preset
 from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.verbs import encode as encode_verb
+from dreamfleet.worker.verbs import pipeline
 from dreamfleet.worker.worldmodel.inference import Encoder, PolicyStep
 from tests.support.drives import write_drive, write_drives
 
@@ -43,8 +51,8 @@ def test_equal_folders_make_equal_bundles(trained, tmp_path):
 
 def test_a_bundle_encodes_as_its_training_did(trained, tmp_path):
     bundle = assemble(trained, tmp_path / "b.zip", "b", with_weights=True)
-    pictures = load(trained / "episodes" / "000001.npz", "picture")["picture"]
-    encoded = load(trained / "encoded" / "000001.npz", "mu", "mirrored_mu")
+    pictures = load_arrays(trained / "episodes" / "000001.npz", "picture")["picture"]
+    encoded = load_arrays(trained / "encoded" / "000001.npz", "mu", "mirrored_mu")
     assert np.array_equal(Encoder(bundle).encode(pictures)[0], encoded["mu"])
     mirrored = np.ascontiguousarray(pictures[:, :, ::-1])
     assert np.array_equal(Encoder(bundle).encode(mirrored)[0], encoded["mirrored_mu"])
@@ -81,14 +89,14 @@ def test_latents_of_an_older_vae_never_reach_a_bundle(trained, tmp_path):
     train_vae.train_vae(folder, TrainConfig(3, 8, 1e-3), ignore)
     for stage in ("mdnrnn", "bundle"):
         with pytest.raises(DatasetError, match="dreamfleet encode"):
-            STAGES[stage](folder)
+            ATTEMPTS[stage](folder)
     list(encode(folder))
     for stage in ("mdnrnn", "bundle"):
         with pytest.raises(DatasetError, match="another VAE"):
-            STAGES[stage](folder)
+            ATTEMPTS[stage](folder)
     (folder / train_mdnrnn.CHECKPOINT).unlink()
-    STAGES["mdnrnn"](folder)
-    STAGES["bundle"](folder)
+    ATTEMPTS["mdnrnn"](folder)
+    ATTEMPTS["bundle"](folder)
 
 
 def test_encoding_again_encodes_only_what_is_new(tmp_path):
@@ -99,18 +107,18 @@ def test_encoding_again_encodes_only_what_is_new(tmp_path):
     assert list(encode(tmp_path)) == [4]
 
 
-STAGES = {
+ATTEMPTS = {
     "encode": lambda folder: list(encode(folder)),
     "mdnrnn": lambda folder: train_mdnrnn.train_mdnrnn(folder, SHORT, ignore),
     "bundle": lambda folder: assemble(folder, folder / "b.zip", "b", with_weights=False),
 }
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", ATTEMPTS)
 def test_a_stage_before_its_time_names_the_verb_to_run(tmp_path, stage):
     write_drives(tmp_path, episodes=2, steps=4)
     with pytest.raises(DatasetError, match=r"dreamfleet (train vae|encode)"):
-        STAGES[stage](tmp_path)
+        ATTEMPTS[stage](tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", bytes(64)])
@@ -136,3 +144,93 @@ def test_an_unknown_preset_lists_those_that_exist():
 )
 def test_the_area_under_the_curve(scores, positive, area):
     assert area_under_curve(np.array(scores, np.float32), np.array(positive, bool)) == area
+
+
+# SWIG warns as Box2D is imported, and an error there kills the process.
+pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
+SHARES = {"tiny": 0.004, "notebook": 0.0005, "article": 0.0002, "attentive": 0.001, "paper": 0.00002}
+FEW = ("--jobs", "1", "--collect-flags", "--steps 24", "--vae-flags", "--batch 4")
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def call(*arguments):
+    parser = argparse.ArgumentParser()
+    pipeline.configure(parser)
+    return pipeline.run(parser.parse_args([str(each) for each in arguments]))
+
+
+def made(folder, preset):
+    return Bundle.open(folder / f"{preset}.zip")
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_share_of_a_preset_becomes_a_bundle_of_its_own_layers(name, tmp_path, capsys):
+    assert call("--data", tmp_path, "--preset", name, "--scale", SHARES[name], *FEW, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert tuple(told["stages"]) == STAGES
+    bundle, preset = made(tmp_path, name), PRESETS[name]
+    assert told["stages"]["bundle"]["sha256"] == bundle.sha256
+    assert bundle.manifest.picture[0] == preset.collect.picture
+    assert bundle.manifest.hidden == preset.mdnrnn_layers.hidden
+    assert bundle.manifest.provenance["episodes"] >= 2
+    assert PolicyStep(bundle).zero_state(1).shape == (1, preset.mdnrnn_layers.state)
+
+
+def test_it_goes_on_where_it_stopped_to_the_same_bundle(tmp_path, monkeypatch, capsys):
+    flags = ("--preset", "article", "--scale", "0.0001", *FEW)
+    assert call("--data", tmp_path / "whole", *flags) == 0
+    assert "controllers of 867 parameters" in capsys.readouterr().out
+
+    def stop(_args):
+        raise StoppedError("stopped")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(encode_verb, "run", stop)
+        with pytest.raises(StoppedError):
+            call("--data", tmp_path / "stopped", *flags)
+    assert not (tmp_path / "stopped" / "encoded").exists()
+    for _ in range(2):  # and once more, when all is finished
+        assert call("--data", tmp_path / "stopped", *flags) == 0
+        assert made(tmp_path / "stopped", "article").sha256 == made(tmp_path / "whole", "article").sha256
+
+
+def test_a_share_of_every_amount_is_rounded_up():
+    stages = Pipeline(PRESETS["notebook"], Path("data"), scale=0.02).stages(2, "cpu")
+    assert "--episodes 20" in " ".join(stages["collect"])
+    assert "--updates 600 --validate-every 4" in " ".join(stages["train.vae"])
+    assert "--updates 200 --validate-every 4" in " ".join(stages["train.mdnrnn"])
+    least = Pipeline(PRESETS["tiny"], Path("data"), scale=1e-6).stages(2, "cpu")
+    assert "--episodes 2" in " ".join(least["collect"])
+    assert "--updates 1" in " ".join(least["train.vae"])
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--scale", "0"), "--scale must be above 0, to 1, not 0"),
+        (("--scale", "2"), "--scale must be above 0, to 1, not 2"),
+        (("--vae-flags", "--dat other"), "--vae-flags: --data of a stage"),
+        (("--collect-flags", "'"), "--collect-flags"),
+        (("--preset", "dream"), "'dream' is a preset of run"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_driven(tmp_path, flags, said):
+    with pytest.raises(UsageError, match=said):
+        call("--data", tmp_path / "data", *flags)
+    assert not (tmp_path / "data").exists()
+
+
+def test_an_unknown_flag_of_a_stage_is_refused_before_anything_is_driven(tmp_path):
+    with pytest.raises(SystemExit):
+        call("--data", tmp_path / "data", "--mdnrnn-flags", "--ghost 1")
+    assert not (tmp_path / "data").exists()
+
+
+def test_another_preset_than_the_data_sets_is_refused(tmp_path):
+    (tmp_path / "preset.json").write_text('{"preset": "paper"}')
+    with pytest.raises(UsageError, match="give --preset paper"):
+        call("--data", tmp_path)

@@ -7,16 +7,16 @@ from dataclasses import fields
 import pytest
 import torch
 
+from dreamfleet.common.cli.presets import NAMES
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.common.presets import NAMES
 from dreamfleet.worker.training import train_mdnrnn, train_vae
-from dreamfleet.worker.training.collect_config import CollectConfig
-from dreamfleet.worker.training.dataset import load
+from dreamfleet.worker.training.data.collect_config import CollectConfig
+from dreamfleet.worker.training.data.dataset import load_arrays
+from dreamfleet.worker.training.data.dataset_preset import check_seed, load_preset, resolve_preset, store_preset
+from dreamfleet.worker.training.data.rollouts import Rollouts, load_rollouts, model_inputs
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.following import follow
-from dreamfleet.worker.training.origin import agreed_preset, check_seed, keep_preset, kept_preset
 from dreamfleet.worker.training.presets import PRESETS
-from dreamfleet.worker.training.rollouts import Rollouts, inputs_of, load_rollouts
+from dreamfleet.worker.training.teacher_forcing import teacher_force
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.verbs import collect
 from dreamfleet.worker.verbs import train_mdnrnn as mdnrnn_verb
@@ -87,9 +87,9 @@ def test_no_drive_is_mirrored_whose_pictures_show_the_indicators(tmp_path, pictu
     path = tmp_path / "encoded" / "000001.npz"
     if picture == 96:
         with pytest.raises(DatasetError, match="mirrored"):
-            load(path, "mirrored_mu")
+            load_arrays(path, "mirrored_mu")
     else:
-        assert len(load(path, "mirrored_mu")["mirrored_mu"]) == 5
+        assert len(load_arrays(path, "mirrored_mu")["mirrored_mu"]) == 5
     taken = []
 
     def watched(paths, mirrored=None):
@@ -107,11 +107,11 @@ def test_a_drive_follows_from_the_first_reward_in_training_and_behind_it():
     ones, reward = torch.ones(1, 3), torch.tensor([[3.0, -0.1, 3.0]])
     mu = torch.randn(1, 3, 32)
     rollouts = Rollouts(mu, mu, torch.randn(1, 3, 3), reward, torch.zeros(1, 3), ones)
-    inputs = inputs_of(NOTEBOOK, mu, rollouts)
+    inputs = model_inputs(NOTEBOOK, mu, rollouts)
     assert inputs[0, :, -1].tolist() == [1, 0, 1]
     model = MDNRNN(NOTEBOOK).eval()
     with torch.no_grad():
-        hidden, states = follow(model, rollouts)
+        hidden, states = teacher_force(model, rollouts)
         torch.testing.assert_close(model.predict(hidden).means, model(inputs).means)
     assert states[0][0, 2 * NOTEBOOK.hidden] == 1
 
@@ -140,7 +140,7 @@ def test_a_later_verb_without_the_data_sets_preset_is_refused(tmp_path, capsys):
         call(collect, "--data", str(tmp_path), "--preset", "article", "--episodes", "2", "--steps", "3", "--jobs", "1")
         == 0
     )
-    assert kept_preset(tmp_path) == "article"
+    assert load_preset(tmp_path) == "article"
     for verb in VERBS:
         with pytest.raises(
             UsageError, match=r"begun with the preset article, and without .* tiny: give --preset article"
@@ -154,28 +154,28 @@ def test_a_later_verb_without_the_data_sets_preset_is_refused(tmp_path, capsys):
 
 def test_a_data_set_from_before_presets_were_kept_stays_without_one(tmp_path):
     write_drive(tmp_path, 0)
-    keep_preset(tmp_path, "article", 0)
-    assert kept_preset(tmp_path) is None
-    assert agreed_preset(tmp_path, "paper") == "paper"
-    assert agreed_preset(tmp_path, None) == "tiny"
+    store_preset(tmp_path, "article", 0)
+    assert load_preset(tmp_path) is None
+    assert resolve_preset(tmp_path, "paper") == "paper"
+    assert resolve_preset(tmp_path, None) == "tiny"
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"preset": 5}', '{"preset": "dream"}', "[" * 900])
 def test_a_damaged_note_of_the_preset_is_told_in_a_line(tmp_path, content):
     (tmp_path / "preset.json").write_text(content)
     with pytest.raises(DatasetError, match="names no preset"):
-        agreed_preset(tmp_path, None)
+        resolve_preset(tmp_path, None)
 
 
 def test_a_preset_is_kept_once(tmp_path):
-    keep_preset(tmp_path, "paper", 5)
-    keep_preset(tmp_path, "tiny", 6)
+    store_preset(tmp_path, "paper", 5)
+    store_preset(tmp_path, "tiny", 6)
     assert json.loads((tmp_path / "preset.json").read_text()) == {"preset": "paper", "seed": 5}
 
 
 def test_a_data_set_has_one_seed(tmp_path):
     check_seed(tmp_path, 7)
-    keep_preset(tmp_path, "paper", 5)
+    store_preset(tmp_path, "paper", 5)
     check_seed(tmp_path, 5)
     with pytest.raises(UsageError, match="begun with --seed 5, and this is --seed 7: give --seed 5"):
         check_seed(tmp_path, 7)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.bundle import Bundle
-from dreamfleet.common.controller import Controller
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.car_racing_variants import DEFAULT_VARIANT, Variant
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
-from dreamfleet.common.variants import PLAIN, Variant
-from dreamfleet.worker.training.refit import Drive, Onlooker, Sums, bounds, refit
+from dreamfleet.worker.training.refit import DriveArrays, FeatureExtractor, LeastSquaresSums, output_bounds, refit
 from dreamfleet.worker.verbs import refit as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -38,7 +38,7 @@ def drives(folder):
     return write_drives(folder / "data", episodes=20, steps=60)
 
 
-def controller(bundle, features="zh", hidden=0, variant=PLAIN):
+def controller(bundle, features="zh", hidden=0, variant=DEFAULT_VARIANT):
     shape = bundle.shape_of(features, hidden, variant)
     parameters = np.random.default_rng(3).normal(size=shape.size).astype(np.float32)
     return Controller(shape, parameters, "car-racing", bundle.sha256, options=variant.options)
@@ -53,21 +53,21 @@ def first_values(chosen, bundle, paths):
     with_pictures = []
     for path in paths:
         with np.load(path) as drive:
-            with_pictures.append(Drive(drive["picture"], drive["action"], drive["reward"]))
-    looking = Onlooker(bundle.fitting(chosen))
+            with_pictures.append(DriveArrays(drive["picture"], drive["action"], drive["reward"]))
+    looking = FeatureExtractor(bundle.for_controller(chosen))
     (weights, biases), *_ = chosen.shape.unpack(chosen.parameters)
-    values = looking.features(with_pictures, looking.see(with_pictures)) @ weights.T + biases
-    return np.clip(values, *bounds(chosen, bundle))
+    values = looking.features(with_pictures, looking.encode_drives(with_pictures)) @ weights.T + biases
+    return np.clip(values, *output_bounds(chosen, bundle))
 
 
 def test_what_lies_behind_an_actions_bound_is_kept_near_it(bundles):
-    lowest, highest = bounds(controller(bundles[0]), bundles[0])
+    lowest, highest = output_bounds(controller(bundles[0]), bundles[0])
     np.testing.assert_allclose(lowest, [-2.5, -2.5, -0.3])  # only the brake is cut off, below 0
     np.testing.assert_allclose(highest, [2.5, 2.5, 2.5])
     for other in (controller(bundles[0], hidden=5), controller(bundles[0], variant=Variant(pedals="one"))):
-        lowest, highest = bounds(other, bundles[0])
+        lowest, highest = output_bounds(other, bundles[0])
         assert (set(lowest), set(highest)) == ({-2.5}, {2.5})
-    choices = bounds(controller(bundles[0], variant=Variant(actions="discrete")), bundles[0])
+    choices = output_bounds(controller(bundles[0], variant=Variant(actions="discrete")), bundles[0])
     assert np.isinf(choices).all(), "values that are compared mean something wherever they lie"
 
 
@@ -104,13 +104,13 @@ def test_least_squares_find_a_map_and_tell_how_much_it_explains():
     inputs = random.normal(size=(200, 3)).astype(np.float32)
     weights, noise = random.normal(size=(4, 2)), random.normal(size=(200, 2)) * [0, 1]
     targets = inputs @ weights[:3] + weights[3] + noise
-    parts = Sums.of(inputs[:90], targets[:90]) + Sums.of(inputs[90:], targets[90:])
+    parts = LeastSquaresSums.of(inputs[:90], targets[:90]) + LeastSquaresSums.of(inputs[90:], targets[90:])
     solved = parts.solve(0)
     assert np.allclose(solved[:, 0], weights[:, 0])
     left = targets[:, 1] - inputs @ solved[:3, 1] - solved[3, 1]
     assert np.allclose(parts.r_squared(solved), [1, 1 - left.var() / targets[:, 1].var()])
     assert np.abs(parts.solve(1)[:3]).sum() < np.abs(solved[:3]).sum()
-    assert np.isnan(Sums.of(inputs, np.ones((200, 1))).r_squared(np.zeros((4, 1)))).all()
+    assert np.isnan(LeastSquaresSums.of(inputs, np.ones((200, 1))).r_squared(np.zeros((4, 1)))).all()
 
 
 def test_what_cannot_be_fitted_is_refused(bundles, drives, folder, tmp_path):

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from dreamfleet.common.bundle import DECODER, DREAM, ENCODER, POLICY, WEIGHTS, Bundle, write_bundle
-from dreamfleet.common.cli import main
+from dreamfleet.common.artifacts.bundle import DECODER, DREAM_GRAPH, ENCODER, POLICY, WEIGHTS, Bundle, write_bundle
+from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
-from dreamfleet.worker.training.assemble import graphs
+from dreamfleet.worker.training.assemble import export_graphs
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
-from dreamfleet.worker.training.encode import encode, identity
+from dreamfleet.worker.training.encode import encode, encoder_hash
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.training.unbundle import unbundle
 from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
@@ -28,7 +28,9 @@ MEMORY = MDNRNNConfig(latent=4, hidden=6)
 def parts_again(folder):
     vae, rnn = folder / train_vae.CHECKPOINT, folder / train_mdnrnn.CHECKPOINT
     configs = load_config(vae, VAEConfig), load_config(rnn, MDNRNNConfig)
-    return graphs(load_weights(vae), load_weights(rnn), np.zeros((1, 2, configs[0].latent), np.float32), *configs)
+    return export_graphs(
+        load_weights(vae), load_weights(rnn), np.zeros((1, 2, configs[0].latent), np.float32), *configs
+    )
 
 
 @pytest.mark.parametrize(
@@ -61,14 +63,14 @@ def test_the_same_dreams_are_bundled_from_it_again(tmp_path, memory):
     bundle = write_random_bundle(tmp_path / "a.zip", 3, EYES, memory)
     unbundle(bundle, tmp_path / "data")
     again = parts_again(tmp_path / "data")
-    assert all(again[name] == bundle.read(name) for name in (DREAM, POLICY))
+    assert all(again[name] == bundle.read(name) for name in (DREAM_GRAPH, POLICY))
 
 
 def test_nothing_was_learnt_yet_and_the_memory_is_of_these_eyes(tmp_path):
     bundle = write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
     vae, rnn = unbundle(bundle, tmp_path)
     assert load_progress(vae) == {"update": 0}
-    assert load_progress(rnn) == {"update": 0, "vae": identity(tmp_path)}
+    assert load_progress(rnn) == {"update": 0, "vae": encoder_hash(tmp_path)}
 
 
 def test_training_goes_on_from_it_also_with_a_head_more(tmp_path):
@@ -126,7 +128,7 @@ def test_models_that_cannot_be_had_again_are_refused(tmp_path, eyes, memory, sai
     assert not list(tmp_path.glob("data/*"))
 
 
-@pytest.mark.parametrize("part", [ENCODER, DECODER, DREAM])
+@pytest.mark.parametrize("part", [ENCODER, DECODER, DREAM_GRAPH])
 def test_a_graph_that_is_none_is_refused_in_a_line(tmp_path, part):
     plain = write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
     parts = {name: plain.read(name) for name in plain.manifest.parts} | {part: b"\0junk" * 100}
@@ -144,7 +146,7 @@ def test_where_one_of_both_cannot_be_written_neither_is(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr("dreamfleet.worker.training.unbundle.save_checkpoint", full)
-        patch.setattr("dreamfleet.worker.training.unbundle.identity", lambda _: "")
+        patch.setattr("dreamfleet.worker.training.unbundle.encoder_hash", lambda _: "")
         with pytest.raises(DatasetError, match="no space"):
             unbundle(plain, tmp_path / "data")
     unbundle(plain, tmp_path / "data")

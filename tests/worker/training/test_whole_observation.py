@@ -5,24 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.controller import Controller
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.common.messages import TaskSpec
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.car_racing.preprocessing import RAW
-from dreamfleet.worker.driving.scene import Dream
-from dreamfleet.worker.scoring.agents import agent_of
-from dreamfleet.worker.scoring.episode import Course, score
+from dreamfleet.worker.driving.scene import DreamScene
+from dreamfleet.worker.scoring.agents import make_agent
+from dreamfleet.worker.scoring.episode import EpisodeConfig, score
 from dreamfleet.worker.scoring.rollout import write_episode
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tools.evaluation import evaluate
 from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
-from dreamfleet.worker.training.collect import collect, episode_path
-from dreamfleet.worker.training.collect_config import CollectConfig
-from dreamfleet.worker.training.dataset import load_pictures
+from dreamfleet.worker.training.data.collect import collect, episode_path
+from dreamfleet.worker.training.data.collect_config import CollectConfig
+from dreamfleet.worker.training.data.dataset import load_pictures
+from dreamfleet.worker.training.data.import_rollouts import import_rollouts
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.intake import take_in
 from dreamfleet.worker.training.presets import PRESETS
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.worldmodel import vae_config
@@ -77,9 +77,9 @@ def test_environment_judge_and_video_score_alike_to_the_bit(bundle, parameters, 
     scorer = Scorer(spec, bundle)
     fitness.append(scorer.score("score", parameters, 20_000).fitness)
     scorer.close()
-    agent = agent_of(Controller(bundle.controller_shape, parameters, "car-racing", bundle.sha256), bundle)
+    agent = make_agent(Controller(bundle.controller_shape, parameters, "car-racing", bundle.sha256), bundle)
     judge = agent.make_judge()
-    fitness.append(score(judge, agent.make_policies()(20_000), parameters, Course(20_000, 70)).fitness)
+    fitness.append(score(judge, agent.make_policies()(20_000), parameters, EpisodeConfig(20_000, 70)).fitness)
     judge.close()
     fitness.append(record(agent, 20_000, 70, tmp_path / "drive.mp4"))
     assert fitness == fitness[:1] * 3
@@ -98,12 +98,12 @@ def test_it_dreams_is_driven_in_reality_and_collects_drives_that_its_data_set_ta
     assert load_pictures(path).shape == (score.steps, 96, 96, 3)
     (tmp_path / "episodes").mkdir()
     episode_path(tmp_path, 0).write_bytes(episode_path(data, 0).read_bytes())
-    assert list(take_in(tmp_path, [path])) == [score.steps]
+    assert list(import_rollouts(tmp_path, [path])) == [score.steps]
 
 
 def test_a_controller_of_it_is_evaluated(bundle, parameters):
     straight = Controller(bundle.controller_shape, np.zeros_like(parameters), "dream", bundle.sha256)
-    (drive,) = evaluate(agent_of(straight, bundle), (10_000,), jobs=1)
+    (drive,) = evaluate(make_agent(straight, bundle), (10_000,), jobs=1)
     assert drive.seed == 10_000
     assert np.isfinite(drive.score)
 
@@ -111,7 +111,7 @@ def test_a_controller_of_it_is_evaluated(bundle, parameters):
 def test_its_dream_is_driven_at_the_size_of_any_other(bundle, random_bundle):
     sizes = []
     for each in (bundle, random_bundle):
-        scene = Dream(each, 1.0, 5)
+        scene = DreamScene(each, 1.0, 5)
         scene.environment.reset(seed=1)
         sizes.append([side * scene.scale for side in scene.surface().get_size()])
     assert sizes == [[640, 640], [640, 640]]
@@ -134,9 +134,9 @@ def test_no_folder_gets_two_kinds_of_pictures(tmp_path, there, wanted):
         list(collect(tmp_path, replace(COLLECT, picture=wanted), jobs=1))
     rollouts = [write_drive(tmp_path / "run", 0, picture=wanted)]
     with pytest.raises(DatasetError, match="of one kind"):
-        list(take_in(tmp_path, rollouts))
+        list(import_rollouts(tmp_path, rollouts))
     with pytest.raises(DatasetError, match="of one kind"):
-        list(take_in(tmp_path / "new", [path, *rollouts]))
+        list(import_rollouts(tmp_path / "new", [path, *rollouts]))
     assert not (tmp_path / "new").exists()
     assert [each.name for each in (tmp_path / "episodes").iterdir()] == [path.name]
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from dreamfleet.common.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.bundle import DREAM
-from dreamfleet.common.controller import act
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.controller import act
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.store import find_bundle
 from dreamfleet.worker.worldmodel.inference import DreamStep, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import ARTICLE, ATTENTIVE, NOTEBOOK, PAPER, REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -95,7 +95,7 @@ def test_a_dreamers_bits_do_not_depend_on_who_else_dreams(tmp_path, name, rows):
 def test_every_controller_acts_by_its_formula_in_the_dream_and_in_reality(tmp_path, features, hidden):
     config = replace(REWARDED, previous_reward=True)
     bundle = write_random_bundle(tmp_path / "b.zip", rnn=config)
-    bundle = bundle.under(bundle.shape_of(features, hidden))
+    bundle = bundle.with_controllers(bundle.shape_of(features, hidden))
     dream, policy, feed = DreamStep(bundle), PolicyStep(bundle), chance(config, rows=4)
     random = np.random.default_rng(4)
     parameters = random.normal(0, 0.1, (4, bundle.controller_shape.size)).astype(np.float32)
@@ -117,15 +117,15 @@ def test_reality_remembers_its_reward_as_the_head_tells_it(tmp_path, kind, label
     config = MDNRNNConfig(**SMALL, reward=kind, previous_reward=True, window=2)
     policy = PolicyStep(write_random_bundle(tmp_path / "b.zip", rnn=config, vae=SMALL_VAE))
     state = policy.zero_state(2)
-    policy.remember(state, np.array([3.2, -0.1]))
+    policy.write_rewards(state, np.array([3.2, -0.1]))
     assert np.flatnonzero(state.any(axis=0)).tolist() == [2 * config.hidden]
     np.testing.assert_allclose(state[:, 2 * config.hidden], labels, rtol=1e-6)
 
 
 def test_a_bundle_from_before_the_dream_says_so():
     shipped = find_bundle("tiny")
-    if DREAM not in shipped.manifest.parts:
+    if DREAM_GRAPH not in shipped.manifest.parts:
         with pytest.raises(BundleError, match=r"holds no dream\.onnx"):
             DreamStep(shipped)
         with pytest.raises(BundleError, match="build it again"):
-            shipped.under(shipped.shape_of("z"))
+            shipped.with_controllers(shipped.shape_of("z"))

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from dreamfleet.common.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.bundle import POLICY, write_bundle
-from dreamfleet.common.controller import act
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.bundle import POLICY, write_bundle
+from dreamfleet.common.artifacts.controller import act
 from dreamfleet.common.errors import BundleError
 from dreamfleet.worker.worldmodel.inference import Decoder, Encoder, PolicyStep, open_part
 from tests.support.bundles import random_models

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.fields import written
+from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.worker.worldmodel import mdnrnn_config as mdnrnn
 from dreamfleet.worker.worldmodel import vae_config as vae
 from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, Encoder, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, reward_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE, Up
-from dreamfleet.worker.worldmodel.vae_config import Layer, VAEConfig
+from dreamfleet.worker.worldmodel.vae_config import ConvolutionLayer, VAEConfig
 from tests.support.bundles import random_models, write_random_bundle
 
 TINY = {"latent": 4, "channels": (4, 4, 8, 8)}
@@ -57,7 +57,7 @@ def test_the_notebooks_vae_has_its_size_and_the_kernels_of_its_decoder():
 
 
 def test_what_a_transposed_convolution_crops_lies_behind_as_in_the_notebooks():
-    model = Up(Layer(1, 1, 5, 2, 1, 2)).eval()
+    model = Up(ConvolutionLayer(1, 1, 5, 2, 1, 2)).eval()
     with torch.no_grad():
         model.weight.copy_(torch.arange(25.0).reshape(1, 1, 5, 5))
         model.bias.zero_()
@@ -155,8 +155,8 @@ def test_sizes_that_make_no_model_are_refused(make):
 
 def test_a_model_of_the_paper_is_written_as_it_was_before_every_layer_had_a_flag():
     later = {"error_factor", "kernels", "strides", "decoder_channels", "decoder_kernels"}
-    assert set(written(vae.PAPER)) == set(asdict(vae.PAPER)) - later
-    assert not {"lost", "first_reward"} & set(written(mdnrnn.REWARDED))
+    assert set(to_dict(vae.PAPER)) == set(asdict(vae.PAPER)) - later
+    assert not {"lost", "first_reward"} & set(to_dict(mdnrnn.REWARDED))
 
 
 def test_the_first_step_sees_the_label_that_the_notebooks_drives_begin_with(tmp_path):

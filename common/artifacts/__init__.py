@@ -1,0 +1,1 @@
+"""What a run makes and needs as files: bundles, controllers, agents, subspaces."""

@@ -1,0 +1,108 @@
+"""How a controller's outputs become a world's actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Continuous:
+    """Outputs in [-1, 1], each scaled, shifted and bounded: `clip(scale * tanh(x) + shift, low, high)`.
+
+    An action has an output of its own unless `outputs_of` says which one each action takes; several may take the same.
+    With `choices`, actions that are known, there is an output for each of them, and the one of the largest is done, of
+    equals the first; nothing is squashed then.
+    """
+
+    scale: tuple[float, ...]
+    shift: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    output_indices: tuple[int, ...] = ()
+    choices: tuple[tuple[float, ...], ...] = ()
+
+    @classmethod
+    def between(cls, low: Any, high: Any) -> Continuous:
+        """The whole range from `low` to `high` `(actions,)`, its middle at an output of 0."""
+        low, high = (np.asarray(each, dtype=np.float64).reshape(-1) for each in (low, high))
+        ranges = ((high - low) / 2, (high + low) / 2, low, high)
+        scale, shift, lowest, highest = (tuple(map(float, each)) for each in ranges)
+        return cls(scale, shift, lowest, highest)
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of a controller."""
+        if self.choices:
+            return len(self.choices)
+        return max(self.output_indices) + 1 if self.output_indices else self.actions
+
+    @property
+    def actions(self) -> int:
+        """Numbers of an action."""
+        return len(self.scale)
+
+    def to_action(self, logits: Floats) -> Floats:
+        """The actions `(..., actions)` of what a controller's last layer adds up to `(..., outputs)`."""
+        if self.choices:
+            done: Floats = self._choice_table[np.argmax(logits, axis=-1)]
+            return done
+        scale, shift, low, high = self._ranges
+        outputs = np.tanh(logits)
+        taken = outputs[..., self.output_indices] if self.output_indices else outputs
+        action: Floats = np.clip(taken * scale + shift, low, high).astype(np.float32)
+        return action
+
+    def to_outputs(self, action: Floats) -> Floats:
+        """Actions `(..., actions)` as a controller gives them `(..., outputs)`.
+
+        Where several take one output they are added up, each with the sign of its scale: of one pedal gas less brake.
+        Of choices it is 1 for that which was done, and 0 for the others.
+        """
+        if self.choices:
+            chosen: Floats = (action[..., None, :] == self._choice_table).all(axis=-1).astype(np.float32)
+            return chosen
+        if not self.output_indices:
+            return action
+        back = np.zeros((*action.shape[:-1], self.outputs), np.float32)
+        for place, (output, scale) in enumerate(zip(self.output_indices, self.scale, strict=True)):
+            back[..., output] += np.copysign(np.float32(1), np.float32(scale)) * action[..., place]
+        return back
+
+    @cached_property
+    def _choice_table(self) -> Floats:
+        return np.array(self.choices, np.float32)
+
+    @cached_property
+    def _ranges(self) -> list[Floats]:
+        return [np.array(each, np.float32) for each in (self.scale, self.shift, self.low, self.high)]
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """One of `outputs` actions: the one with the largest output, of equals the first."""
+
+    outputs: int
+    first: int = 0  # the environment's number of the first one
+
+    def to_action(self, logits: Floats) -> np.int64:
+        """The action's number."""
+        return np.int64(self.first + int(np.argmax(logits)))
+
+
+Actions = Continuous | Discrete
+
+# hardmaru/WorldModelsExperiments, carracing: steering tanh; gas (tanh + 1) / 2; brake clip(tanh, 0, 1).
+STEERING_GAS_BRAKE = Continuous(scale=(1, 0.5, 1), shift=(0, 0.5, 0), low=(-1, 0, 0), high=(1, 1, 1))
+# AppliedDataSciencePartners/WorldModels, controller/arch.py, and the notebook after it: gas and brake (tanh + 1) / 2.
+STEERING_AND_HALVES = Continuous.between(low=(-1, 0, 0), high=(1, 1, 1))
+# gymnasium's CarRacing-v3 with continuous=False: nothing, right, left, gas, brake.
+FIVE_CHOICES = replace(
+    STEERING_GAS_BRAKE, choices=((0, 0, 0), (0.6, 0, 0), (-0.6, 0, 0), (0, 0.2, 0), (0, 0, 0.8))
+)  # fmt: skip

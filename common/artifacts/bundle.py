@@ -1,0 +1,314 @@
+"""The frozen world model as one content-addressed file: a manifest and its parts in a stored zip.
+
+The file's SHA-256 is its identity. Equal parts give equal files: entries are sorted, uncompressed, without a date.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, DEFAULT_VARIANT, Variant
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.artifacts.delta_bundle import write_stored
+from dreamfleet.common.artifacts.onnx_checks import (
+    UnsafeModelError,
+    check_model,
+    has_finite_weights,
+    is_empty_graph,
+    read_float_array,
+)
+from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive
+from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.regular_files import open_regular, read_regular
+from dreamfleet.common.serialization.constraints import Between, Word
+from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
+from dreamfleet.common.serialization.validation import MalformedError, from_plain
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART = "encoder.onnx", "decoder.onnx", "policy.onnx", "initial_latents.npy"
+DREAM_GRAPH = "dream.onnx"  # a step of the dream; bundles from before it have none
+RECORDED_STATES = "recorded_states.npy"  # where recorded drives were: only in bundles whose dreams may begin there
+LINEAR_CONTROLLER, LAYERED_CONTROLLER = (
+    "controller-linear.onnx",
+    "controller-hidden.onnx",
+)  # controllers of any size, a row each
+WEIGHTS = "weights.safetensors"  # only in bundles that training goes on from
+REQUIRED = (ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART)
+MAX_BUNDLE = 256 << 20  # bytes, of the file and of all that it holds: the largest known is 16 MB
+LIMITS = ArchiveLimits(MAX_BUNDLE)
+_MAX_MANIFEST = 1_000_000
+MAX_RECORDED_STATES = 16_384  # states: 19 MB of the default layers'
+
+
+@dataclass(frozen=True)
+class BundleManifest:
+    """What a bundle is: its shapes, task and preprocessing, the hash of each part, and where it comes from."""
+
+    name: Word
+    task: Word
+    preprocessing: Word
+    picture: tuple[int, ...]  # height, width, channels of what the encoder takes, 8-bit
+    latent: Annotated[int, Between(1, 10_000)]
+    hidden: Annotated[int, Between(1, 100_000)]
+    actions: Annotated[int, Between(1, 1000)]
+    parts: dict[str, Any] = field(default_factory=dict)  # name -> SHA-256; filled in as the bundle is written
+    provenance: dict[str, Any] = field(default_factory=dict)
+    format: int = FORMAT
+    # The configurations of `vae` and `mdnrnn`; empty in bundles from before they were kept: the paper's.
+    models: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)
+
+
+class Bundle:
+    """A verified bundle, under the controllers that a run evolves."""
+
+    def __init__(
+        self, path: Path, sha256: str, manifest: BundleManifest, shape: ControllerShape | None = None,
+        variant: Variant = DEFAULT_VARIANT,
+    ) -> None:  # fmt: skip
+        self.path = path
+        self.sha256 = sha256
+        self.manifest = manifest
+        self.variant = variant  # how its controllers drive
+        self._shape = shape
+
+    @classmethod
+    def open(cls, path: Path | str, sha256: str | None = None) -> Bundle:
+        """Verify a bundle whole: archive, manifest, each part's hash, and its own if `sha256` names one.
+
+        What is verified is what was read: a file that is swapped meanwhile cannot pass. `BundleError` says what is
+        wrong.
+        """
+        path = Path(path)  # a text is one too
+        try:
+            data = read_regular(path, MAX_BUNDLE)
+        except FileNotFoundError:
+            raise BundleError(f"no bundle at {path}") from None
+        except OSError as error:
+            raise BundleError(f"{path} is not a whole bundle ({error.strerror}); fetch or build it again") from error
+        return cls.from_bytes(path, data, sha256)
+
+    @classmethod
+    def from_bytes(cls, path: Path, data: bytes, wanted: str | None) -> Bundle:
+        """The bundle that these bytes of `path` are."""
+        found = hashlib.sha256(data).hexdigest()
+        if wanted is not None and found != wanted:
+            raise BundleError(
+                f"{path} is not the world model that is wanted: its hash is {found[:12]}..., not {wanted[:12]}...; "
+                "put the right one there; one in a cache may be deleted, and is fetched again"
+            )
+        try:
+            with open_archive(io.BytesIO(data), LIMITS) as archive:
+                manifest = _read_manifest(archive, path)
+                for name in {*REQUIRED, *manifest.parts}:
+                    _check_part(path, manifest, name, _read_part(archive, path, manifest, name))
+        except DamagedArchiveError as error:
+            raise BundleError(f"{path} is not a whole bundle ({error}); fetch or build it again") from error
+        return cls(path, found, manifest)
+
+    @property
+    def default_shape(self) -> ControllerShape:
+        """A linear controller on latent and hidden state: what the policy's one graph holds."""
+        return self.shape_of("zh")
+
+    @property
+    def controller_shape(self) -> ControllerShape:
+        """The controllers that this bundle is under: `default_shape` unless `under` said otherwise."""
+        return self._shape or self.default_shape
+
+    def shape_of(self, features: str, hidden: int = 0, variant: Variant = DEFAULT_VARIANT) -> ControllerShape:
+        """Controllers that see `z` or `zh` (latent, or latent and hidden state), through `hidden` units; 0: linear.
+
+        A `variant` has outputs of its own, and may see more.
+        """
+        width = self.manifest.latent + (self.manifest.hidden if features == "zh" else 0)
+        outputs = self.manifest.actions if variant.is_default else variant.controls.outputs
+        return ControllerShape(width + variant.extra_features, outputs, hidden)
+
+    def with_controllers(self, shape: ControllerShape | None, variant: Variant = DEFAULT_VARIANT) -> Bundle:
+        """This bundle under controllers of another shape or variant; `None`: linear ones on all that they can see.
+
+        `ControllerError` if they do not fit it, `BundleError` if it is too old for them or of a world without variants.
+        """
+        if variant.is_default and shape in (None, self.default_shape):
+            return Bundle(self.path, self.sha256, self.manifest)
+        if not variant.is_default and self.manifest.task != CAR_RACING:
+            raise BundleError(
+                f"{self.path.name} is of {self.manifest.task}: {variant.options} are options of {CAR_RACING}"
+            )
+        shape = shape or self.shape_of("zh", variant=variant)
+        if shape not in (self.shape_of(features, shape.hidden, variant) for features in ("z", "zh")):
+            fitting = self.shape_of("zh", variant=variant)
+            raise ControllerError(
+                f"a controller of {shape.size} parameters does not fit {self.path.name}, which needs "
+                f"{fitting.size}, or other inputs: latent {self.manifest.latent}, hidden "
+                f"{self.manifest.hidden}, {fitting.actions} actions"
+            )
+        if not {DREAM_GRAPH, LINEAR_CONTROLLER, LAYERED_CONTROLLER} <= self.manifest.parts.keys():
+            raise BundleError(
+                f"{self.path.name} is from before other controllers than the linear one on z and h: build it again"
+            )
+        return Bundle(self.path, self.sha256, self.manifest, shape, variant)
+
+    def for_controller(self, controller: Controller) -> Bundle:
+        """This bundle under one controller's shape and variant; errors as of `under`.
+
+        `ControllerError` for a controller of another world model: its parameters mean nothing to this one.
+        """
+        found = self.with_controllers(controller.shape, controller.variant)
+        if self.sha256 != controller.bundle:
+            raise ControllerError(
+                f"the controller belongs to {describe_bundle(controller.bundle)}, not to {self.path.name} "
+                f"({self.sha256[:12]}...): leave --bundle out, or fit it to this one by `dreamfleet refit`"
+            )
+        return found
+
+    @property
+    def recorded_count(self) -> int:
+        """How many recorded states its dreams may begin at."""
+        return len(self.read_recorded()) if RECORDED_STATES in self.manifest.parts else 0
+
+    def check_recorded(self) -> None:
+        """`BundleError` if no dream can begin at a recorded state."""
+        if RECORDED_STATES not in self.manifest.parts:
+            raise BundleError(
+                f"{self.path.name} holds no recorded states that dreams could begin at: build it again with "
+                "`dreamfleet bundle --recorded N`, or leave --recorded out"
+            )
+
+    def read_recorded(self) -> NDArray[np.float32]:
+        """Recorded states `(N, 2 * latent + state)`: mu, logvar and the recurrent state before the action.
+
+        `BundleError` if it has none.
+        """
+        self.check_recorded()
+        return read_float_array(self.read(RECORDED_STATES))
+
+    def read(self, name: str) -> bytes:
+        """One part's bytes; `BundleError` if the bundle has no such part.
+
+        They are of the hash that the verified manifest gives them, whatever lies at the path by now.
+        """
+        if name not in self.manifest.parts:
+            raise BundleError(f"{self.path} holds no {name}")
+        try:
+            with open_regular(self.path, MAX_BUNDLE) as file, open_archive(file, LIMITS) as archive:
+                return _read_part(archive, self.path, self.manifest, name)
+        except (OSError, DamagedArchiveError) as error:
+            raise BundleError(f"{self.path} was changed while it was in use ({error}); fetch it again") from error
+
+
+def write_bundle(path: Path, manifest: BundleManifest, parts: Mapping[str, bytes]) -> Bundle:
+    """Write a bundle whole or not at all, and open it."""
+    hashes = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(parts.items())}
+    text = json.dumps({**to_dict(manifest), "parts": hashes}, indent=1, sort_keys=True)
+    if len(text) > _MAX_MANIFEST:
+        raise BundleError(f"the manifest of {path} would have {len(text)} bytes, and {_MAX_MANIFEST} are read")
+    with atomic_write(path) as file:
+        write_stored(file, [(MANIFEST, text.encode()), *sorted(parts.items())])
+    return Bundle.open(path)
+
+
+def hash_file(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal; `OSError` for what is none."""
+    with open_regular(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _check_part(path: Path, manifest: BundleManifest, name: str, data: bytes) -> None:
+    """Refuse what would only show as nonsense while it is scored."""
+    if name.endswith(".onnx"):
+        try:
+            check_model(data)
+        except UnsafeModelError as error:
+            raise BundleError(f"{path}: {name} {error}; build the bundle again") from error
+    if name.endswith(".onnx") and is_empty_graph(data):
+        raise BundleError(
+            f"{path}: {name} is an empty graph; fetch the bundle again, or build it again from its models"
+        )
+    if name.endswith(".onnx") and not has_finite_weights(data):
+        raise BundleError(f"{path}: {name} has weights that are NaN or infinite; train the model again")
+    if name == INITIAL_LATENTS_PART:
+        _check_latents(path, manifest, data)
+    if name == RECORDED_STATES:
+        _check_recorded_states(path, manifest, data)
+
+
+def _check_latents(path: Path, manifest: BundleManifest, data: bytes) -> None:
+    try:
+        latents = read_float_array(data)
+    except ValueError as error:
+        raise BundleError(
+            f"{path}: {INITIAL_LATENTS_PART} is no array of latents ({error}); build the bundle again"
+        ) from error
+    if latents.ndim != 3 or latents.shape[1:] != (2, manifest.latent) or not len(latents):
+        raise BundleError(
+            f"{path}: {INITIAL_LATENTS_PART} must be (N, 2, {manifest.latent}) with N at least 1, not {latents.shape}; "
+            "build the bundle again from encoded rollouts"
+        )
+    if not np.isfinite(latents).all():
+        raise BundleError(f"{path}: {INITIAL_LATENTS_PART} holds NaN or infinity; encode the rollouts again")
+
+
+def _check_recorded_states(path: Path, manifest: BundleManifest, data: bytes) -> None:
+    """How wide a state is exactly, the graph of the dream says to whoever dreams."""
+    try:
+        states = read_float_array(data)
+    except ValueError as error:
+        raise BundleError(
+            f"{path}: {RECORDED_STATES} is no array of states ({error}); build the bundle again"
+        ) from error
+    least = 2 * (manifest.latent + manifest.hidden)
+    if states.ndim != 2 or not 1 <= len(states) <= MAX_RECORDED_STATES or states.shape[1] < least:
+        raise BundleError(
+            f"{path}: {RECORDED_STATES} must be (N, W) with N from 1 to {MAX_RECORDED_STATES} and W at least {least}, "
+            f"not {states.shape}; build the bundle again"
+        )
+    if not np.isfinite(states).all():
+        raise BundleError(f"{path}: {RECORDED_STATES} holds NaN or infinity; build the bundle again")
+
+
+def read_bytes_or_none(path: Path) -> bytes | None:
+    """What lies at a path; `None` if that is nothing, or nothing that can be read."""
+    try:
+        return read_regular(path, MAX_BUNDLE)
+    except OSError:
+        return None
+
+
+def _read_part(archive: Archive, path: Path, manifest: BundleManifest, name: str) -> bytes:
+    """One part, of the hash that the manifest says."""
+    data = archive.read(name)
+    if hashlib.sha256(data).hexdigest() != manifest.parts.get(name):
+        raise BundleError(f"{path}: part {name} is damaged; fetch or build the bundle again")
+    return data
+
+
+def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
+    try:
+        plain = json.loads(archive.read(MANIFEST, _MAX_MANIFEST))
+        if plain["format"] != FORMAT:
+            raise BundleError(f"{path} has bundle format {plain['format']!r:.20}; this version reads {FORMAT}")
+        manifest = from_plain(BundleManifest, plain)
+        if not all(isinstance(each, dict) for each in manifest.models.values()):
+            raise MalformedError("models are no configurations")
+    except DamagedArchiveError:
+        raise
+    except (ValueError, TypeError, KeyError, MalformedError, RecursionError) as error:
+        raise BundleError(f"{path}: the manifest cannot be read ({error})") from error
+    return manifest
+
+
+def describe_bundle(sha256: str) -> str:
+    """A world model by its hash, in words; empty: none."""
+    return f"the world model {sha256[:12]}" if sha256 else "no world model"

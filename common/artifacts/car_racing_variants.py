@@ -1,0 +1,138 @@
+"""Variants of driving CarRacing: a controller's actions and features, and what a candidate pays for time and grass.
+
+They are the task's own options. A run's specification names what differs from the plain way, which is named by nothing:
+so what is plain stays as it was before there were any.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from functools import lru_cache
+from typing import Any, Literal
+
+from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_AND_HALVES, STEERING_GAS_BRAKE, Continuous
+from dreamfleet.common.errors import UsageError
+
+CAR_RACING = "car-racing"  # whose options these are, and its dream's
+OPTION_HELP = {
+    "actions": "continuous, or discrete with pedals=two",
+    "pedals": "two, half or one",
+    "pedal_shift": "a number from -1 to 1, and 0 unless pedals=one",
+    "decide_every": "a whole number from 1 to 50",
+    "feedback": "none or last",
+    "time_cost": "a number from 0 to 100",
+    "offroad_cost": "a number from 0 to 100",
+}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """How a controller drives, and what its candidates pay; each default is the plain way.
+
+    `UsageError` for a value that is out of its range.
+    """
+
+    actions: Literal["continuous", "discrete"] = "continuous"  # discrete: one of gymnasium's five
+    pedals: Literal["two", "half", "one"] = "two"  # half: at 0 both are half down; one: above 0 is gas, below it brake
+    pedal_shift: float = 0.0  # added to the one pedal
+    decide_every: int = 1  # steps for which a choice is held
+    feedback: Literal["none", "last"] = "none"  # last: the last choice and its change are features too
+    time_cost: float = 0.0  # what a candidate pays for each step before its lap is over
+    offroad_cost: float = 0.0  # what it pays for each step with a wheel off the road
+
+    def __post_init__(self) -> None:
+        fits = {
+            "actions": self.actions == "continuous" or (self.actions == "discrete" and self.pedals == "two"),
+            "pedals": self.pedals in ("two", "half", "one"),
+            "pedal_shift": _within(self.pedal_shift, -1, 1) and (self.pedals == "one" or not self.pedal_shift),
+            "decide_every": type(self.decide_every) is int and 1 <= self.decide_every <= 50,
+            "feedback": self.feedback in ("none", "last"),
+            "time_cost": _within(self.time_cost, 0, 100),
+            "offroad_cost": _within(self.offroad_cost, 0, 100),
+        }
+        for name, fit in fits.items():
+            if not fit:
+                raise UsageError(f"{CAR_RACING}'s {name} must be {OPTION_HELP[name]}, not {getattr(self, name)!r}")
+
+    @classmethod
+    def from_json(cls, options: str) -> Variant:
+        """What a specification's options name, a JSON object or nothing; `UsageError` lists those that are known."""
+        return _parse_options(options)
+
+    @classmethod
+    def from_values(cls, names: Mapping[str, Any]) -> Variant:
+        """The variant of these names and values, each of its own type; `UsageError` as `of`."""
+        if unknown := sorted(set(names) - set(OPTION_HELP)):
+            raise UsageError(f"{CAR_RACING} knows no option {', '.join(unknown)}: known are {', '.join(OPTION_HELP)}")
+        found = cls(**names)
+        shift, time, offroad = map(float, (found.pedal_shift, found.time_cost, found.offroad_cost))
+        return replace(found, pedal_shift=shift, time_cost=time, offroad_cost=offroad)
+
+    @property
+    def options(self) -> str:
+        """As a specification has it: canonical JSON of what is not plain."""
+        return json.dumps(self._non_default, sort_keys=True) if self._non_default else ""
+
+    @property
+    def option_texts(self) -> tuple[str, ...]:
+        """As it is said where a run begins: NAME=VALUE of what is not plain."""
+        return tuple(f"{name}={value}" for name, value in self._non_default.items())
+
+    @property
+    def is_default(self) -> bool:
+        """Whether nothing differs."""
+        return self == DEFAULT_VARIANT
+
+    @property
+    def version(self) -> int:
+        """Of the task: a worker that knows no variants must not score one as if it were plain."""
+        if self.is_default:
+            return 1
+        return 3 if self.without_costs.is_default else 2  # version 2 drove plain controllers that pay by other products
+
+    @property
+    def without_costs(self) -> Variant:
+        """What a controller's parameters depend on: all but what candidates pay."""
+        return replace(self, time_cost=0.0, offroad_cost=0.0)
+
+    @property
+    def controls(self) -> Continuous:
+        """How outputs become steering, gas and brake."""
+        if self.actions == "discrete":
+            return FIVE_CHOICES
+        if self.pedals == "two":
+            return STEERING_GAS_BRAKE
+        if self.pedals == "half":
+            return STEERING_AND_HALVES
+        shift = (0.0, self.pedal_shift, -self.pedal_shift)
+        return Continuous((1, 1, -1), shift, low=(-1, 0, 0), high=(1, 1, 1), output_indices=(0, 1, 1))
+
+    @property
+    def extra_features(self) -> int:
+        """Features beside those of the world model: each output's last choice and its change."""
+        return 2 * self.controls.outputs if self.feedback == "last" else 0
+
+    @property
+    def _non_default(self) -> dict[str, Any]:
+        values = asdict(self)
+        return {each.name: values[each.name] for each in fields(self) if values[each.name] != each.default}
+
+
+@lru_cache
+def _parse_options(options: str) -> Variant:
+    try:
+        names = json.loads(options or "{}")
+        if not isinstance(names, dict):
+            raise TypeError("it is no object")
+    except (ValueError, TypeError, RecursionError) as error:
+        raise UsageError(f"{CAR_RACING}'s options must be a JSON object, not {options!r:.200}") from error
+    return Variant.from_values(names)
+
+
+def _within(value: Any, low: float, high: float) -> bool:
+    return type(value) in (int, float) and low <= value <= high
+
+
+DEFAULT_VARIANT = Variant()

@@ -1,0 +1,165 @@
+"""Looking at the arrays in a bundle's parts without the libraries that run them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.files.archives import parse_array
+
+_ORT_FORMAT = b"ORTM"  # its flat buffers' mark, which its reader takes for another format
+_MAX_DEPTH = 64  # graphs within nodes within graphs
+_MAX_FIELDS = 500_000  # of all messages of a model; ours have some hundreds
+_MAX_FIELD_NUMBER = 2**29  # of a field: the runtime's reader cuts longer ones short
+# Of onnx.proto: where messages of each kind hold messages that a tensor may stand in.
+_NESTED = {
+    "model": {7: "graph", 20: "training", 25: "function"},
+    "training": {1: "graph", 2: "graph"},
+    "function": {7: "node", 11: "attribute"},
+    "graph": {1: "node", 5: "tensor", 15: "sparse"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
+    "sparse": {1: "tensor", 2: "tensor"},
+    "tensor": {},
+}
+_EXTERNAL_DATA, _DATA_LOCATION = 13, 14  # of TensorProto
+
+_VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # protobuf's wire types
+# By onnx.proto's TensorProto.DataType.
+_FLOATS: dict[int, np.dtype[Any]] = {
+    1: np.dtype("<f4"),
+    10: np.dtype("<f2"),
+    11: np.dtype("<f8"),
+}
+
+
+def has_finite_weights(model: bytes) -> bool:
+    """Whether no weight of an ONNX model is NaN or infinite; what is no model has none.
+
+    The runtime does not tell: a rectifier makes zero of NaN. Field numbers are those of onnx.proto: ModelProto.graph 7,
+    GraphProto.initializer 5, TensorProto.data_type 2 and raw_data 9.
+    """
+    try:
+        return all(
+            np.isfinite(array).all()
+            for graph in _messages(memoryview(model), 7)
+            for tensor in _messages(graph, 5)
+            for array in _arrays(tensor)
+        )
+    except (IndexError, ValueError):
+        return True
+
+
+class UnsafeModelError(ValueError):
+    """What no model may have, in words that follow its name."""
+
+
+def check_model(model: bytes) -> None:
+    """`UnfitError` if an ONNX model reads other files, or is too much to look through.
+
+    What is no model at all is not judged here; `check_closed` is for those who run it.
+    """
+    try:
+        check_self_contained(model)
+    except UnsafeModelError:
+        raise
+    except ValueError:
+        return
+
+
+def check_self_contained(model: bytes) -> None:
+    """`ValueError` unless an ONNX model is one whole message that names no other file.
+
+    Stricter than the runtime's own reader, so that nothing passes here which means something else there: of messages
+    alone, without groups, in which no number is longer than it may be.
+    """
+    if model[4:8] == _ORT_FORMAT:
+        raise ValueError("it is in the runtime's own format, not in ONNX")
+    try:
+        _check_message(memoryview(model), "model", [_MAX_FIELDS])
+    except IndexError as error:
+        raise ValueError("not a message") from error
+
+
+def is_empty_graph(model: bytes) -> bool:
+    """Whether an ONNX model computes nothing: it is no bytes at all, or a message without a node.
+
+    What is no message at all is not judged here; the runtime refuses it. GraphProto.node is field 1.
+    """
+    try:
+        return not any(True for graph in _messages(memoryview(model), 7) for _ in _messages(graph, 1))
+    except (IndexError, ValueError):
+        return False
+
+
+def read_float_array(data: bytes) -> NDArray[np.float32]:
+    """A `.npy` of floats; `ValueError` if it is none."""
+    array = parse_array(data)
+    if array.dtype.kind != "f":
+        raise ValueError("not an array of floats")
+    return np.asarray(array, dtype=np.float32)
+
+
+def _check_message(data: memoryview, kind: str, left: list[int], depth: int = 0) -> None:
+    """Look through one message; `left` holds how many fields may still come."""
+    if depth > _MAX_DEPTH:
+        raise UnsafeModelError("is nested too deeply")
+    for number, value in _fields(data):
+        left[0] -= 1
+        if left[0] < 0:
+            raise UnsafeModelError(f"has more than {_MAX_FIELDS} fields")
+        if kind == "tensor" and (number == _EXTERNAL_DATA or (number == _DATA_LOCATION and value != 0)):
+            raise UnsafeModelError("keeps weights in another file, which no graph may read")
+        if (inner := _NESTED[kind].get(number)) is not None:
+            if not isinstance(value, memoryview):
+                raise ValueError("not a message")
+            _check_message(value, inner, left, depth + 1)
+
+
+def _arrays(tensor: memoryview) -> Iterator[NDArray[Any]]:
+    values = dict(_fields(tensor))
+    kind, raw = values.get(2), values.get(9)
+    if isinstance(raw, memoryview) and isinstance(kind, int) and kind in _FLOATS:
+        yield np.frombuffer(raw, dtype=_FLOATS[kind])
+
+
+def _messages(data: memoryview, wanted: int) -> Iterator[memoryview]:
+    for number, value in _fields(data):
+        if number == wanted and isinstance(value, memoryview):
+            yield value
+
+
+def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    position = 0
+    while position < len(data):
+        tag, position = _varint(data, position)
+        number, kind = tag >> 3, tag & 7
+        if not 0 < number < _MAX_FIELD_NUMBER:
+            raise ValueError("not a message")
+        if kind == _VARINT:
+            value, position = _varint(data, position)
+            yield number, value
+            continue
+        if kind == _BYTES:
+            size, position = _varint(data, position)
+        else:
+            size = {_EIGHT: 8, _FOUR: 4}.get(kind, len(data))
+        if position + size > len(data):
+            raise ValueError("not a message")
+        yield number, data[position : position + size]
+        position += size
+
+
+def _varint(data: memoryview, position: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = data[position]
+        value |= (byte & 127) << shift
+        position, shift = position + 1, shift + 7
+        if byte < 128:
+            return value, position
+        if shift > 63:
+            raise ValueError("not a number")

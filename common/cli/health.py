@@ -1,0 +1,111 @@
+"""Checks of an installation, each with its remedy."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import default_cache, shipped_bundles
+from dreamfleet.common.errors import AccessError, DreamfleetError
+from dreamfleet.common.host.packages import PACKAGES, install_command, package_version
+from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left, read_join_file
+
+GROUP = "dreamfleet.checks"
+# What a role stands on, as findings name it; but for the coordinator's, the extra of that name installs the last part.
+ROLES = {
+    "coordinator": ("everything", "coordinator"),
+    "worker": ("everything", "worker"),
+    "views": ("everything", "worker", "views"),
+    "train": ("everything", "worker", "train"),
+    "dashboard": ("everything", "dashboard"),
+    "export": ("everything", "export"),
+}
+MIN_FREE_BYTES = 200_000_000
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check: what was found, what it is for, whether that cannot do without it, and what to do if it lacks.
+
+    `role` is `everything` or one of `ROLES`.
+    """
+
+    name: str
+    ok: bool
+    needed: bool
+    found: str
+    role: str
+    remedy: str
+
+
+def run_checks(runs_dir: Path, join: Path | None = None) -> list[Finding]:
+    """Every check, ours, of a join file that is used, and those that the sides register under `dreamfleet.checks`."""
+    registered = [finding for point in entry_points(group=GROUP) for finding in point.load()()]
+    folders = [
+        _check_writable("cache", default_cache(), "everything"),
+        _check_writable("runs", runs_dir, "coordinator"),
+    ]
+    joined = [] if join is None else [_check_join_file(join)]
+    return [*_check_packages(), _check_box2d(), *_check_bundles(), *registered, *folders, *joined]
+
+
+def _check_join_file(path: Path) -> Finding:
+    """Whether it lets anybody in, and for how long; a week before its end it is no more as it should be."""
+    try:
+        credentials = read_join_file(path)
+    except AccessError as error:
+        return Finding("join file", False, True, str(error), "everything", "have another issued")
+    left = credentials.time_left(datetime.now(UTC))
+    found = f"{path}: {credentials.role} {credentials.name}, {describe_time_left(left)}"
+    remedy = f"have {credentials.role} {credentials.name} issued again"
+    return Finding("join file", left > EXPIRY_WARNING, False, found, "everything", remedy)
+
+
+def missing_for_role(role: str, findings: list[Finding]) -> list[Finding]:
+    """What keeps this installation from a role; empty if it can be played."""
+    return [each for each in findings if each.role in ROLES[role] and each.needed and not each.ok]
+
+
+def _check_packages() -> Iterator[Finding]:
+    for name, (module, extra) in PACKAGES.items():
+        found = package_version(name) or (package_version("box2d-py") if name == "box2d" else None)
+        ok = found is not None and find_spec(module) is not None
+        yield Finding(name, ok, True, found or "-", extra or "everything", install_command(extra))
+
+
+def _check_box2d() -> Finding:
+    both = package_version("box2d") and package_version("box2d-py")
+    remedy = "pip uninstall box2d box2d-py, then pip install 'dreamfleet[worker]': both own the module Box2D"
+    return Finding("one Box2D", not both, True, "both box2d and box2d-py" if both else "ok", "worker", remedy)
+
+
+def _check_bundles() -> Iterator[Finding]:
+    paths = shipped_bundles()
+    for name, path in paths.items():
+        try:
+            found, ok = Bundle.open(path).sha256[:12], True
+        except DreamfleetError as error:
+            found, ok = str(error), False
+        yield Finding(f"bundle {name}", ok, True, found, "everything", "reinstall dreamfleet")
+    if not paths:
+        yield Finding("bundle", False, True, "none shipped", "everything", "reinstall dreamfleet")
+
+
+def _check_writable(name: str, path: Path, role: str) -> Finding:
+    """Whether a folder, or the nearest parent that exists, can be written and has room."""
+    where = next(each for each in (path, *path.absolute().parents) if each.exists())
+    remedy = f"make {where} writable, or point $DREAMFLEET_{'CACHE' if name == 'cache' else 'RUNS_DIR'} elsewhere"
+    try:
+        with tempfile.TemporaryFile(dir=where):
+            free = shutil.disk_usage(where).free
+    except OSError as error:
+        return Finding(f"{name} folder", False, True, f"{path}: {error.strerror}", role, remedy)
+    found = f"{path}, {free / 1e9:.1f} GB free"
+    return Finding(f"{name} folder", free > MIN_FREE_BYTES, True, found, role, remedy)

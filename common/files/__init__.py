@@ -1,0 +1,1 @@
+"""Files: atomic writes, bounded archives, folder locks, event files."""

@@ -1,0 +1,88 @@
+"""What a verb writes where `--out` says: looked at before minutes of work, then whole or not there."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.files.regular_files import check_replaceable, is_folder
+
+
+def check_output_path(path: Path) -> None:
+    """`UsageError` where no file can be written; its folder is made."""
+    if is_folder(path):
+        raise UsageError(f"--out {path} is a folder: name a file in it")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--out {path}: its folder cannot be made ({error}): choose another") from error
+    if not os.access(path.parent, os.W_OK):
+        raise UsageError(f"--out {path}: its folder cannot be written in: choose another")
+    try:
+        check_replaceable(path)
+    except OSError as error:
+        raise UsageError(f"--out {path}: {error.strerror}: name another") from error
+
+
+@contextmanager
+def open_output(path: Path) -> Iterator[BinaryIO]:
+    """Open what `--out` names for writing; it is whole or not there."""
+    with reporting_write_errors(path), atomic_write(path) as file:
+        yield file
+
+
+@contextmanager
+def reporting_write_errors(path: Path, flag: str = "--out") -> Iterator[None]:
+    """What cannot be written at `path`, which `flag` names, is a `DreamfleetError`."""
+    try:
+        yield
+    except OSError as error:
+        raise DreamfleetError(f"cannot write {path}: {error.strerror}; make room or choose another {flag}") from error
+
+
+@contextmanager
+def atomic_write(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
+    """Open a neighbour of `path` for writing; on success it is synced and takes the name, on failure it vanishes.
+
+    A `private` file is its owner's alone (mode 600), from the first byte on.
+
+    The folder is synced too: a name that a power cut takes back would be no file at all. `OSError` where there is
+    something that is no file: a device would become one.
+    """
+    check_replaceable(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with _open_for_writing(aside, private) as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+        fsync_path(path.parent)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def _open_for_writing(path: Path, private: bool) -> BinaryIO:
+    if not private:
+        return path.open("wb")
+    path.unlink(missing_ok=True)  # one of another mode
+    return open_new(path)
+
+
+def open_new(path: Path) -> BinaryIO:
+    """Open a file that is its owner's alone (mode 600) for writing; `FileExistsError` if there is any."""
+    return open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "wb")  # noqa: PTH123
+
+
+def fsync_path(path: Path) -> None:
+    """Make a file's bytes, or the names in a folder, durable."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)

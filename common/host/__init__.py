@@ -1,0 +1,1 @@
+"""The host and its processes: limits, signals, logs, streams, parent death."""

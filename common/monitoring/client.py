@@ -1,0 +1,268 @@
+"""Asking a run over Zenoh how it is, watching it, and fetching its controller. Read-only but for `control`."""
+
+from __future__ import annotations
+
+import base64
+import queue
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from time import monotonic
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.errors import ConnectionFailedError, ControllerError, RefusedError, UsageError
+from dreamfleet.common.monitoring.status import (
+    FINAL_STATES,
+    Event,
+    Population,
+    Status,
+    WorkerStatus,
+    read_document,
+    read_status,
+)
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import decode_json
+from dreamfleet.common.protocol.messages import ControlReply
+from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
+from dreamfleet.common.serialization.optional_fields import known
+from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.transport.query import query_all
+from dreamfleet.common.transport.session import Network, enqueue_into, open_session
+
+QUERY_TIMEOUT = 3.0
+PATIENCE = 1.0  # seconds without an answer after which a watched run counts as left
+MAX_PARAMETERS = 16 << 20  # of a controller, as its file may have them
+MAX_CHANGES = 5  # controllers that may replace one another while one is fetched in parts
+
+
+class Client:
+    """A connection to the router of one or more runs; use it in a `with`.
+
+    >>> with Client(("tcp/127.0.0.1:7447",)) as client:  # doctest: +SKIP
+    ...     print(client.status("my-run").state)
+    """
+
+    def __init__(self, connect: Network | tuple[str, ...] | str) -> None:
+        """`connect` are addresses, or with them a join file's credentials: `site.reached`."""
+        connect = (connect,) if isinstance(connect, str) else connect
+        network = connect if isinstance(connect, Network) else Network(connect=connect)
+        if not network.connect:
+            raise UsageError("a client needs an address: tcp/HOST:PORT")
+        self._where = ", ".join(network.connect)
+        self._secured = network.credentials is not None
+        #: with which flags a worker is started that joins a run here; in a fleet with join files it brings its own
+        self.worker_flags = "--join FILE" if network.credentials else f"--connect {' '.join(network.connect)}"
+        self.session = open_session(network)  # also for what asks in other words, as for a bundle
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        self.session.close()  # type: ignore[no-untyped-call]
+
+    def runs(self) -> list[str]:
+        """Names of the live runs."""
+        return sorted(str(document["run"]) for document in self.statuses() if "run" in document)
+
+    def status(self, run: str | None = None) -> Status:
+        """How `run` is, or the only live run; `MalformedError` if its version is not understood."""
+        return read_status(self.document(run))
+
+    def statuses(self, timeout: float = QUERY_TIMEOUT) -> list[dict[str, Any]]:
+        """How every live run is, as the wire has it, in no order: what answers within `timeout` seconds."""
+        return [read_document(payload) for payload in query_all(self.session, [keys.status("*")], timeout)]
+
+    def document(self, run: str | None = None, part: str = "", parameters: str = "") -> dict[str, Any]:
+        """What answers for `run`, or for the only live run, as the wire has it; `part` is one of `status.PARTS`."""
+        key = keys.status(keys.check_run_name(run) if run else "*", part)
+        documents = self._query(f"{key}?{parameters}" if parameters else key)
+        if len(documents) > 1:
+            names = ", ".join(sorted(str(document.get("run")) for document in documents))
+            raise UsageError(f"several runs are live: name one of {names}")
+        if not documents:
+            raise self._no_answer_error(run)
+        return documents[0]
+
+    def watch(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[Status]:
+        """How `run` is every `pause` seconds, and at last how its coordinator left it.
+
+        `ConnectionFailedError` if for `patience` seconds nobody answers: the coordinator vanished without a word, or
+        never came. Give more to wait for one that is being started, or started again.
+        """
+        return map(read_status, self.watch_documents(run, pause, patience))
+
+    def watch_documents(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[dict[str, Any]]:
+        """As `watch`, but as the wire has it."""
+        last_statuses: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        enqueue = enqueue_into(last_statuses, "status", most=1)
+        subscriber: Any = self.session.declare_subscriber(keys.event_status(keys.check_run_name(run)), enqueue)
+        lost_at: float | None = None  # when it counts as left, while nobody answers
+        try:
+            while True:
+                try:
+                    document = self.document(run)
+                except ConnectionFailedError:
+                    lost_at = monotonic() + patience if lost_at is None else lost_at
+                    if monotonic() >= lost_at:
+                        raise
+                else:
+                    lost_at = None
+                    yield document
+                    if document.get("state") in FINAL_STATES:
+                        return
+                wait = pause if lost_at is None else min(pause, max(lost_at - monotonic(), 0.0))
+                with suppress(queue.Empty):
+                    _, sample = last_statuses.get(timeout=wait)
+                    yield read_document(sample.payload.to_bytes())
+                    return
+        finally:
+            subscriber.undeclare()
+
+    def workers(self, run: str) -> list[WorkerStatus]:
+        """All workers that the coordinator of `run` knows."""
+        return [from_plain(WorkerStatus, known(WorkerStatus, row)) for row in self.fetch_rows("workers", run)]
+
+    def history(self, run: str, offset: int = 0) -> list[StoredGeneration]:
+        """All closed generations of `run` but the first `offset`, oldest first."""
+        rows = self.fetch_rows("history", run, offset)
+        return [from_plain(StoredGeneration, known(StoredGeneration, row)) for row in rows]
+
+    def events(
+        self, run: str | None = None, worker: str = "", job: str = "", kinds: Collection[str] = ()
+    ) -> tuple[list[Event], int]:
+        """What happened of late, oldest first, and how many such events are kept: more than one answer may hold.
+
+        `worker` is a worker, or the host's name in its name; `job` a candidate as generation/index; `kinds` are words
+        of `status.What`; else all.
+        """
+        try:
+            document = self.document(run, "story", f"worker={worker};job={job};what={','.join(kinds)}")
+        except ConnectionFailedError:
+            document = self.document(run)  # one from before this part answers for its status alone
+        rows = document.get("story")
+        if not isinstance(rows, list):
+            raise MalformedError(
+                f"the coordinator of run {document.get('run')} tells no story: a worker's join file may not ask for "
+                "it, or its dreamfleet is older than this verb; take a viewer's, or install a newer one there"
+            )
+        return [from_plain(Event, known(Event, row)) for row in rows], int(document.get("total", len(rows)))
+
+    def evaluations(self, run: str) -> list[StoredEvaluation]:
+        """All finished evaluations of `run`, oldest first; a coordinator from before this part does not answer."""
+        rows = self.fetch_rows("evaluations", run)
+        return [from_plain(StoredEvaluation, known(StoredEvaluation, row)) for row in rows]
+
+    def candidates(self, run: str, generation: int) -> list[Population]:
+        """All candidates of the open generation of `run`, or of the one before it, in parts; the open one otherwise."""
+        parts: list[Population] = []
+        seen = 0
+        while not parts or seen < parts[0].total:
+            document = self.document(run, "candidates", f"offset={seen};generation={generation}")
+            parts.append(from_plain(Population, known(Population, document)))
+            seen += len(parts[-1].done)
+            if not parts[-1].done:
+                break
+        return parts
+
+    def controller(self, run: str) -> Controller:
+        """What `run` reports now: its best evaluated mean, else its last one; `ControllerError` before the first."""
+        for _ in range(MAX_CHANGES):
+            data, about = b"", self._fetch_controller_part(run, 0)
+            sha256, total = about["sha256"], 4 * _check_total(about)
+            while about["sha256"] == sha256:
+                part = _decode_part(about)
+                data += part
+                if len(data) >= total or not part:
+                    return _decode_controller(about, data)
+                about = self._fetch_controller_part(run, len(data) // 4)
+        raise ControllerError(f"the controller of run {run} changes faster than it can be fetched; ask again")
+
+    def fetch_rows(self, part: str, run: str, offset: int = 0) -> Iterator[dict[str, Any]]:
+        """All rows from `offset` on of a paged part as the wire has them: `workers`, `history` or `evaluations`."""
+        while True:
+            document = self.document(run, part, f"offset={offset}")
+            yield from document[part]
+            offset += len(document[part])
+            if offset >= document["total"] or not document[part]:
+                return
+
+    def control(self, run: str, verb: str) -> str:
+        """Ask the coordinator to `pause`, `resume`, `drain` or `stop`; `RefusedError` says why it does not.
+
+        The command that continues the run on its host, if it is left now and its coordinator says so.
+        """
+        for reply in self.session.get(keys.control(keys.check_run_name(run), verb), timeout=QUERY_TIMEOUT):
+            if reply.ok is not None:
+                try:
+                    answer = decode_json(ControlReply, reply.ok.payload.to_bytes())
+                except MalformedError as error:
+                    raise MalformedError(
+                        f"what answers for run {run} is no coordinator of this version ({error}): install the same "
+                        "dreamfleet on both sides"
+                    ) from error
+                if not answer.accepted:
+                    raise RefusedError(answer.why)
+                return answer.again
+        raise self._no_answer_error(run)
+
+    def _fetch_controller_part(self, run: str, offset: int) -> dict[str, Any]:
+        about = self.document(run, "best", f"offset={offset}").get("controller")
+        if about is None:
+            raise ControllerError(f"run {run} reports no controller yet: wait until its first generation is closed")
+        if not isinstance(about, dict) or not about.keys() >= {"sha256", "total", "parameters", "shape", "task"}:
+            raise MalformedError(f"run {run} gives a controller that this version cannot read: update dreamfleet")
+        return about
+
+    def _no_answer_error(self, run: str | None) -> ConnectionFailedError:
+        whose, again = "any run", "--run NAME` begins one"
+        if run:
+            whose, again = f"run {run!r}", f"--resume {run}` goes on with one that was stopped or killed"
+        right = ", or the join file lacks the right to ask" if self._secured else ""
+        return ConnectionFailedError(
+            f"no coordinator of {whose} answers through {self._where}: it is not running{right}; "
+            f"`dreamfleet coordinator {again}"
+        )
+
+    def _query(self, selector: str) -> list[dict[str, Any]]:
+        return [read_document(payload) for payload in query_all(self.session, [selector], QUERY_TIMEOUT)]
+
+
+def _check_total(about: dict[str, Any]) -> int:
+    """How many parameters there are; `ControllerError` before more is fetched than a controller may have."""
+    total = about["total"]
+    if type(total) is not int or not 0 < total <= MAX_PARAMETERS:
+        raise ControllerError("the run says that its controller has no such number of parameters as one may have")
+    return total
+
+
+def _decode_part(about: dict[str, Any]) -> bytes:
+    """The parameters of one answer."""
+    try:
+        return base64.b64decode(about["parameters"], validate=True)
+    except (ValueError, TypeError) as error:
+        raise ControllerError("the controller arrived damaged; ask again") from error
+
+
+def _decode_controller(about: dict[str, Any], data: bytes) -> Controller:
+    try:
+        shape = from_plain(ControllerShape, known(ControllerShape, about["shape"]))
+        parameters = np.frombuffer(data, dtype="<f4").astype(np.float32)
+        controller = Controller(
+            shape,
+            parameters,
+            str(about["task"]),
+            str(about["bundle"]),
+            dict(about.get("provenance", {})),
+            str(about.get("options", "")),
+            int(about.get("version", 1)),
+        )
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise ControllerError(f"the run's controller cannot be read ({error}): update dreamfleet") from error
+    if controller.sha256 != about["sha256"]:
+        raise ControllerError("the controller arrived damaged; ask again")
+    return controller

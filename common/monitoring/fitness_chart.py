@@ -1,0 +1,58 @@
+"""What pictures of runs and trainings have in common: colours, and a run's fitness over its generations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+
+from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.stages import begun_stages
+
+PLOT_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive")
+
+
+def draw_fitness(axes: Any, run: RunFolder) -> list[Any]:
+    """Draw each generation's mean, spread and best; evaluations and the confirmed mean where there are any.
+
+    Those have a scale of their own where the run dreams alone, for fitness and score are not of one kind. What comes
+    back is for a legend.
+    """
+    history, evaluations, settings = run.history(), run.evaluations(), run.settings
+    number, mean, std, best = np.array([(each.number, each.mean, each.std, each.best) for each in history]).T
+    axes.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label="± 1 standard deviation")
+    axes.plot(number, mean, color="tab:blue", label="mean of the population")
+    axes.plot(number, best, color="tab:orange", linewidth=1, label="best candidate")
+    stages = begun_stages(settings, history, evaluations)
+    for count, each in enumerate(stages[1:]):
+        label = None if count else "a stage begins"
+        axes.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1, label=label)
+    axes.set_xlabel("generation")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(alpha=0.3)
+    dreamt = settings.task.task == DREAM
+    alone = dreamt and not any(each.stage.driven for each in stages)
+    real = axes.twinx() if alone and evaluations else axes
+    if evaluations:
+        episodes = f"{settings.evaluation_episodes} whole episodes"
+        real.errorbar(
+            [each.generation for each in evaluations], [each.mean for each in evaluations],
+            [each.error for each in evaluations], fmt="o-" if dreamt else "o", color="tab:green", capsize=3,
+            label=f"evaluated mean{' in reality' if dreamt else ''}, {episodes} (± standard error)",
+        )  # fmt: skip
+        _draw_confirmed(real, run)
+    if real is not axes:
+        real.set_ylabel(f"score in reality, {episodes}", color="tab:green")
+    drawn = (axes,) if real is axes else (axes, real)
+    return [handle for each in drawn for handle in each.get_legend_handles_labels()[0]]
+
+
+def _draw_confirmed(axes: Any, run: RunFolder) -> None:
+    """The score that the run reports, which lies below its best evaluation where that was lucky."""
+    if (confirmed := run.confirmation()) is not None:
+        axes.errorbar(
+            confirmed.generation, confirmed.mean, confirmed.error, fmt="*", color="tab:red", capsize=3, markersize=10,
+            label=f"reported: confirmed on {confirmed.episodes} fresh seeds (± standard error)",
+        )  # fmt: skip

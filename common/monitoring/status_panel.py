@@ -1,0 +1,322 @@
+"""A run's status as a picture for a terminal of any size: what matters least gives way, and no name is cut."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import pairwise, zip_longest
+
+from rich.cells import cell_len, chop_cells
+from rich.console import Console, ConsoleOptions, Group, RenderResult
+from rich.panel import Panel
+from rich.text import Text
+
+from dreamfleet.common.monitoring.eta import describe_state, estimate_eta
+from dreamfleet.common.monitoring.status import (
+    EpisodeProgress,
+    FailureStatus,
+    GenerationStatus,
+    Population,
+    StageStatus,
+    Status,
+)
+from dreamfleet.common.monitoring.terminal_charts import bar_chart, candidate_grid, candidate_grid_height, share_bar
+from dreamfleet.common.monitoring.worker_table import WorkerTable
+from dreamfleet.common.printable import plural, printable
+from dreamfleet.common.protocol.tasks import DREAM, is_unregistered
+from dreamfleet.common.runs.records import (
+    RunSettings,
+    StoredConfirmation,
+    StoredEvaluation,
+    StoredGeneration,
+    format_mean,
+)
+from dreamfleet.common.runs.stages import describe_steps
+from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left
+
+STATE_STYLES = {
+    "running": "green",
+    "evaluating": "cyan",
+    "paused": "bold red",
+    "ended": "bold",
+    "left": "bold yellow",
+    "waiting for workers": "yellow",
+}
+FRAME_WIDTH = 4  # columns of border and air
+BORDERS = 2  # lines
+LABEL_WIDTH = 17  # columns of a fact's name
+TWO_COLUMN_WIDTH = 110  # columns from which on facts stand in two
+BAR = 40  # columns at most
+MAX_CURVE_LINES = 8  # lines at most
+UNKNOWN_ADDRESS = "--connect tcp/HOST:PORT"  # of a worker, where it is not known how the run is reached
+
+
+@dataclass(frozen=True)
+class Block:
+    """A part of the picture: it takes `least` lines or none, would have `wish`, and has use for `most`."""
+
+    need: int  # 0 first: who gets lines before others
+    least: int
+    wish: int
+    most: int
+    draw: Callable[[int], list[Text]]
+
+
+class RunPanel:
+    """The whole picture; `fitted`: as high as the terminal at most, for one that is drawn again and again.
+
+    A worker is started with `worker_flags`, which say where the run is.
+    """
+
+    def __init__(self, status: Status, worker_flags: str = UNKNOWN_ADDRESS, *, fitted: bool = False) -> None:
+        self._status = status
+        self._worker_flags = worker_flags
+        self._fitted = fitted
+
+    def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
+        """A panel of the console's width."""
+        status = self._status
+        lines = options.max_height - BORDERS - 1 if self._fitted else None  # the last line is for the shell's prompt
+        state = printable(status.state), STATE_STYLES.get(status.state, "")
+        title = Text.assemble((printable(status.run), "bold"), " · ", state)
+        content = Group(*panel_lines(status, options.max_width - FRAME_WIDTH, lines, self._worker_flags))
+        yield Panel(content, title=title, title_align="left", padding=(0, 1))
+
+
+def panel_lines(
+    status: Status, width: int, lines: int | None = None, worker_flags: str = UNKNOWN_ADDRESS
+) -> list[Text]:
+    """The picture without its frame, in `width` columns and at most so many lines; `None`: as many as it takes."""
+    blocks = list(_blocks(status, max(width, 1), worker_flags))
+    return [line for block, given in zip(blocks, allocate_lines(blocks, lines), strict=True) if given
+            for line in block.draw(given)[:given]]  # fmt: skip
+
+
+def allocate_lines(blocks: Sequence[Block], lines: int | None) -> list[int]:
+    """The lines that each block has: in the order of need first the least of each, then its wish, then the most."""
+    if lines is None:
+        return [each.most for each in blocks]
+    given, left = [0] * len(blocks), lines
+    order = sorted(range(len(blocks)), key=lambda index: blocks[index].need)
+    for index in order:
+        if blocks[index].least <= left:
+            given[index] = blocks[index].least
+            left -= given[index]
+    for aim in ("wish", "most"):
+        for index in order:
+            more = min(getattr(blocks[index], aim) - given[index], left) if given[index] else 0
+            given[index] += max(more, 0)
+            left -= max(more, 0)
+    return given
+
+
+def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
+    """From top to bottom."""
+    state = STATE_STYLES.get(status.state, "")
+    yield _text_block(0, Text(printable(describe_state(status)), style=state), width, least=2)
+    if status.failures and not status.why:
+        yield _text_block(1, Text(printable(_describe_failure(status.failures[0])), style="red"), width, least=1)
+    if not status.is_over:
+        yield _text_block(2, Text(printable(estimate_eta(status).description)), width, least=1)
+    if progress := list(_progress_lines(status, width)):
+        yield Block(3, 1, len(progress), len(progress), lambda _: progress)
+    facts = list(_facts(status))
+    most = len(_fact_lines(facts, width))
+    yield Block(4, min(3, most), min(5, most), most, lambda given: _fit_facts(facts, width, given))
+    if len(status.recent) > 1:
+        yield Block(
+            7, 1, 4, MAX_CURVE_LINES, lambda given: _curve_lines(status.recent, width, given, status.generation.stage)
+        )
+    if (population := _open_population(status)) is not None:
+        shown = population
+        wanted = 1 + candidate_grid_height(shown, width)
+        yield Block(5, 2, min(wanted, 4), wanted, lambda given: _candidate_lines(status, shown, width, given))
+    yield _workers_block(status, width, worker_flags)
+
+
+def _text_block(need: int, text: Text, width: int, least: int) -> Block:
+    lines = _wrap(text.plain, width)
+    drawn = [Text(each, style=text.style) for each in lines]
+    return Block(need, min(least, len(lines)), len(lines), len(lines), lambda given: drawn[:given])
+
+
+def _wrap(text: str, width: int) -> list[str]:
+    """Broken between words; text of wide characters anywhere."""
+    return textwrap.wrap(text, width) if cell_len(text) == len(text) else chop_cells(text, width)
+
+
+def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
+    """Need (0 first), name and value, in the order in which they stand."""
+    settings, task, waste = status.settings, status.settings.task, status.waste
+    temperature, stage = status.generation.temperature, status.generation.stage
+    now, size = (task, settings) if stage is None else (stage, stage)
+    warm = "" if temperature is None or size.driven == 1 else f", temperature {temperature:g}"
+    length = describe_steps(now.horizon, size.driven, dreamt=task.task == DREAM and size.driven > 0)
+    yield 6, "task", f"{task.task}, {length}{warm}"
+    yield 7, "population", f"{size.population} x {size.episodes}"
+    if stage is not None:
+        yield 4, "stage", f"{stage.number} of {stage.total}, since generation {stage.since}"
+    yield 0, "last generation", _describe_generation(status.last) if status.last else "-"
+    yield 5, "step size", f"{status.generation.sigma:.4f} ({_describe_optimiser(settings)})"
+    yield 1, "evaluated mean", _describe_evaluation(status.evaluation)
+    yield 2, "reported", _describe_reported(status)
+    rate, steps = status.throughput.steps_per_second, status.throughput.environment_steps
+    yield 3, "throughput", f"{rate:,.0f} steps/s, {steps:,} in all"
+    resent = f", {plural(waste.resent_batches, 'batch', 'batches')} sent again" if waste.resent_batches else ""
+    yield 4, "waste", f"{waste.share:.1%}, {plural(waste.reissued, 'job')} issued again{resent}"
+    if status.classes.total:
+        yield 4 if status.classes.mixed else 7, "hosts", status.classes.description
+    if status.expires is not None:
+        left = datetime.fromtimestamp(status.expires, UTC) - datetime.now(UTC)
+        yield 0 if left < EXPIRY_WARNING else 8, "join file", f"the coordinator's: {describe_time_left(left)}"
+    if sum(status.dropped.values()):
+        yield 8, "dropped messages", ", ".join(f"{count} {why}" for why, count in status.dropped.items())
+
+
+def _fit_facts(facts: Sequence[tuple[int, str, str]], width: int, lines: int) -> list[Text]:
+    """Those that are needed most, as many as have room."""
+    for count in range(len(facts), 0, -1):
+        kept = sorted(facts, key=lambda each: each[0])[:count]
+        drawn = _fact_lines([each for each in facts if each in kept], width)
+        if len(drawn) <= lines:
+            return drawn
+    return drawn
+
+
+def _fact_lines(facts: Sequence[tuple[int, str, str]], width: int) -> list[Text]:
+    """Names beside values, in two columns where there is room."""
+    half = (width - 2) // 2
+    if width < TWO_COLUMN_WIDTH:
+        return [line for each in facts for line in _fact(each, width)]
+    found = []
+    for left, right in zip_longest(facts[::2], facts[1::2]):
+        cells = _fact(left, half), _fact(right, half) if right else []
+        for one, other in zip_longest(*cells, fillvalue=Text()):
+            one.pad_right(half + 2 - one.cell_len)
+            found.append(one + other)
+    return found
+
+
+def _fact(each: tuple[int, str, str], width: int) -> list[Text]:
+    _, name, value = each
+    lines = _wrap(printable(value), max(width - LABEL_WIDTH, 1)) or [""]
+    return [
+        Text.assemble(((name if row == 0 else "").ljust(LABEL_WIDTH), "dim"), line) for row, line in enumerate(lines)
+    ]
+
+
+def _describe_generation(last: StoredGeneration) -> str:
+    return f"{last.mean:.1f} ± {last.std:.1f}  ({last.worst:.0f} to {last.best:.0f})"
+
+
+def _describe_optimiser(settings: RunSettings) -> str:
+    return settings.covariance if settings.optimiser == "cma" else settings.optimiser
+
+
+def _describe_evaluation(each: StoredEvaluation | StoredConfirmation | None) -> str:
+    if each is None:
+        return "-"
+    seeds = plural(each.episodes, "fresh seed" if isinstance(each, StoredConfirmation) else "seed")
+    return f"{format_mean(each)} on {seeds} (generation {each.generation})"
+
+
+def _describe_reported(status: Status) -> str:
+    if status.confirmed is not None or status.best is None:
+        return _describe_evaluation(status.confirmed)
+    return f"{_describe_evaluation(status.best)}, provisional"
+
+
+def _describe_failure(failure: FailureStatus) -> str:
+    worker, error = next(iter(failure.errors.items()), ("a worker", "no reason was given"))
+    return f"candidate {failure.candidate} failed on {worker}: {error}; another worker will try"
+
+
+def _progress_lines(status: Status, width: int) -> Iterator[Text]:
+    """What goes on beside the generation."""
+    parts = {"evaluation": status.evaluating, "confirmation": status.confirming, "kept rollouts": status.collecting}
+    for label, part in parts.items():
+        if part.episodes:
+            share = part.episodes_done / part.episodes
+            told = f" {part.episodes_done}/{part.episodes} episodes"
+            drawn = share_bar(share, max(min(BAR, width - LABEL_WIDTH - len(told)), 0))
+            yield Text.assemble((label.ljust(LABEL_WIDTH), "dim"), (drawn, "cyan"), told)
+
+
+def _open_population(status: Status) -> Population | None:
+    """The candidates to show: once a run is over, those of the generation that was closed last."""
+    population = status.last_population if status.is_over else status.population
+    return population if population is not None and population.done else None
+
+
+def _candidate_lines(status: Status, population: Population, width: int, lines: int) -> list[Text]:
+    """A line about them, and their cells."""
+    found = [each for each in population.candidates if each.fitness is not None]
+    episodes: GenerationStatus | EpisodeProgress = status.generation
+    done, wanted = episodes.episodes_done, episodes.episodes
+    if population.generation != status.generation.number:
+        done, wanted = sum(population.done), sum(population.wanted)
+    told = [f"{done:,}/{wanted:,} episodes"]
+    if found:
+        values = [each.fitness or 0.0 for each in found]
+        told.append(f"so far {min(values):.0f} to {max(values):.0f}")
+    if population.total > len(population.done):
+        told.append(f"the first {len(population.done)} of {population.total} candidates")
+    caption = f"generation {population.generation}".ljust(LABEL_WIDTH) + ", ".join(told)
+    return [Text(caption[:width], style="dim"), *candidate_grid(population, width, lines - 1)]
+
+
+def _curve_lines(
+    history: Sequence[StoredGeneration], width: int, lines: int, stage: StageStatus | None = None
+) -> list[Text]:
+    """The mean fitness of all generations: a line of bars, or, with more lines, a plot under a caption.
+
+    Where there are more than columns a bar is the mean of several. Those before the open generation's stage are dim:
+    their fitness may be of another kind.
+    """
+    caption = "mean fitness by generation"
+    margin = max(len(f"{each.mean:.0f}") for each in history) + 1
+    room = width - margin - (len(caption) + 1 + margin if lines == 1 else 0)
+    means = _downsample([each.mean for each in history], max(room, 1))
+    low, high = f"{min(means):.0f}", f"{max(means):.0f}"
+    since = 0 if stage is None else stage.since
+    earlier = round(sum(each.number < since for each in history) / len(history) * len(means))  # bars
+    if lines == 1:
+        drawn = Text.assemble(
+            (f"{caption} ", "dim"), f"{low} ", *_colour_bars(bar_chart(means, 1)[0], earlier), f" {high}"
+        )
+        return [drawn]
+    wide = max(1, room // len(means))
+    rows = bar_chart([mean for mean in means for _ in range(wide)], lines - 1)
+    marks = [high] if len(rows) == 1 else [high, *[""] * (len(rows) - 2), low]
+    plot = [Text.assemble((f"{mark:>{margin - 1}} ", "dim"), *_colour_bars(row, earlier * wide))
+            for mark, row in zip(marks, rows, strict=True)]  # fmt: skip
+    each = "" if len(means) == len(history) else f", {round(len(history) / len(means))} to a bar"
+    begun = f", stage {stage.number} since {since}" if stage is not None and earlier else ""
+    return [Text(f"{caption}, {history[0].number} to {history[-1].number}{each}{begun}"[:width], style="dim"), *plot]
+
+
+def _colour_bars(row: str, earlier: int) -> tuple[tuple[str, str], tuple[str, str]]:
+    return (row[:earlier], "dim green"), (row[earlier:], "green")
+
+
+def _downsample(values: Sequence[float], most: int) -> list[float]:
+    """At most so many: the means of neighbours, as equally many of them as can be."""
+    count = min(len(values), most)
+    edges = [len(values) * each // count for each in range(count + 1)]
+    return [sum(each / (last - first) for each in values[first:last]) for first, last in pairwise(edges)]
+
+
+def _workers_block(status: Status, width: int, worker_flags: str) -> Block:
+    if status.worker_list:
+        roster = WorkerTable(status.worker_list, status.workers.known)
+        most = roster.height(width)
+        return Block(6, min(3, most), min(8, most), most, lambda given: roster.lines(width, given))
+    said = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
+    task = status.settings.task.task
+    own = f" --task {task}" if is_unregistered(task) else ""
+    none = "no worker is there" if status.throughput.environment_steps else "no workers yet"
+    said = said or [f"{none}; start one with", f"dreamfleet worker --run {status.run} {worker_flags}{own}"]
+    lines = [Text(part, style="yellow") for each in said for part in _wrap(printable(each), width)]
+    return Block(6, min(3, len(lines)), len(lines), len(lines), lambda given: lines[:given])

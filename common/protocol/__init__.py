@@ -1,0 +1,1 @@
+"""What travels over Zenoh: keys, messages, their encoding and bounds."""

@@ -1,0 +1,57 @@
+"""Pictures of live frames: made small for the wire, and looked at before they are believed."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.protocol.messages import MAX_PICTURE_SIDE, ViewFrame
+from dreamfleet.common.serialization.validation import MalformedError
+
+MAX_PACKED = 32 * 1024  # bytes: the rest of a frame has room beside it
+ZLIB_LEVEL = 1  # of zlib's levels: a picture that a model sees becomes a quarter within 0.1 ms
+Picture = NDArray[np.uint8]
+
+
+def pack_picture(picture: Picture) -> tuple[int, int, bytes]:
+    """Height, width and deflated bytes of `(height, width, 3)`, made smaller by whole factors until it fits."""
+    factor = -(-max(picture.shape[:2]) // MAX_PICTURE_SIDE)
+    while True:
+        small = _downsample(picture, factor) if factor > 1 else picture
+        data = zlib.compress(small.tobytes(), ZLIB_LEVEL)
+        if len(data) <= MAX_PACKED:
+            return small.shape[0], small.shape[1], data
+        factor += 1
+
+
+def unpack_picture(frame: ViewFrame) -> Picture | None:
+    """The picture `(height, width, 3)`, `None` if there is none; `MalformedError` for bytes that are not of it."""
+    if not frame.picture:
+        return None
+    size = frame.height * frame.width * 3
+    data = _inflate(frame.picture, size) if frame.packed else frame.picture
+    if len(data) != size:
+        raise MalformedError("wrong length")
+    return np.frombuffer(data, np.uint8).reshape(frame.height, frame.width, 3)
+
+
+def _downsample(picture: Picture, factor: int) -> Picture:
+    """Each pixel the mean of `factor x factor`; a side that is no multiple loses its last pixels."""
+    height, width = (max(1, side // factor) for side in picture.shape[:2])
+    rows, columns = min(factor, picture.shape[0]), min(factor, picture.shape[1])
+    total = np.zeros((height, width, 3), np.uint32)
+    for row in range(rows):
+        for column in range(columns):
+            total += picture[row : height * rows : rows, column : width * columns : columns]
+    mean: Picture = (total // (rows * columns)).astype(np.uint8)
+    return mean
+
+
+def _inflate(data: bytes, most: int) -> bytes:
+    """No more than `most` bytes and one are ever made, whatever the data would become."""
+    try:
+        return zlib.decompressobj().decompress(data, most + 1)
+    except zlib.error as error:
+        raise MalformedError("not deflated") from error

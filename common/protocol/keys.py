@@ -1,0 +1,139 @@
+"""Key expressions of protocol version 2, and the names that may stand in them."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import socket
+
+from dreamfleet.common.errors import UsageError
+
+PROTOCOL_VERSION = 2
+ROOT = "dreamfleet"
+_PREFIX = f"{ROOT}/v{PROTOCOL_VERSION}"
+_RUN = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
+_WORKER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
+_LIFE = re.compile(r"[0-9a-f]{8}")
+
+
+def check_run_name(name: str) -> str:
+    """Return `name` if it may name a run, else raise `UsageError`."""
+    if not _RUN.fullmatch(name):
+        raise UsageError(
+            f"{name!r} cannot name a run: use 1 to 63 of a-z, 0-9 and '-', and begin with a letter or a digit"
+        )
+    return name
+
+
+def check_worker_name(name: str) -> str:
+    """Return `name` if it may name a worker, else raise `UsageError`."""
+    if not _WORKER_NAME.fullmatch(name):
+        raise UsageError(
+            f"{name!r} cannot name a worker: use 1 to 63 of A-Z, a-z, 0-9, '.', '_' and '-', and begin with a letter "
+            "or a digit"
+        )
+    return name
+
+
+def is_worker_identity(identity: str) -> bool:
+    """Whether `identity` has the form `<name>/<life>`."""
+    name, _, life = identity.partition("/")
+    return bool(_WORKER_NAME.fullmatch(name) and _LIFE.fullmatch(life))
+
+
+def new_worker_identity(name: str | None = None) -> str:
+    """Identity of a worker process: a name and 8 random hex digits of this life.
+
+    Without a name it is the host's, in lower case and without what no key may hold; `UsageError` for a name that cannot
+    be kept as it is.
+    """
+    if name is not None:
+        return f"{check_worker_name(name)}/{secrets.token_hex(4)}"
+    clean = re.sub(r"[^a-z0-9.-]+", "-", socket.gethostname().lower()).strip("-.")[:63] or "worker"
+    return f"{clean}/{secrets.token_hex(4)}"
+
+
+def hello(run: str) -> str:
+    """Where a worker asks to join; frozen for ever, outside the version. `*` asks every live run."""
+    return f"{ROOT}/hello/{run}"
+
+
+def secured_hello(run: str, worker: str) -> str:
+    """Where a worker asks to join a secured run, under its own name, to which the router holds it."""
+    return f"{ROOT}/hello/{run}/{worker}"
+
+
+def job(run: str, worker: str) -> str:
+    """Coordinator to one worker: numbered batches."""
+    return f"{_PREFIX}/{run}/job/{worker}"
+
+
+def result(run: str, worker: str) -> str:
+    """One worker to the coordinator: finished jobs."""
+    return f"{_PREFIX}/{run}/result/{worker}"
+
+
+def beat(run: str, worker: str) -> str:
+    """One worker to the coordinator: what it holds."""
+    return f"{_PREFIX}/{run}/beat/{worker}"
+
+
+def live_worker(run: str, worker: str) -> str:
+    """Liveliness token of a worker."""
+    return f"{_PREFIX}/{run}/live/worker/{worker}"
+
+
+def live_coordinator(run: str, nonce: str) -> str:
+    """Liveliness token of a coordinator; the nonce makes a second one visible."""
+    return f"{_PREFIX}/{run}/live/coordinator/{nonce}"
+
+
+def claim(run: str, nonce: str) -> str:
+    """Where coordinators of one name ask each other who they are."""
+    return f"{_PREFIX}/{run}/claim/{nonce}"
+
+
+def status(run: str, part: str = "") -> str:
+    """Read-only JSON for people and tools; `part` is one of `dreamfleet.common.monitoring.status.PARTS`."""
+    return f"{_PREFIX}/{run}/status/{part}" if part else f"{_PREFIX}/{run}/status"
+
+
+def control(run: str, verb: str) -> str:
+    """Where pause, resume, drain and stop are asked for."""
+    return f"{_PREFIX}/{run}/control/{verb}"
+
+
+def bundle(run: str, sha256: str) -> str:
+    """The frozen world model, in parts: parameters `offset` and `length`, in bytes."""
+    return f"{_PREFIX}/{run}/bundle/{sha256}"
+
+
+def upload(run: str, worker: str) -> str:
+    """One worker to the coordinator: what a job made that is larger than a result."""
+    return f"{_PREFIX}/{run}/upload/{worker}"
+
+
+def event_generation(run: str) -> str:
+    """Coordinator to anyone, as each generation ends."""
+    return f"{_PREFIX}/{run}/event/generation"
+
+
+def event_status(run: str) -> str:
+    """Coordinator to anyone, as it leaves: the last status."""
+    return f"{_PREFIX}/{run}/event/status"
+
+
+def view(run: str, worker: str) -> str:
+    """One worker to anyone: live frames, only while somebody subscribes."""
+    return f"{_PREFIX}/{run}/view/{worker}"
+
+
+def all_workers(kind: str, run: str) -> str:
+    """Every worker's `result`, `beat`, `upload`, `view` or `live/worker` keys of a run."""
+    return f"{_PREFIX}/{run}/{kind}/*/*"
+
+
+def worker_from_key(key: str) -> str:
+    """The identity `<name>/<life>`: the last two chunks of a worker's key."""
+    name, life = key.rsplit("/", 2)[-2:]
+    return f"{name}/{life}"

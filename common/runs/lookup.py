@@ -1,0 +1,104 @@
+"""Where what is named on the command line lies: controllers, world models and subspaces; files, runs, or what ships."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache, find_bundle, pretrained_folder
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.subspace import Subspace
+from dreamfleet.common.artifacts.trained_agent import TrainedAgent, is_agent
+from dreamfleet.common.errors import BundleError, ControllerError, JournalError, UsageError
+from dreamfleet.common.files.regular_files import is_file, path_exists
+from dreamfleet.common.host.processes import shell_command
+from dreamfleet.common.runs.run_folder import BUNDLE, CONTROLLER, JOURNAL, open_run
+
+SUBSPACES = "subspaces"  # the folder of those that ship, each named as its world model
+
+
+def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]:
+    """The controller, and the bundle that lies beside it if one does; `ControllerError` for a trained agent."""
+    found, beside = find_agent(name, runs_dir)
+    if isinstance(found, TrainedAgent):
+        raise ControllerError(
+            f"{name} is a trained agent, which `evaluate`, `record` and `reproduce` take: a controller's parameters "
+            "are needed here"
+        )
+    return found, beside
+
+
+def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Path | None]:
+    """Who is to drive, a controller or a trained agent, and the bundle that lies beside it if one does."""
+    path, run, shipped = Path(name), runs_dir / name, pretrained_folder() / f"{name}.npz"
+    if is_file(path):
+        return TrainedAgent.load(path) if is_agent(path) else Controller.load(path), path.parent / BUNDLE
+    if is_file(run / CONTROLLER):
+        return Controller.load(run / CONTROLLER), run / BUNDLE
+    if is_file(shipped):
+        return Controller.load(shipped), None
+    if is_file(run / JOURNAL):
+        raise ControllerError(
+            f"run {name} has no controller yet: it is written as the first generation is closed; an older run's is "
+            f"written once it is continued: {shell_command('coordinator', '--resume', name, '--runs-dir', runs_dir)}"
+        )
+    names = ", ".join(sorted(each.stem for each in pretrained_folder().glob("*.npz"))) or "none"
+    raise ControllerError(f"no controller {name!r}: give a file, a run, or one that ships: {names}")
+
+
+def find_evaluated_mean(name: str, runs_dir: Path, generation: int) -> tuple[Controller, Path]:
+    """The evaluated mean of a run's generation, and the bundle beside it; `JournalError` names those that were."""
+    with open_run(runs_dir, name) as run:
+        evaluated = [each.generation for each in run.evaluations()]
+        if generation not in evaluated:
+            known = ", ".join(map(str, evaluated)) or "none yet"
+            raise JournalError(f"generation {generation} of run {name} was not evaluated; those that were: {known}")
+        spec, shape = run.spec, run.settings.controller
+        told = {"run_uid": run.uid, "generation": generation}
+        mean = Controller(
+            shape, run.evaluated_mean(generation), spec.task, spec.bundle, told, spec.options, spec.version
+        )
+        return mean, run.bundle_path
+
+
+def find_bundle_of(
+    controller: Controller | TrainedAgent, named: str | None, beside: Path | None = None
+) -> Bundle | None:
+    """The world model that a controller was evolved with: as named, beside the controller, cached or shipped.
+
+    `None` for a task that needs none, and for a trained agent.
+    """
+    if isinstance(controller, TrainedAgent) or not controller.bundle:
+        return None
+    if named is not None:
+        bundle = find_bundle(named)
+    elif beside is not None and path_exists(beside):
+        bundle = Bundle.open(beside, controller.bundle)
+    else:
+        found = BundleStore(default_cache()).find(controller.bundle)
+        if found is None:
+            raise BundleError(
+                f"the controller's world model {controller.bundle[:12]}... is not here: name it with --bundle FILE"
+            )
+        bundle = found
+    return bundle.for_controller(controller)
+
+
+def shipped_subspace_name(bundle: str) -> str | None:
+    """The name of the subspace that ships for the world model of this name; `None`: none does."""
+    return bundle if is_file(pretrained_folder() / SUBSPACES / f"{bundle}.npz") else None
+
+
+def find_subspace(name: str) -> Subspace:
+    """The subspace that ships under this name, or the one in a file of it; `UsageError` if there is none."""
+    folder = pretrained_folder() / SUBSPACES
+    shipped = folder / f"{name}.npz"
+    if is_file(shipped):
+        return Subspace.load(shipped)
+    if not path_exists(Path(name)):
+        names = ", ".join(sorted(each.stem for each in folder.glob("*.npz"))) or "none"
+        raise UsageError(
+            f"no subspace {name!r}: name a file of `dreamfleet subspace`, one that ships ({names}), or none for all "
+            "parameters"
+        )
+    return Subspace.load(Path(name))

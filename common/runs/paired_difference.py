@@ -1,0 +1,82 @@
+"""Whether one controller drives better than another, on the seeds that both drove."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from statistics import fmean, stdev
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs.episode_results import EpisodeResults
+
+SIGNIFICANT_ERRORS = 2  # standard errors of many seeds: a smaller difference is none
+MANY_SEEDS = 30  # seeds
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """The mean of one controller's score less another's, seed by seed: what tracks have in common falls out."""
+
+    seeds: int
+    mean: float
+    error: float  # standard error of the mean
+
+    @classmethod
+    def between(cls, one: EpisodeResults, other: EpisodeResults) -> PairedDifference:
+        """Of the `other` less the `one`; `UsageError` where they share fewer than two seeds."""
+        return cls.of(_scores_by_seed(one), _scores_by_seed(other))
+
+    @classmethod
+    def of(cls, one: Mapping[int, float], other: Mapping[int, float]) -> PairedDifference:
+        """As `between`, of scores by seed."""
+        shared = sorted(one.keys() & other.keys())
+        if len(shared) < 2:
+            raise UsageError(
+                f"{len(shared)} seeds are in both, and a difference needs 2: evaluate both with equal --first-seed and "
+                "--episodes"
+            )
+        differences = [other[seed] - one[seed] for seed in shared]
+        return cls(len(shared), fmean(differences), stdev(differences) / math.sqrt(len(shared)))
+
+    @property
+    def critical_value(self) -> float:
+        """Standard errors that are no difference yet: two of many seeds, more of few.
+
+        Student's t of as many degrees of freedom that chance exceeds as rarely as two deviations of a normal
+        distribution, by its expansion in 1 / (seeds - 1) (Abramowitz & Stegun 26.7.5).
+        """
+        if self.seeds >= MANY_SEEDS:
+            return SIGNIFICANT_ERRORS
+        z, freedom = float(SIGNIFICANT_ERRORS), self.seeds - 1
+        first, second = (z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96
+        third = (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384
+        return z + first / freedom + second / freedom**2 + third / freedom**3
+
+    @property
+    def threshold_text(self) -> str:
+        """What a difference must be more than, in words."""
+        return (
+            "two standard errors"
+            if self.seeds >= MANY_SEEDS
+            else f"{self.critical_value:.1f} standard errors of so few seeds"
+        )
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is more than chance gives."""
+        return abs(self.mean) > self.critical_value * self.error
+
+    @property
+    def description(self) -> str:
+        """In words."""
+        if self.mean == self.error == 0:
+            return f"the same scores, to the bit, on {self.seeds} equal seeds"
+        found = f"{self.mean:+.1f} ± {self.error:.1f} (standard error) on {self.seeds} equal seeds"
+        if self.is_significant:
+            return f"{found}: {'better' if self.mean > 0 else 'worse'}"
+        return f"{found}: none, for a difference under {self.threshold_text} is none"
+
+
+def _scores_by_seed(evaluated: EpisodeResults) -> dict[int, float]:
+    return dict(zip(evaluated.seeds, evaluated.scores, strict=True))

@@ -1,0 +1,71 @@
+"""Recorded scores and the same drives again: whether they agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
+from dreamfleet.common.runs.evaluation_report import EvaluationReport
+from dreamfleet.common.runs.paired_difference import PairedDifference
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """A recorded report, and what its controller drove now, on the same seeds or on some of them.
+
+    On a host of the recorded fingerprint every drive must be the same to the bit, and so must a single one anywhere.
+    Elsewhere the mean may differ by two standard errors of the paired difference.
+    """
+
+    recorded: EvaluationReport
+    repeated: EvaluationReport
+
+    @cached_property
+    def pairs(self) -> tuple[tuple[EpisodeResult, EpisodeResult], ...]:
+        """Each drive as it was recorded, and again."""
+        before = {each.seed: each for each in self.recorded.drives}
+        return tuple((before[each.seed], each) for each in self.repeated.drives)
+
+    @property
+    def same_fingerprint(self) -> bool:
+        """Whether equal bits are expected."""
+        return self.recorded.fingerprint == self.repeated.fingerprint
+
+    @property
+    def differing_seeds(self) -> tuple[int, ...]:
+        """The seeds whose score or length is another."""
+        return tuple(one.seed for one, other in self.pairs if (one.score, one.steps) != (other.score, other.steps))
+
+    @property
+    def difference(self) -> PairedDifference:
+        """Of now less the record; `UsageError` of a single seed."""
+        return PairedDifference.between(EpisodeResults(tuple(one for one, _ in self.pairs)), self.repeated.results)
+
+    @property
+    def is_reproduced(self) -> bool:
+        """Whether the record is reproduced."""
+        return not self.differing_seeds or (
+            not self.same_fingerprint and len(self.pairs) > 1 and not self.difference.is_significant
+        )
+
+    @property
+    def description(self) -> str:
+        """In words."""
+        name, count, mean = self.recorded.name, len(self.pairs), self.repeated.results.mean
+        if not self.differing_seeds:
+            host = "" if self.same_fingerprint else ", though this host is of another fingerprint"
+            return f"{name}: reproduced: the same {count} scores to the bit, mean {mean:.1f}{host}"
+        if self.same_fingerprint:
+            seeds = ", ".join(map(str, self.differing_seeds[:5])) + (", ..." if len(self.differing_seeds) > 5 else "")
+            return (
+                f"{name}: NOT reproduced: {len(self.differing_seeds)} of {count} drives differ (seeds {seeds}) on a "
+                f"host of the recorded fingerprint; it was recorded by dreamfleet {self.recorded.version}, here is "
+                f"{self.repeated.version}"
+            )
+        hosts = f"recorded on [{self.recorded.fingerprint}], this host is [{self.repeated.fingerprint}]"
+        if count < 2:
+            was = f"{mean:.1f} instead of {self.pairs[0][0].score:.1f}"
+            return f"{name}: NOT reproduced: {was} on one seed, and a mean of other bits takes 2 seeds or more; {hosts}"
+        verdict = "reproduced" if self.is_reproduced else "NOT reproduced"
+        return f"{name}: {verdict}: mean {mean:.1f}, {self.difference.description}; {hosts}"

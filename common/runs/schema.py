@@ -1,0 +1,73 @@
+"""The journal's tables, and how an older journal becomes today's."""
+
+from __future__ import annotations
+
+import sqlite3
+
+from dreamfleet.common.errors import JournalError
+
+APPLICATION_ID = 0x64666C74  # "dflt": SQLite's own mark of whose file this is
+MIGRATIONS = (
+    """
+    CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
+    CREATE TABLE generation (
+        number INTEGER PRIMARY KEY, seeds TEXT NOT NULL, opened REAL NOT NULL, closed REAL,
+        mean REAL, std REAL, best REAL, worst REAL, sigma REAL NOT NULL, steps INTEGER, seconds REAL
+    ) STRICT;
+    CREATE TABLE candidate (
+        generation INTEGER NOT NULL, number INTEGER NOT NULL, vector BLOB NOT NULL, fitness REAL,
+        PRIMARY KEY (generation, number)
+    ) STRICT, WITHOUT ROWID;
+    CREATE TABLE evaluation (
+        generation INTEGER PRIMARY KEY, vector BLOB NOT NULL, episodes INTEGER NOT NULL, mean REAL, std REAL
+    ) STRICT;
+    CREATE TABLE result (
+        digest BLOB PRIMARY KEY, kind TEXT NOT NULL, generation INTEGER NOT NULL, candidate INTEGER NOT NULL,
+        episode INTEGER NOT NULL, seed INTEGER NOT NULL, fitness REAL NOT NULL, steps INTEGER NOT NULL,
+        seconds REAL NOT NULL, worker TEXT NOT NULL, fingerprint TEXT NOT NULL, incarnation INTEGER NOT NULL
+    ) STRICT, WITHOUT ROWID;
+    CREATE INDEX result_of_candidate ON result (kind, generation, candidate, episode);
+    CREATE TABLE strategy (generation INTEGER PRIMARY KEY, state BLOB NOT NULL) STRICT;
+    """,
+    """
+    CREATE TABLE collection (
+        generation INTEGER PRIMARY KEY, vector BLOB NOT NULL, episodes INTEGER NOT NULL
+    ) STRICT;
+    """,
+    "ALTER TABLE result ADD COLUMN host_class TEXT NOT NULL DEFAULT '';",
+)
+"""Entry i brings a journal from version i to i + 1; only ever appended to."""
+VERSION = len(MIGRATIONS)
+HOST_CLASS_VERSION = 3  # the version since which results name their host's class; empty: its fingerprint tells it
+
+
+# What would run as a table is read: somebody's own query, which need not end.
+_FOREIGN = (
+    "SELECT count(*) FROM sqlite_master WHERE type NOT IN ('table', 'index') "
+    "OR sql LIKE 'CREATE VIRTUAL%' OR sql LIKE '%GENERATED%'"
+)
+
+
+def check_schema(connection: sqlite3.Connection, path: object) -> int:
+    """The schema version of an open journal; `JournalError` if it is foreign or newer than this program."""
+    (mark,) = connection.execute("PRAGMA application_id").fetchone()
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    (foreign,) = connection.execute(_FOREIGN).fetchone()
+    if foreign:
+        raise JournalError(f"{path} holds views, triggers or virtual tables, which no journal of dreamfleet has")
+    if mark != APPLICATION_ID:
+        raise JournalError(f"{path} is not a journal of dreamfleet; nothing was changed")
+    if version > VERSION:
+        raise JournalError(
+            f"{path} has schema version {version}, this program knows {VERSION}: install a newer dreamfleet"
+        )
+    return int(version)
+
+
+def migrate(connection: sqlite3.Connection, version: int) -> None:
+    """Bring an open journal from `version` to today's, each step whole or not at all."""
+    for number, script in enumerate(MIGRATIONS[version:], start=version + 1):
+        connection.executescript(
+            f"BEGIN IMMEDIATE; {script} PRAGMA application_id = {APPLICATION_ID}; "
+            f"PRAGMA user_version = {number}; COMMIT;"
+        )

@@ -1,0 +1,75 @@
+"""Under which terms each generation of a run is asked and scored: its stage, and how warm it dreams.
+
+Terms are a pure function of the run's settings and of what is finished before the generation opens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.stages import BegunStage, Stage, StageTracker
+from dreamfleet.common.runs.temperature_schedule import TemperatureSchedule
+
+
+@dataclass(frozen=True)
+class ScoringParams:
+    """Those of one generation."""
+
+    spec: TaskSpec  # what its candidates are scored in, but for the episodes that a dream's stage drives
+    begun: BegunStage
+
+    @property
+    def stage(self) -> Stage:
+        """Its stage."""
+        return self.begun.stage
+
+    def episode_spec(self, episode: int) -> TaskSpec:
+        """What one episode of a candidate is scored in."""
+        return self.spec.with_overrides(driven=episode < self.stage.driven_episodes or None)
+
+
+class ScheduleState:
+    """The terms of one generation after another; ask for generations in rising order."""
+
+    def __init__(self, settings: RunSettings) -> None:
+        self.stages = StageTracker(settings)
+        self._heat = TemperatureSchedule(settings)
+        self._own = settings.task
+
+    def scoring_params(
+        self, generation: int, history: Sequence[StoredGeneration], finished: Mapping[int, StoredEvaluation]
+    ) -> ScoringParams:
+        """Those of `generation`.
+
+        `history` holds at least the generations before it, from the first on, and `finished` by generation the
+        evaluations that it depends on.
+        """
+        begun = self.stages.advance_to(generation, history, finished)
+        return ScoringParams(
+            begun.stage.spec(self._own).with_overrides(self._heat.temperature_at(generation, finished)), begun
+        )
+
+    def required_evaluation(self, generation: int) -> int:
+        """The evaluation, by its generation, without which `generation`, the next one, cannot open; negative: none."""
+        return max(self._heat.required_evaluation(generation), self.stages.required_evaluation(generation))
+
+    def spec(self, generation: int) -> TaskSpec:
+        """What the mean after `generation` is driven in where it is driven as candidates are, not evaluated."""
+        return self.stages.stage_of(generation).stage.spec(self._own)
+
+
+def scoring_params_at(
+    generation: int, settings: RunSettings, history: Sequence[StoredGeneration],
+    evaluations: Iterable[StoredEvaluation],
+) -> ScoringParams:  # fmt: skip
+    """The terms of one `generation`, as `Agenda` tells them."""
+    return ScheduleState(settings).scoring_params(generation, history, {each.generation: each for each in evaluations})
+
+
+def scoring_params_of(run: RunFolder, generation: int) -> ScoringParams:
+    """The terms of a stored run's generation."""
+    return scoring_params_at(generation, run.settings, run.history(), run.evaluations())

@@ -1,0 +1,1 @@
+"""A secured fleet: join files, certificates, access rules, connection limits."""

@@ -1,0 +1,239 @@
+"""A fleet's own certificate authority: a folder that makes join files, and says which of them count no more.
+
+    ca.pem, ca.key   the authority itself; the key is what everything rests on, and needs to be on no other host
+    secret           where the fleet is joined by passwords: what these follow from
+    issued.json      what was issued and revoked; no secret
+
+Keys are P-256, which whatever speaks TLS understands; certificates are X.509 v3 (RFC 5280).
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import secrets
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, EllipticCurvePrivateKey, generate_private_key
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from dreamfleet.common.errors import AccessError, UsageError
+from dreamfleet.common.files.atomic_write import atomic_write, check_output_path, reporting_write_errors
+from dreamfleet.common.files.folder_lock import folder_lock
+from dreamfleet.common.files.regular_files import read_regular, read_text
+from dreamfleet.common.protocol.keys import check_worker_name
+from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, IssuedJoinFile
+from dreamfleet.common.security.credentials import SEATS, Credentials, derive_password, format_join_file, hash_authority
+
+AUTHORITY_YEARS = 10  # of the authority
+DEFAULT_DAYS = {"coordinator": 90, "router": 90, "operator": 90, "viewer": 90, "worker": 30}  # by default
+CLOCK_SKEW = timedelta(minutes=5)  # clocks differ
+LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")  # of every listener, for its own host
+_CERTIFICATE, _KEY, _SECRET = "ca.pem", "ca.key", "secret"
+_MAX_FILE_BYTES = 64 * 1024
+_HOST = re.compile(r"(\*\.)?[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")
+
+
+class Authority:
+    """An authority in its folder."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open it; `AccessError` if there is none, or it is damaged."""
+        self._folder = folder
+        if not _authority_exists(folder):
+            raise AccessError(
+                f"no authority in {folder}: `dreamfleet access init` makes one, --access-dir names another"
+            )
+        try:
+            self._pem = read_text(folder / _CERTIFICATE, _MAX_FILE_BYTES)
+            self._certificate = x509.load_pem_x509_certificate(self._pem.encode())
+            key = serialization.load_pem_private_key(read_regular(folder / _KEY, _MAX_FILE_BYTES), None)
+            self._secret = read_text(folder / _SECRET, _MAX_FILE_BYTES).strip() if (folder / _SECRET).exists() else ""
+            bytes.fromhex(self._secret)
+        except OSError as error:
+            raise AccessError(f"the authority in {folder} cannot be read: {error.strerror}") from error
+        except (ValueError, TypeError) as error:
+            raise AccessError(f"the authority in {folder} is damaged: restore the folder") from error
+        if not isinstance(key, EllipticCurvePrivateKey):
+            raise AccessError(f"the authority in {folder} has a key of another kind: restore the folder")
+        if key.public_key() != self._certificate.public_key():
+            raise AccessError(f"the authority in {folder} has the key of another certificate: restore the folder")
+        self._key = key
+
+    @classmethod
+    def create(cls, folder: Path, *, passwords: bool = False) -> Authority:
+        """A new one; `UsageError` where there is one."""
+        if _authority_exists(folder):
+            raise UsageError(f"{folder} holds an authority already: name another --access-dir")
+        key, now = generate_private_key(SECP256R1()), datetime.now(UTC)
+        name = _x509_name(f"dreamfleet {secrets.token_hex(4)}")
+        certificate = (
+            _certificate_builder(name, name, key, now, now + timedelta(days=365 * AUTHORITY_YEARS))
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_key_usage(signs_certificates=True), critical=True)
+            .sign(key, hashes.SHA256())
+        )
+        pem = certificate.public_bytes(serialization.Encoding.PEM)
+        with reporting_write_errors(folder, "--access-dir"):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with reporting_write_errors(folder, "--access-dir"), _locked(folder):
+            if _authority_exists(folder):
+                raise UsageError(f"{folder} holds an authority already: name another --access-dir")
+            _write_private(folder / _CERTIFICATE, pem)
+            if passwords:
+                _write_private(folder / _SECRET, secrets.token_hex(32).encode())
+            CertificateLedger(hash_authority(pem.decode()), passwords).save(folder / LEDGER_FILE)
+            _write_private(folder / _KEY, _key_bytes(key))  # at last: it says that there is an authority
+        return cls(folder)
+
+    def issue(
+        self, role: str, name: str, out: Path, *, connect: Sequence[str] = (), hosts: Sequence[str] = (),
+        days: float | None = None, now: datetime | None = None,
+    ) -> Credentials:  # fmt: skip
+        """Write a join file, which must not be there yet; who had the name before keeps its seat, unless revoked."""
+        check_worker_name(name)
+        days, now = DEFAULT_DAYS[role] if days is None else days, now or datetime.now(UTC)
+        expires = (now + timedelta(days=days)).replace(microsecond=0)
+        check_output_path(out)
+        if out.exists():
+            raise UsageError(f"{out} exists: name another --out, or remove it first")
+        with self._locked_ledger() as ledger:
+            seat, shared = _assign_seat(ledger, role, name), {"ca": self._pem, "connect": tuple(connect)}
+            who = Credentials(role, seat, name, min(expires, self._certificate.not_valid_after_utc), **shared)  # type: ignore[arg-type]
+            serial = x509.random_serial_number()
+            if who.can_listen or not ledger.passwords:
+                key = generate_private_key(SECP256R1())
+                pem = self._sign_certificate(who, key, serial, hosts, now)
+                who = replace(who, certificate=pem, key=_key_bytes(key).decode())
+            if ledger.passwords and not self._secret:
+                raise AccessError(f"{self._folder / _SECRET} is missing, of which all passwords follow: restore it")
+            if ledger.passwords:
+                who = (replace(who, secret=self._secret) if who.can_listen
+                       else replace(who, password=derive_password(self._secret, who.identity)))  # fmt: skip
+            entry = IssuedJoinFile(role, seat, name, f"{serial:x}" if who.certificate else "", who.expires.timestamp())
+            replace(ledger, issued=(*ledger.issued, entry)).save(
+                self._folder / LEDGER_FILE
+            )  # before the file: what is out is known
+            with reporting_write_errors(out):
+                _write_private(out, format_join_file(who).encode())
+        return who
+
+    def issued(self) -> tuple[IssuedJoinFile, ...]:
+        """All that was issued, the oldest first."""
+        return CertificateLedger.load(self._folder / LEDGER_FILE).issued
+
+    def revoke(self, name: str, role: str | None = None) -> tuple[IssuedJoinFile, ...]:
+        """Bar the seat that a name has; what that took back. `UsageError` if it is nobody's, or of several roles."""
+        with self._locked_ledger() as ledger:
+            standing = [each for each in ledger.issued if each.revoked is None]
+            found = [each for each in standing if each.name == name and role in (None, each.role)]
+            if not found:
+                raise UsageError(f"nothing is issued to {name!r} that is not revoked: see `dreamfleet access list`")
+            if len(roles := sorted({each.role for each in found})) > 1:
+                raise UsageError(f"{name!r} is the name of {' and '.join(roles)}: say which with --role")
+            ledger.with_revoked(found, time.time()).save(self._folder / LEDGER_FILE)
+            return tuple(found)
+
+    def _sign_certificate(
+        self, who: Credentials, key: EllipticCurvePrivateKey, serial: int, hosts: Sequence[str], now: datetime
+    ) -> str:
+        builder = _certificate_builder(
+            _x509_name(who.identity), self._certificate.subject, key, min(now, who.expires), who.expires, serial
+        )
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
+        if who.can_listen:
+            purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
+            names = [_alternative_name(each) for each in dict.fromkeys((*hosts, *LOCAL_HOSTS))]
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+        certificate = (
+            builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_key_usage(signs_certificates=False), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+            .sign(self._key, hashes.SHA256())
+        )
+        return certificate.public_bytes(serialization.Encoding.PEM).decode()
+
+    @contextmanager
+    def _locked_ledger(self) -> Iterator[CertificateLedger]:
+        """The ledger, which nobody else changes meanwhile."""
+        with _locked(self._folder):
+            ledger = CertificateLedger.load(self._folder / LEDGER_FILE)
+            if ledger.authority != hash_authority(self._pem):
+                raise AccessError(f"{self._folder / LEDGER_FILE} is of another authority: restore the folder")
+            yield ledger
+
+
+def _authority_exists(folder: Path) -> bool:
+    """Whether there is an authority; `AccessError` where that cannot be seen."""
+    try:
+        return (folder / _KEY).exists()
+    except OSError as error:
+        raise AccessError(f"the authority in {folder} cannot be read: {error.strerror}") from error
+
+
+def _locked(folder: Path) -> AbstractContextManager[None]:
+    return folder_lock(folder / "lock", "`dreamfleet access`", "--access-dir")
+
+
+def _assign_seat(ledger: CertificateLedger, role: str, name: str) -> int:
+    """The one that the name has, else the next one; none is given twice."""
+    own = [each for each in ledger.issued if each.role == role]
+    for each in own:
+        if each.name == name and each.revoked is None:
+            return each.seat
+    seat = max((each.seat for each in own), default=0) + 1
+    if seat > SEATS[role]:
+        raise AccessError(
+            f"all {SEATS[role]} seats of role {role} are given: make another authority with `dreamfleet access init`"
+        )
+    return seat
+
+
+def _certificate_builder(
+    subject: x509.Name, issuer: x509.Name, key: EllipticCurvePrivateKey, start: datetime, end: datetime,
+    serial: int | None = None,
+) -> x509.CertificateBuilder:  # fmt: skip
+    return x509.CertificateBuilder(
+        issuer_name=issuer, subject_name=subject, public_key=key.public_key(),
+        serial_number=serial or x509.random_serial_number(), not_valid_before=start - CLOCK_SKEW, not_valid_after=end,
+    )  # fmt: skip
+
+
+def _x509_name(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=True, content_commitment=False, key_encipherment=False, data_encipherment=False,
+        key_agreement=False, key_cert_sign=signs_certificates, crl_sign=signs_certificates, encipher_only=False,
+        decipher_only=False,
+    )  # fmt: skip
+
+
+def _alternative_name(text: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(text.strip("[]")))
+    except ValueError:
+        pass
+    if not _HOST.fullmatch(text):  # of other scripts it is the `xn--` form that is asked for
+        raise UsageError(f"--host {text!r} is no host: give a name or an address, without a port")
+    return x509.DNSName(text)
+
+
+def _key_bytes(key: EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+
+
+def _write_private(path: Path, data: bytes) -> None:
+    with atomic_write(path, private=True) as file:
+        file.write(data)

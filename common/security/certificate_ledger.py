@@ -1,0 +1,130 @@
+"""What an authority issued, and what it took back: a list without secrets, which a coordinator reads as it serves."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from dreamfleet.common.errors import AccessError
+from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.regular_files import read_regular
+from dreamfleet.common.security.credentials import Credentials, identity
+from dreamfleet.common.serialization.validation import MalformedError, from_plain
+
+log = logging.getLogger(__name__)
+LEDGER_FILE = "issued.json"  # in the authority's folder
+MAX_BYTES = 4_000_000
+CHECK_INTERVAL = 2.0  # seconds between looks at whether it changed
+
+
+@dataclass(frozen=True)
+class IssuedJoinFile:
+    """A join file that was made; times in seconds since 1970."""
+
+    role: str
+    seat: int
+    name: str
+    serial: str  # of the certificate, in hex; empty where there is none
+    expires: float
+    revoked: float | None = None
+
+    @property
+    def identity(self) -> str:
+        """As the router knows it."""
+        return identity(self.role, self.seat)
+
+    @property
+    def expires_at(self) -> datetime:
+        """When it expires."""
+        return datetime.fromtimestamp(self.expires, UTC)
+
+
+@dataclass(frozen=True)
+class CertificateLedger:
+    """All that one authority issued, the oldest first."""
+
+    authority: str  # hash of its certificate
+    passwords: bool = False
+    issued: tuple[IssuedJoinFile, ...] = ()
+
+    @classmethod
+    def load(cls, path: Path) -> CertificateLedger:
+        """From its file; `AccessError` if that is damaged."""
+        try:
+            document = json.loads(read_regular(path, MAX_BYTES))
+            return from_plain(cls, document)
+        except OSError as error:
+            raise AccessError(f"{path} cannot be read: {error.strerror}") from error
+        except (ValueError, RecursionError, MalformedError) as error:
+            raise AccessError(f"{path} is damaged: {error}; restore it") from error
+
+    def save(self, path: Path) -> None:
+        """Write it whole; `AccessError` if that fails, and it is as before."""
+        try:
+            with atomic_write(path, private=True) as file:
+                file.write(json.dumps(asdict(self), indent=1).encode())
+        except OSError as error:
+            raise AccessError(f"{path} cannot be written: {error.strerror}; nothing is changed") from error
+
+    def revoked_seats(self) -> frozenset[str]:
+        """The seats that were taken back."""
+        return frozenset(each.identity for each in self.issued if each.revoked is not None)
+
+    def with_revoked(self, wanted: Iterable[IssuedJoinFile], now: float) -> CertificateLedger:
+        """The same where some were taken back."""
+        chosen = set(wanted)
+        return replace(self, issued=tuple(replace(each, revoked=now) if each in chosen else each
+                                          for each in self.issued))  # fmt: skip
+
+
+class RevocationWatcher:
+    """Which seats are barred, by a ledger that may change while this lives; without credentials nothing is."""
+
+    def __init__(self, folder: Path, credentials: Credentials | None) -> None:
+        """`AccessError` where the folder's ledger is damaged or another authority's: what it revoked would stand."""
+        self._path = folder / LEDGER_FILE
+        self._authority = credentials.authority if credentials else None
+        self._next = float("-inf")
+        self._seen: tuple[int, int, int] | None = None
+        self.revoked_seats: frozenset[str] = frozenset()
+        if credentials is None:
+            return
+        try:
+            there = self._path.exists()
+        except OSError as error:  # what it revoked would stand
+            raise AccessError(f"{self._path} cannot be read: {error.strerror}") from error
+        if not there:
+            log.warning("there is no %s: nothing is revoked (--access-dir)", self._path)
+        else:
+            self._reload(time.monotonic())
+
+    def reload_if_changed(self, now: float) -> None:
+        """Read it again if it changed; what cannot be read leaves what is known."""
+        if self._authority is None or now < self._next:
+            return
+        try:
+            self._reload(now)
+        except AccessError as error:
+            log.warning("%s; what was revoked until now stays so", error)
+
+    def _reload(self, now: float) -> None:
+        self._next = now + CHECK_INTERVAL
+        try:
+            found = self._path.stat()
+        except OSError:  # gone
+            return
+        seen = found.st_ino, found.st_mtime_ns, found.st_size
+        if seen == self._seen:
+            return
+        self._seen = seen
+        ledger = CertificateLedger.load(self._path)
+        if ledger.authority != self._authority:
+            raise AccessError(f"{self._path} is of another authority than the join file: name its own --access-dir")
+        for each in sorted(ledger.revoked_seats() - self.revoked_seats):
+            log.warning("%s is revoked: nothing that it says counts", each)
+        self.revoked_seats = ledger.revoked_seats()

@@ -1,0 +1,64 @@
+"""Why a router does not let somebody in, in words: Zenoh says only that nobody could be reached."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from collections.abc import Iterable
+
+from dreamfleet.common.security.credentials import Credentials
+
+PATIENCE = 2.0  # seconds
+
+
+def diagnose_connection(endpoints: Iterable[str], credentials: Credentials | None) -> str | None:
+    """What is wrong at the first endpoint where somebody listens who did not let this side in; `None` if unknown."""
+    for endpoint in endpoints:
+        host, _, port = endpoint.partition("/")[2].rpartition(":")
+        try:
+            link = socket.create_connection((host.strip("[]"), int(port)), PATIENCE)
+        except (OSError, ValueError):  # a name that no host can have
+            continue
+        with link:
+            if credentials is not None:
+                why = _diagnose_tls(link, host, credentials)
+                return f"{endpoint} lets {credentials.identity} ({credentials.name}) not in: {why}"
+            if _speaks_tls(link):
+                return (
+                    f"{endpoint} speaks TLS: who joins its fleet has a join file; have one issued (`dreamfleet access "
+                    "issue`), and give --join FILE, which says where to connect, for --connect"
+                )
+    return None
+
+
+def _speaks_tls(link: socket.socket) -> bool:
+    """Whether the other side is a TLS server, whoever's."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    try:
+        with context.wrap_socket(link):
+            return True
+    except (OSError, ValueError):
+        return False
+
+
+def _diagnose_tls(link: socket.socket, host: str, credentials: Credentials) -> str:
+    try:
+        context = ssl.create_default_context(cadata=credentials.ca)
+    except (OSError, ValueError, TypeError):
+        return "this join file is damaged: have another issued"
+    try:
+        with context.wrap_socket(link, server_hostname=host.strip("[]")):
+            return (
+                "it is of this fleet, and refuses this join file; it may be of another authority, expired or revoked: "
+                "have another issued"
+            )
+    except ssl.SSLCertVerificationError as error:
+        return (
+            f"its certificate is not good here ({error.verify_message.rstrip('.')}): it is another fleet's, has "
+            "expired, or was issued without --host for this name; have the coordinator's join file issued again"
+        )
+    except TimeoutError:  # an unsecured router waits for the rest of what it takes for a message
+        return "it answers nothing to TLS: its coordinator was started without --join, or it is too busy for now"
+    except (OSError, ValueError):
+        return "it speaks no TLS: its coordinator was started without --join, or another program has the port"

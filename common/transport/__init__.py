@@ -1,0 +1,1 @@
+"""Zenoh sessions, endpoints, queries and the router."""

@@ -1,0 +1,37 @@
+"""A router of its own, for coordinators and workers that cannot reach each other. It decides and keeps nothing."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from contextlib import closing
+from threading import Event
+
+import zenoh
+
+from dreamfleet.common.transport.network import Network
+from dreamfleet.common.transport.session import open_session
+
+log = logging.getLogger("dreamfleet.router")
+SUMMARY_INTERVAL = 60.0  # seconds from one line about the sessions to the next
+
+
+def run_router(network: Network, stopped: Event) -> None:
+    """Pass messages on between whoever connects, until `stopped`; `ConnectionFailedError` if it cannot listen.
+
+    Other routers in `network.connect` may start later, end and come back.
+    """
+    with closing(open_session(network, timeout=None)) as session:
+        others = f"; linked to {', '.join(network.connect)} whenever it is there" if network.connect else ""
+        log.info("listening on %s%s", ", ".join(network.listen), others,
+                 extra={"facts": {"event": "begin", "listen": network.listen, "connect": network.connect}})  # fmt: skip
+        while not stopped.wait(SUMMARY_INTERVAL):
+            _log_sessions(session)
+        _log_sessions(session)
+
+
+def _log_sessions(session: zenoh.Session) -> None:
+    found = Counter(str(each.whatami) for each in session.info.transports())
+    facts = {"event": "sessions", "clients": found["client"], "routers": found["router"]}
+    log.info("%d sessions: %d clients, %d routers", found.total(), found["client"], found["router"],
+             extra={"facts": facts})  # fmt: skip

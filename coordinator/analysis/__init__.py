@@ -1,0 +1,1 @@
+"""Finished and live runs compared, plotted, exported and cited."""

@@ -1,0 +1,114 @@
+"""A run's receipt in words, as a paper or a report cites it: what was computed with what, and how to have it again."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from typing import Any
+
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.monitoring.eta import format_duration
+from dreamfleet.common.printable import plural
+from dreamfleet.common.runs.records import RunSettings, best_evaluation, describe_score
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
+from dreamfleet.common.runs.seeds import TRAINING_FIRST
+from dreamfleet.common.runs.stages import begun_stages, describe_stages
+from dreamfleet.common.serialization.optional_fields import to_dict
+
+
+def citation_facts(run: RunFolder) -> dict[str, Any]:
+    """The receipt with what it is of, as plain values; `ControllerError` where the run reports no controller yet."""
+    controller = Controller.load(run.controller_path)
+    receipt, settings = read_run_provenance(controller), read_run_settings(controller)
+    return {
+        "run": run.name, "run_uid": run.uid, "created": run.created, "ended": run.ended,
+        "ended_at": run.ended_at, "lasted_seconds": run.duration_seconds,
+        "controller": controller.sha256, "bundle": settings.task.bundle or None, "score": _score(run),
+        "settings": to_dict(settings), "receipt": to_dict(receipt), "commands": _commands(run),
+    }  # fmt: skip
+
+
+def format_markdown(run: RunFolder) -> str:
+    """The same for people: a list in Markdown, the commands, and an entry for BibTeX."""
+    controller = Controller.load(run.controller_path)
+    receipt, settings = read_run_provenance(controller), read_run_settings(controller)
+    lines = [
+        f"# Run {run.name}",
+        "",
+        *(f"- {name}: {value}" for name, value in _rows(run, controller, receipt, settings)),
+    ]
+    commands = [f"{command}   # {why}" for why, command in _commands(run).items()]
+    return "\n".join(
+        [*lines, "", "```sh", *commands, "```", "", "```bibtex", *_bibtex(run, controller, receipt), "```"]
+    )
+
+
+def _rows(
+    run: RunFolder, controller: Controller, receipt: RunProvenance, settings: RunSettings
+) -> Iterator[tuple[str, str]]:
+    spec = settings.task
+    at = (
+        ""
+        if run.duration_seconds is None
+        else f" at {run.ended_at}, {format_duration(run.duration_seconds)} after it began"
+    )
+    yield "run", f"`{run.uid}`, begun {run.created}, {f'ended after {run.ended}{at}' if run.ended else 'open'}"
+    yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
+    yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
+    yield "score", _score(run)
+    warm = "" if spec.temperature is None else f", temperature {spec.temperature:g}"
+    generations = plural(receipt.generations, "generation")
+    if settings.stages:  # each has a horizon, a population and more of its own
+        begun = begun_stages(settings, run.history(), run.evaluations())
+        yield "task", f"{spec.task}{warm}, version {spec.version}"
+        yield "search", f"{settings.optimiser}, {settings.covariance}, {generations}"
+        yield from describe_stages(settings, begun).items()
+    else:
+        yield "task", f"{spec.task}, {spec.horizon} steps{warm}, version {spec.version}"
+        size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
+        yield "search", f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
+    yield "spent", receipt.total.description
+    yield "seed", f"{settings.seed}; training seeds follow from it, from {TRAINING_FIRST} up"
+    for what, (first, count) in (receipt.seeds or {}).items():
+        yield f"seeds of the {what}", f"{first} to {first + count - 1}"
+    if receipt.start is not None:
+        yield "begun at", f"{receipt.start.source}, SHA-256 `{receipt.start.sha256}`"
+    if settings.subspace:
+        yield "subspace", f"SHA-256 `{settings.subspace}`"
+    if receipt.classes is not None:
+        yield "hosts", receipt.classes.description
+        yield from ((f"class {name}", hosts) for name, hosts in receipt.classes.rows)
+    elif receipt.fingerprint is not None:
+        yield "hosts", f"`{receipt.fingerprint}`" + (", and others: its last bits are its own" if receipt.mixed else "")
+    if receipt.versions is not None:
+        yield "coordinator", ", ".join(f"{name} {version}" for name, version in receipt.versions.items())
+
+
+def _score(run: RunFolder) -> str:
+    return describe_score(run.confirmation() or best_evaluation(run.evaluations()))
+
+
+def _commands(run: RunFolder) -> dict[str, str]:
+    """What checks the run, by what it shows."""
+    last = max((each.number for each in run.history()), default=0)
+    beside, controller = ("--runs-dir", str(run.path.parent)), str(run.controller_path)
+    words = {
+        "one candidate's fitness again, to the bit, on any host of its class": (
+            "replay", run.name, "--candidate", f"{last}/0", *beside,
+        ),
+        "the whole run again, to the bit": ("repeat", run.name, *beside),
+        "its score on unseen seeds": ("evaluate", "--controller", controller, "--episodes", "100"),
+    }  # fmt: skip
+    return {why: shlex.join(("dreamfleet", *each)) for why, each in words.items()}
+
+
+def _bibtex(run: RunFolder, controller: Controller, receipt: RunProvenance) -> list[str]:
+    version = (receipt.versions or {}).get("dreamfleet", "")
+    return [
+        f"@misc{{dreamfleet-{run.name},",
+        f"  title = {{Run {run.name} of dreamfleet {version}}},",
+        f"  year = {{{run.created[:4]}}},",
+        f"  note = {{run {run.uid}, controller SHA-256 {controller.sha256}, {receipt.generations} generations}}",
+        "}",
+    ]

@@ -1,0 +1,115 @@
+"""Runs beside each other: settings that differ, scores for equal spending, and what their differences are worth.
+
+Every run evaluates its means on the same validation tracks, and confirms what it reports on the same fresh ones. So
+two runs' scores share what is luck with tracks, their standard errors say little about a difference, and it is told
+track by track (`common/runs/paired_difference.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.paired_difference import PairedDifference
+from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, expand_task_options
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.coordinator.analysis.learning import LearningCurve, Point
+from dreamfleet.coordinator.settings.start import total_effort
+
+Scores = dict[int, float]  # by validation seed
+
+
+@dataclass(frozen=True)
+class EvaluatedMean:
+    """An evaluated mean: its generation, what had been spent by then, and its scores."""
+
+    generation: int
+    point: Point
+    scores: Scores
+
+
+@dataclass(frozen=True)
+class ComparedRun:
+    """One run, as it is compared; its looks oldest first."""
+
+    name: str
+    settings: RunSettings
+    world: str | None  # that its evaluations drive; `None` where nothing was evaluated
+    total: Effort
+    evaluated_means: tuple[EvaluatedMean, ...]
+    confirmed: StoredConfirmation | None
+    confirmed_scores: Scores
+
+    @classmethod
+    def of(cls, run: RunFolder) -> ComparedRun:
+        """From its journal."""
+        with run.read_transaction():
+            return cls._read(run)
+
+    @classmethod
+    def _read(cls, run: RunFolder) -> ComparedRun:
+        evaluations, confirmed = run.evaluations(), run.confirmation()
+        curve = LearningCurve.of(run) if evaluations else None
+        evaluated_means = tuple(
+            EvaluatedMean(each.generation, point, run.scores(each.generation))
+            for each, point in zip(evaluations, curve.points if curve else (), strict=True)
+        )
+        scores = {} if confirmed is None else run.scores(confirmed.generation, confirming=True)
+        world = None if curve is None else curve.world
+        return cls(run.name, run.settings, world, total_effort(run), evaluated_means, confirmed, scores)
+
+    def last_within_budget(self, spent: Callable[[Effort], float], most: float) -> EvaluatedMean | None:
+        """The last look that had spent no more; whether it was a lucky one played no part in that choice."""
+        return next((each for each in reversed(self.evaluated_means) if spent(each.point.effort) <= most), None)
+
+
+@dataclass(frozen=True)
+class EqualBudget:
+    """The looks of every run once each had spent so much, in the order of the runs."""
+
+    what: str
+    spent: float
+    evaluated_means: tuple[EvaluatedMean | None, ...]
+
+
+BUDGETS: dict[str, Callable[[Effort], float]] = {
+    "steps in reality": lambda effort: effort.steps,
+    "core-hours": lambda effort: effort.core_hours,
+}
+
+
+def differing_settings(sides: Sequence[ComparedRun]) -> dict[str, list[Any]]:
+    """The settings in which the runs differ: of each one a value a run, `None` where it has its default."""
+    flat = [_flatten(expand_task_options(to_dict(each.settings))) for each in sides]
+    names = sorted({name for each in flat for name in each})
+    rows = {name: [each.get(name) for each in flat] for name in names}
+    return {name: values for name, values in rows.items() if any(value != values[0] for value in values)}
+
+
+def at_equal_budget(sides: Sequence[ComparedRun]) -> list[EqualBudget]:
+    """What each run had learnt once all had spent as much as the thriftiest one had at its last look."""
+    found = []
+    for what, spent in BUDGETS.items():
+        if all(each.evaluated_means for each in sides):
+            most = min(spent(each.evaluated_means[-1].point.effort) for each in sides)
+            found.append(EqualBudget(what, most, tuple(each.last_within_budget(spent, most) for each in sides)))
+    return found
+
+
+def difference(one: Scores, other: Scores) -> PairedDifference | str:
+    """Of the `other` less the `one`, or why there is none."""
+    try:
+        return PairedDifference.of(one, other)
+    except UsageError:
+        return "no difference can be told: fewer than 2 seeds are in both"
+
+
+def _flatten(plain: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in plain.items():
+        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat

@@ -1,0 +1,112 @@
+"""A run's journal as tables, for whatever reads CSV, Parquet or TensorBoard's events."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.errors import MissingExtraError, UsageError
+from dreamfleet.common.files.atomic_write import open_output, reporting_write_errors
+from dreamfleet.common.files.regular_files import is_file, is_folder
+from dreamfleet.common.files.tensorboard import EXTRA, open_event_file
+from dreamfleet.common.runs.records import StoredCandidate, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.run_folder import RunFolder
+
+EVENTS = "events.out.tfevents.*"  # the files that TensorBoard reads
+Row = dict[str, Any]
+TABLES: dict[str, tuple[type[Any], Callable[[RunFolder], Sequence[Any]]]] = {
+    "generations": (StoredGeneration, RunFolder.history),
+    "candidates": (StoredCandidate, RunFolder.candidates),
+    "evaluations": (StoredEvaluation, RunFolder.evaluations),
+    "confirmation": (StoredConfirmation, lambda run: [each] if (each := run.confirmation()) else []),
+}
+JUDGED = ("evaluations", "confirmation")  # which have a standard error
+
+
+def export_csv(run: RunFolder, folder: Path) -> list[Path]:
+    """A file `TABLE.csv` for each table that has a row; what was written."""
+
+    def save(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+        with open_output(path) as file:
+            file.write(text.getvalue().encode())
+
+    return _export_tables(run, folder, "csv", save)
+
+
+def export_parquet(run: RunFolder, folder: Path) -> list[Path]:
+    """A file `TABLE.parquet` for each table that has a row; `MissingExtraError` without pyarrow."""
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(f"Parquet needs the package {error.name!r}: {EXTRA}") from error
+
+    def save(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
+        table = pa.table({name: [row[name] for row in rows] for name in columns})
+        with open_output(path) as file:
+            parquet.write_table(table, file)
+
+    return _export_tables(run, folder, "parquet", save)
+
+
+def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
+    """An event file with curves over generations; `UsageError` where there are events, for they would add up."""
+    if is_folder(folder) and any(folder.glob(EVENTS)):
+        raise UsageError(f"{folder} holds TensorBoard's events already: delete them, or choose another --out")
+    with _remove_on_failure(folder), open_event_file(folder) as events:
+        events.add_text("settings", f"```\n{run.settings.to_json()}\n```")
+        for each in run.history():
+            events.add(each.number, fitness__mean=each.mean, fitness__std=each.std, fitness__best=each.best,
+                       fitness__worst=each.worst, search__sigma=each.sigma, effort__steps=each.steps,
+                       effort__seconds=each.seconds)  # fmt: skip
+        for judged in run.evaluations():
+            events.add(judged.generation, score__evaluated=judged.mean, score__evaluated_error=judged.error)
+        if (confirmed := run.confirmation()) is not None:
+            events.add(confirmed.generation, score__confirmed=confirmed.mean, score__confirmed_error=confirmed.error)
+    return sorted(folder.glob(EVENTS))
+
+
+@contextmanager
+def _remove_on_failure(folder: Path) -> Iterator[None]:
+    """What was begun is no file of events, if it cannot be ended: it would stand in the way of the next attempt."""
+    try:
+        yield
+    except BaseException:
+        for each in folder.glob(EVENTS):
+            each.unlink(missing_ok=True)
+        raise
+
+
+def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
+    """Name, columns and rows of each table that has any."""
+    for name, (kind, read) in TABLES.items():
+        judged = name in JUDGED
+        columns = [each.name for each in fields(kind)] + ["error"] * judged
+        if rows := [asdict(each) | ({"error": each.error} if judged else {}) for each in read(run)]:
+            yield name, columns, rows
+
+
+def _export_tables(
+    run: RunFolder, folder: Path, kind: str, save: Callable[[Path, Sequence[str], Sequence[Row]], None]
+) -> list[Path]:
+    """A file for each table that has a row; one of an earlier export that has none now is gone."""
+    with reporting_write_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, columns, rows in _tables(run):
+        written.append(folder / f"{name}.{kind}")
+        save(written[-1], columns, rows)
+    with reporting_write_errors(folder):
+        for path in (folder / f"{name}.{kind}" for name in TABLES):
+            if path not in written and is_file(path):
+                path.unlink()
+    return written

@@ -1,0 +1,129 @@
+"""Pictures of runs: the fitness of one over its generations, and what several learnt from what they spent."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from dreamfleet.common.files.atomic_write import open_output
+from dreamfleet.common.monitoring.fitness_chart import PLOT_COLOURS, draw_fitness
+from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.common.runs.effort import Effort, format_steps
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
+from dreamfleet.coordinator.analysis.learning import LearningCurve, PublishedScore
+
+TITLE = 90  # characters of a line of it
+KINDS = (".png", ".svg")
+PAPERS_NAME = "Ha & Schmidhuber 2018, their public log (1024 tracks; of its time the end alone is known)"
+REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # names of an SVG's parts are drawn at random otherwise
+
+
+def plot_fitness(run: RunFolder, path: Path) -> None:
+    """Draw one run's fitness over its generations, with its evaluated and its confirmed means."""
+    settings = run.settings
+    stages = begun_stages(settings, run.history(), run.evaluations())
+    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+    handles = draw_fitness(axes, run)
+    size = join_distinct(
+        f"{each.stage.population} candidates x {plural(each.stage.episodes, 'episode')}" for each in stages
+    )
+    dreamt = settings.task.task == DREAM
+    steps = join_distinct(describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt) for each in stages)
+    axes.set_ylabel(f"fitness over {steps}")
+    title = f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}"
+    axes.set_title("\n".join(textwrap.wrap(title, TITLE)), fontsize=11)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    _save(figure, path)
+
+
+def plot_learning(curves: Sequence[LearningCurve], marks: Sequence[PublishedScore], path: Path) -> None:
+    """Draw evaluated scores over environment steps and over core-hours; `marks` are published ones.
+
+    Environment steps are all that were made in reality: those of candidates, kept rollouts, evaluations, and what the
+    run began from. Dreamt ones are told in the legend.
+    """
+    figure, (over_steps, over_hours) = plt.subplots(1, 2, figsize=(11, 5.6), sharey=True, layout="constrained")
+    for curve, colour in zip(curves, PLOT_COLOURS * len(curves), strict=False):
+        _draw_curve(over_steps, curve, colour, lambda effort: effort.steps)
+        _draw_curve(over_hours, curve, colour, lambda effort: effort.core_hours)
+    _draw_marks(over_steps, [(each.steps, each.score) for each in marks])
+    _draw_marks(over_hours, [(each.core_hours, each.score) for each in marks if each.core_hours is not None])
+    over_steps.set(xlabel="environment steps in reality, evaluations included", ylabel=_score_axis(curves))
+    over_hours.set(xlabel="core-hours: time that slots worked on accepted results")
+    for axes in (over_steps, over_hours):
+        _scale(axes)
+        axes.margins(y=0.1)
+        axes.grid(alpha=0.3, which="major")
+    figure.legend(*over_steps.get_legend_handles_labels(), loc="outside lower center", fontsize=9, frameon=False)
+    _save(figure, path)
+
+
+def _scale(axes: Any) -> None:
+    """Logarithmic, with 20 and 50 beside 10 and 100 where there is room for them."""
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    named = FuncFormatter(lambda value, _: f"{value:g}" if value < 1000 else format_steps(round(value)))
+    axes.xaxis.set_major_formatter(named)
+    if high < 100 * low:
+        axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        axes.xaxis.set_minor_formatter(named)
+        axes.tick_params(axis="x", which="minor", length=mpl.rcParams["xtick.major.size"])
+    else:
+        axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Callable[[Effort], float]) -> None:
+    """Evaluations as a line, and as a star the confirmed score, dotted to the evaluation of the same mean."""
+    points, last, reported = curve.points, curve.confirmed, curve.reported
+    axes.errorbar(
+        [spent(each.effort) for each in points],
+        [each.score for each in points],
+        [each.error for each in points],
+        fmt="o-",
+        color=colour,
+        markersize=4,
+        linewidth=1.2,
+        capsize=2,
+        label=f"{curve.name}: {curve.total.description}",
+    )
+    if last is None:
+        return
+    if reported is not None:
+        ends = [spent(reported.effort), spent(last.effort)], [reported.score, last.score]
+        axes.plot(*ends, ":", color=colour, linewidth=1)
+    axes.errorbar(
+        spent(last.effort), last.score, last.error, fmt="*", color=colour, markersize=13, capsize=3,
+        markeredgecolor="black", label=f"{curve.name}, confirmed on fresh seeds: {last.score:.0f}",
+    )  # fmt: skip
+
+
+def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]]) -> None:
+    if not marks:
+        return
+    axes.plot(*zip(*marks, strict=True), "s--", color="black", markersize=5, linewidth=1, label=PAPERS_NAME)
+    for number, (spent, score) in enumerate(marks):  # neighbours on two sides, so that none lies on another
+        place = (0, 7 if number % 2 else -14)
+        axes.annotate(f"{score:g}", (spent, score), place, textcoords="offset points", ha="center", fontsize=9)
+
+
+def _score_axis(curves: Sequence[LearningCurve]) -> str:
+    worlds = ", ".join(sorted({each.world for each in curves}))
+    return f"{worlds}: score of the mean, whole episodes\non validation seeds, ± standard error"
+
+
+def _save(figure: Any, path: Path) -> None:
+    """Whole or not at all, of the kind that its name ends in; equal pictures are equal files."""
+    told = {"Date": None} if path.suffix == ".svg" else None
+    with open_output(path) as file, mpl.rc_context(REPEATABLE):
+        figure.savefig(file, format=path.suffix.removeprefix("."), dpi=120, metadata=told)
+    plt.close(figure)

@@ -1,0 +1,308 @@
+"""Asking live runs how they are: what was heard of each, and one immutable picture of all of them a look."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeVar
+
+from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, HandshakeRejectedError
+from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.monitoring.status import Population, Status, WorkerStatus, read_document, read_status
+from dreamfleet.common.printable import truncate
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.serialization.optional_fields import known
+from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.transport.network import Network
+from dreamfleet.common.transport.session import enqueue_into
+from dreamfleet.coordinator.dashboard.curves import RunData, curves, downsample
+from dreamfleet.coordinator.dashboard.lanes import Lanes
+from dreamfleet.coordinator.dashboard.page_state import RunSnapshot, page_state
+from dreamfleet.coordinator.dashboard.sse import event
+from dreamfleet.coordinator.dashboard.stored_runs import read_quartiles
+
+ANSWER_TIMEOUT = 1.5  # seconds that an answer may take
+PATIENCE = 5.0  # seconds of slow answers after which a run counts as lost; where nobody is there it does at once
+MOST_RUNS = 32  # that are followed
+MOST_ROWS = 100_000  # generations, evaluations, workers of a run that are fetched
+
+T = TypeVar("T")
+UNREADABLE = (MalformedError, LookupError, TypeError, ValueError, ArithmeticError)  # of what another version may say
+
+
+@dataclass(frozen=True)
+class RunEvents:
+    """What viewers of one run get: two server-sent events, ready to be written."""
+
+    page_state: bytes
+    curves: bytes
+    curves_version: tuple[str, int]  # the run's uid and how often its curves were drawn: others are others
+
+
+@dataclass(frozen=True)
+class DashboardSnapshot:
+    """All that is known at one moment."""
+
+    runs: Mapping[str, RunEvents]
+    default_run: str | None  # for whoever names no run
+    absent_event: bytes  # for whom there is none: the event that says so
+    statuses: Sequence[Status] = ()  # of the live ones, with all workers that are known
+
+    def find(self, run: str | None) -> RunEvents | None:
+        """The run of that name, or the chosen one."""
+        return self.runs.get(run or self.default_run or "")
+
+
+class Watcher:
+    """Follows every live run, or one; called by one thread at a time."""
+
+    def __init__(self, network: Network, run: str | None, runs_dir: Path) -> None:
+        self._network = network
+        self._only = None if run is None else keys.check_run_name(run)
+        self._runs_dir = runs_dir
+        self._client: Client | None = None
+        self._final_statuses: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._followed: dict[str, _FollowedRun] = {}
+        self._past_lanes: dict[str, Lanes] = {}  # by a run's uid: what its workers did while somebody looked
+        self._problem = ""  # what the last look could not read, or why it is not let in
+
+    def poll(self) -> DashboardSnapshot:
+        """Ask, and tell. Never raises for what comes over the wire."""
+        self._problem = ""
+        began, answered = time.monotonic(), self._query_statuses()
+        slow = time.monotonic() - began >= ANSWER_TIMEOUT
+        now = time.time()
+        for name, document in answered.items():
+            with suppress(ConnectionFailedError):  # it left between two questions
+                self._update_run(name, document, now)
+        for each in self._followed.values():
+            if each.name not in answered and (not slow or now - each.heard > PATIENCE):
+                each.lost = each.lost or now
+        self._receive_final_statuses(now)
+        self._forget_oldest()
+        return self._snapshot()
+
+    def suspend(self) -> None:
+        """Nobody looks: leave the network, and forget what will be old by the next look."""
+        if self._client is not None:
+            self._client.__exit__(None, None, None)
+            self._client = None
+        self._past_lanes |= {each.uid: each.lanes for each in self._followed.values()}
+        self._past_lanes = dict(list(self._past_lanes.items())[-MOST_RUNS:])
+        self._followed.clear()
+
+    def _query_statuses(self) -> dict[str, dict[str, Any]]:
+        """The answers of live runs by their names."""
+        try:
+            if self._client is None:
+                self._client = Client(self._network)
+                heard = enqueue_into(self._final_statuses, "status", most=MOST_RUNS)
+                self._client.session.declare_subscriber(keys.event_status("*"), heard)
+            found = self._client.statuses(ANSWER_TIMEOUT)
+        except (HandshakeRejectedError, MalformedError) as error:
+            self._problem = str(error)
+            return {}
+        except ConnectionFailedError:
+            return {}
+        named = {str(document.get("run")): document for document in found}
+        return {name: named[name] for name in sorted(named)[:MOST_RUNS] if self._only in (None, name)}
+
+    def _update_run(self, name: str, document: dict[str, Any], now: float) -> None:
+        assert self._client is not None
+        try:
+            status = read_status(document)
+            followed = self._followed.get(name)
+            if followed is None or followed.uid != status.run_uid or followed.is_ahead_of(status):
+                self._followed.pop(name, None)  # so that the newest one stands last
+                followed = self._followed[name] = _FollowedRun(status, self._runs_dir)
+                followed.lanes = self._past_lanes.pop(followed.uid, followed.lanes)
+            followed.update(status, self._client, now)
+        except UNREADABLE as error:
+            self._problem = f"run {name}: {error}"
+
+    def _receive_final_statuses(self, now: float) -> None:
+        with suppress(queue.Empty):
+            while True:
+                _, sample = self._final_statuses.get_nowait()
+                with suppress(MalformedError):
+                    status = read_status(read_document(sample.payload.to_bytes()))
+                    followed = self._followed.get(status.run)
+                    if followed is not None and followed.matches(status):
+                        followed.update_final(status, now)
+
+    def _forget_oldest(self) -> None:
+        """The oldest of those that nobody serves any more, beyond what is kept."""
+        gone = [name for name, each in self._followed.items() if not each.is_live]
+        for name in gone[: max(len(self._followed) - MOST_RUNS, 0)]:
+            del self._followed[name]
+
+    def _snapshot(self) -> DashboardSnapshot:
+        live = [name for name, each in self._followed.items() if each.is_live]
+        events = {}
+        for name, each in self._followed.items():
+            try:
+                events[name] = each.events(sorted(live))
+            except UNREADABLE as error:  # numbers that are none, say
+                self._problem = f"run {name}: {error}"
+        default_run = next(reversed(live or list(self._followed)), None)
+        absent_event = {
+            "link": "absent",
+            "run": "",
+            "live": sorted(live),
+            "address": ", ".join(self._network.connect),
+            "trouble": truncate(self._problem, 1000),
+            "only": self._only or "",
+        }
+        statuses = tuple(self._followed[name].full_status for name in sorted(live) if name in events)
+        return DashboardSnapshot(events, default_run, event("frame", absent_event), statuses)
+
+
+@dataclass
+class _FollowedRun:
+    """One run: what was heard of it so far."""
+
+    status: Status
+    runs_dir: Path
+    heard: float = 0.0  # seconds since 1970
+    lost: float | None = None
+    history: list[StoredGeneration] = field(default_factory=list)
+    evaluations: list[StoredEvaluation] = field(default_factory=list)
+    lanes: Lanes = field(default_factory=Lanes)
+    _workers: Sequence[WorkerStatus] = ()
+    _population: Sequence[Population] = ()
+    _quartiles: dict[int, tuple[float, float]] | None = None  # `None`: its journal does not lie here
+    _rendered_curves: tuple[Any, bytes, int] = (None, b"", 0)  # of what, the event, how often
+
+    def __post_init__(self) -> None:
+        with suppress(DreamfleetError), open_run(self.runs_dir, self.name) as stored:
+            if stored.uid == self.uid:
+                self._quartiles = {}
+
+    @property
+    def name(self) -> str:
+        """The run's."""
+        return self.status.run
+
+    @property
+    def uid(self) -> str:
+        """Of the run that was first heard of under that name."""
+        return self.status.run_uid
+
+    @property
+    def is_live(self) -> bool:
+        """Whether its coordinator answers."""
+        return self.lost is None and not self.status.is_over
+
+    @property
+    def full_status(self) -> Status:
+        """The status with every worker."""
+        return replace(self.status, worker_list=tuple(self._workers))
+
+    def matches(self, final_status: Status) -> bool:
+        """Whether that is its coordinator's, and not of an earlier life whose word came late."""
+        return final_status.run_uid == self.uid and final_status.incarnation >= self.status.incarnation
+
+    def is_ahead_of(self, status: Status) -> bool:
+        """Whether it knows of generations that the run has not: an older copy of it is served now."""
+        return len(self.history) > status.generations
+
+    def update(self, status: Status, client: Client, now: float) -> None:
+        """What it answered, and the rest of what came as a head."""
+        self.status, self.heard, self.lost = status, now, None
+        self._workers, self._population = status.worker_list, (status.population,)
+        self._update_lanes(now)
+        self._fetch_missing_rows(status, client)
+        if status.workers.known > len(status.worker_list):
+            self._workers = list(_fetch_rows(client, "workers", WorkerStatus, self.name))
+            self._update_lanes(now)
+        if status.population.total > len(status.population.done):
+            self._population = client.candidates(self.name, status.generation.number)
+
+    def update_final(self, status: Status, now: float) -> None:
+        """What its coordinator said as it left."""
+        self.status, self.heard, self.lost = status, now, None
+        self._workers, self._population = status.worker_list, (status.population,)
+        self._append_recent(status)
+
+    def events(self, live: list[str]) -> RunEvents:
+        """As viewers get it."""
+        snapshot = RunSnapshot(
+            self.status, self._workers, self.lanes.render(self._workers), self._population, self.heard, self.lost,
+            folder=None if self._quartiles is None else self.runs_dir / self.name,
+        )  # fmt: skip
+        self._render_curves()
+        _, drawing, times = self._rendered_curves
+        return RunEvents(event("frame", {**page_state(snapshot), "live": live}), drawing, (self.uid, times))
+
+    def _update_lanes(self, now: float) -> None:
+        self.lanes.update(self._workers, now)
+
+    def _fetch_missing_rows(self, status: Status, client: Client) -> None:
+        """Closed generations and evaluations that are not known yet."""
+        self._append_recent(status)
+        if len(self.history) < min(status.generations, MOST_ROWS):
+            self._append(_fetch_rows(client, "history", StoredGeneration, self.name, len(self.history)))
+        if len(self.evaluations) != status.evaluations:
+            self._fetch_evaluations(status, client)
+
+    def _append_recent(self, status: Status) -> None:
+        if status.recent and status.recent[0].number <= len(self.history) < MOST_ROWS:
+            self._append(each for each in status.recent if each.number >= len(self.history))
+
+    def _append(self, rows: Iterable[StoredGeneration]) -> None:
+        for each in rows:
+            if each.number != len(self.history):
+                raise MalformedError(f"run {self.name} tells of generation {each.number} after {len(self.history) - 1}")
+            self.history.append(each)
+
+    def _fetch_evaluations(self, status: Status, client: Client) -> None:
+        last = status.evaluation
+        latest = self.evaluations[-1].generation if self.evaluations else -1
+        if last is not None and last.generation > latest and len(self.evaluations) + 1 == status.evaluations:
+            self.evaluations.append(last)
+            return
+        try:
+            found = list(_fetch_rows(client, "evaluations", StoredEvaluation, self.name))
+        except ConnectionFailedError:  # an earlier coordinator: what is seen while somebody looks
+            found = [*self.evaluations, *(each for each in (status.best, last) if each is not None)]
+        self.evaluations = sorted({each.generation: each for each in found}.values(), key=lambda each: each.generation)
+
+    def _render_curves(self) -> None:
+        """The curves, if there is anything new in them."""
+        of = len(self.history), tuple(self.evaluations[-1:]), len(self.evaluations), self.status.confirmed
+        if self._rendered_curves[0] == of:
+            return
+        data = RunData(self.status.settings, self.history, self.evaluations, self.status.confirmed)
+        self._read_quartiles()
+        self._rendered_curves = of, event("curves", curves(data, self._quartiles)), self._rendered_curves[2] + 1
+
+    def _read_quartiles(self) -> None:
+        """From the journal, if it lies here: those that are drawn and not known yet."""
+        read = self._quartiles
+        if read is None:
+            return
+        wanted = [each for each in downsample(self.history) if each.number not in read]
+        try:
+            with open_run(self.runs_dir, self.name) as stored:
+                found = self._read_missing_quartiles(stored, wanted)
+        except DreamfleetError:
+            found = None  # it was moved away
+        self._quartiles = None if found is None else {**read, **found}
+
+    def _read_missing_quartiles(
+        self, stored: RunFolder, wanted: list[StoredGeneration]
+    ) -> Mapping[int, tuple[float, float]] | None:
+        return read_quartiles(stored, self.status.settings, wanted) if stored.uid == self.uid else None
+
+
+def _fetch_rows(client: Client, part: str, kind: type[T], run: str, offset: int = 0) -> Iterator[T]:
+    """The rows of a paged part from `offset` on, as many as anybody wants to see."""
+    rows = islice(client.fetch_rows(part, run, offset), MOST_ROWS - offset)
+    return (from_plain(kind, known(kind, row)) for row in rows)

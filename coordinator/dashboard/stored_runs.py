@@ -1,0 +1,162 @@
+"""Runs on this disk as the page shows them: a list, and one run whole. Only reads journals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.errors import DreamfleetError, JournalError
+from dreamfleet.common.printable import format_setting, plural, printable
+from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.common.runs.effort import START_EFFORT, Effort, parse_start_effort
+from dreamfleet.common.runs.records import (
+    RunSettings,
+    StoredGeneration,
+    best_evaluation,
+    describe_score,
+    expand_task_options,
+)
+from dreamfleet.common.runs.run_folder import RunFolder, open_run, run_paths
+from dreamfleet.common.runs.stages import stages_of
+from dreamfleet.coordinator.dashboard.curves import Quartiles, RunData, cumulative_effort, curves, downsample
+from dreamfleet.coordinator.dashboard.page_state import NONE, Facts, describe_optimiser, format_score, resume_command
+
+COLUMNS = (
+    "run", "created", "begun", "task", "generations", "mean", "best", "confirmed", "best_error", "confirmed_error",
+    "again", "state", "damaged",
+)  # fmt: skip
+LAST = 20  # generations that are listed one by one
+MOST_READ = 256 << 20  # bytes of candidates that are looked at for their quartiles; beyond it takes too long
+
+
+def list_runs(runs_dir: Path) -> list[dict[str, Any]]:
+    """A row for each run, by name; a damaged journal is a row too."""
+    return [_run_row(path) for path in run_paths(runs_dir)]
+
+
+def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
+    """One run; `JournalError` or `UsageError` where there is no such run, or it cannot be read."""
+    with open_run(runs_dir, name) as run, run.read_transaction():
+        settings, history = run.settings, run.history()
+        if [each.number for each in history] != list(range(len(history))):
+            raise JournalError(f"the journal of run {name} is damaged: generations are missing; restore it from a copy")
+        data = RunData(settings, history, run.evaluations(), run.confirmation())
+        start = parse_start_effort(run.fact(START_EFFORT)) or Effort()
+        efforts = run.efforts()
+        spent = cumulative_effort(start, efforts, len(history))
+        total = sum((each.effort for each in efforts), start)
+        reported = data.confirmed or best_evaluation(data.evaluations)
+        return {
+            "run": run.name,
+            "state": printable(run.state),
+            "sentence": printable(f"{run.state}; {describe_score(reported) if reported else 'no mean was evaluated'}"),
+            "again": _resume_command(run),
+            "facts": _facts(run, data, total),
+            "settings": flatten_settings(settings),
+            "world": _world(run),
+            "curves": curves(data, read_quartiles(run, settings, downsample(history)), spent),
+            "generations": [_generation_row(each) for each in history[-LAST:][::-1]],
+        }
+
+
+def read_quartiles(run: RunFolder, settings: RunSettings, drawn: Sequence[StoredGeneration]) -> Quartiles | None:
+    """Those of the generations that are drawn; `None` where there would be too much to read."""
+    numbers = [each.number for each in drawn]
+    largest = max(each.population for each in stages_of(settings))
+    if len(numbers) * largest * settings.controller.size * 4 > MOST_READ:
+        return None
+    return run.quartiles(numbers)
+
+
+def flatten_settings(settings: RunSettings) -> Facts:
+    """Every setting by its name, those of a part with the part's name before it."""
+    rows: Facts = []
+
+    def walk(prefix: str, value: object) -> None:
+        if isinstance(value, dict):
+            for name, inner in value.items():
+                walk(f"{prefix}.{name}" if prefix else str(name), inner)
+        elif isinstance(value, (list, tuple)) and value and isinstance(value[0], dict):
+            for number, inner in enumerate(value, 1):
+                walk(f"{prefix}.{number}", inner)
+        elif value not in (None, "", ()):
+            rows.append((prefix, printable(format_setting(value))))
+
+    walk("", expand_task_options(asdict(settings)))
+    return rows
+
+
+def _run_row(path: Path) -> dict[str, Any]:
+    try:
+        with RunFolder(path) as run:
+            history, evaluations, confirmed = run.history(), run.evaluations(), run.confirmation()
+            best = best_evaluation(evaluations)
+            return {
+                "run": printable(run.name),
+                "created": run.created,
+                "begun": format_created(run.created),
+                "task": printable(run.spec.task),
+                "generations": len(history),
+                "mean": history[-1].mean if history else None,
+                "best": best.mean if best else None,
+                "confirmed": confirmed.mean if confirmed else None,
+                "best_error": best.error if best else None,
+                "confirmed_error": confirmed.error if confirmed else None,
+                "again": _resume_command(run),
+                "state": printable(run.state),
+                "damaged": False,
+            }
+    except JournalError as error:
+        return {**dict.fromkeys(COLUMNS), "run": printable(path.name), "state": printable(str(error)), "damaged": True}
+
+
+def _resume_command(run: RunFolder) -> str:
+    """The command that goes on with an open run; empty of one that is live, or has ended."""
+    return printable(resume_command(run.path)) if run.state == "open" else ""
+
+
+def format_created(created: str) -> str:
+    """When a run began, as a person reads it, such as 2026-11-23 17:30 UTC."""
+    with suppress(ValueError):
+        return f"{datetime.fromisoformat(created).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+    return printable(created)
+
+
+def _world(run: RunFolder) -> str:
+    """The task whose reality gives the scores: of a dream its world model's."""
+    task = run.spec.task
+    if task == DREAM:
+        with suppress(DreamfleetError, OSError):  # its world model may be gone
+            task = Bundle.open(run.bundle_path, run.spec.bundle).manifest.task
+    return printable(task)
+
+
+def _facts(run: RunFolder, data: RunData, total: Effort) -> Facts:
+    settings, best = data.settings, best_evaluation(data.evaluations)
+    facts = [
+        ("task", settings.task.task),
+        ("begun", format_created(run.created)),
+        ("generations", f"{len(data.history):,}"),
+        ("population", f"{settings.population} candidates x {plural(settings.episodes, 'episode')}"),
+        ("horizon", f"{settings.task.horizon:,} steps"),
+        ("optimiser", f"{describe_optimiser(settings)}, first step size {settings.sigma0:g}"),
+        ("seed", str(settings.seed)),
+        ("spent", total.description),
+        ("hosts", run.classes.description),
+        ("best evaluation", NONE if best is None else f"{format_score(best)}, generation {best.generation}"),
+        ("confirmed", NONE if data.confirmed is None else
+         f"{format_score(data.confirmed)} on {data.confirmed.episodes} fresh seeds"),
+    ]  # fmt: skip
+    return [(name, printable(value)) for name, value in facts]
+
+
+def _generation_row(each: StoredGeneration) -> dict[str, Any]:
+    return {
+        "generation": each.number, "mean": each.mean, "std": each.std, "best": each.best, "worst": each.worst,
+        "sigma": each.sigma, "steps": each.steps, "seconds": each.seconds,
+    }  # fmt: skip

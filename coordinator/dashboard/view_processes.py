@@ -1,0 +1,231 @@
+"""Live views for the page: a `dreamfleet live` for each thing that somebody looks at, shared by all who look at it.
+
+The page's own process has no simulator and no world model. A view's process begins with the first who looks and ends
+soon after the last, so that workers publish frames only while somebody sees them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import subprocess
+from base64 import b64encode
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.processes import VerbProcess, parent_death_command
+from dreamfleet.common.monitoring.mjpeg import read_parts
+from dreamfleet.common.printable import truncate
+from dreamfleet.common.protocol import keys
+from dreamfleet.coordinator.dashboard.sse import event
+
+RATE = 10  # pictures a second
+LINGER = 5.0  # seconds that a view goes on after the last who looked: perhaps the page is only loaded anew
+CHECK_INTERVAL = 0.5  # seconds between looks at whether anybody is there
+STALLED = 15.0  # seconds after which who takes nothing looks no more
+PATIENCE = 3.0  # seconds that a process whose stream has ended has to end
+MOST_VIEWERS = 200
+LONGEST = 500  # characters of what a process said as it ended
+NICE = ("nice", "-n", "10")  # whoever scores on this host goes first
+WORKER, BEST, GENERATION = "worker", "best", "generation"
+_NUMBER = re.compile(r"\d{1,9}")
+
+
+@dataclass(frozen=True)
+class ViewTarget:
+    """What is looked at: a worker by `name/life`, the best mean, an evaluated generation's mean, or who is busiest."""
+
+    run: str
+    kind: str = ""
+    name: str = ""
+
+    @classmethod
+    def of(cls, asked: Mapping[str, str]) -> ViewTarget:
+        """As an address asks for it; `UsageError` for what nothing can be named."""
+        run, worker, generation = keys.check_run_name(asked.get("run", "")), asked.get(WORKER), asked.get(GENERATION)
+        if worker is not None:
+            if not keys.is_worker_identity(worker):
+                raise UsageError("worker must be name/life, as the page shows it")
+            return cls(run, WORKER, worker)
+        if generation is not None:
+            if not _NUMBER.fullmatch(generation):
+                raise UsageError("generation must be a number")
+            return cls(run, GENERATION, generation)
+        return cls(run, BEST if BEST in asked else "")
+
+    def flags(self, connection_flags: Sequence[str], runs_dir: Path) -> list[str]:
+        """The flags that say so; `place` are those that lead to the fleet."""
+        if self.kind == GENERATION:
+            return [f"--controller={self.run}", f"--generation={self.name}", f"--runs-dir={runs_dir}"]
+        whom = {WORKER: [f"--worker={self.name}"], BEST: ["--best"]}.get(self.kind, [])
+        return [f"--run={self.run}", *connection_flags, *whom]
+
+
+class ViewProcesses:
+    """All that is looked at now; used by one event loop."""
+
+    def __init__(self, connection_flags: Sequence[str], runs_dir: Path, limit: int) -> None:
+        """`place` are the flags that lead to the fleet; `most` processes at a time, 0: there are none to look at."""
+        self._connection_flags, self._runs_dir, self._limit = connection_flags, runs_dir, limit
+        self._views: dict[ViewTarget, _ViewProcess] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._closed = False
+
+    @property
+    def is_enabled(self) -> bool:
+        """Whether there is anything to look at."""
+        return self._limit > 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no room for another who looks."""
+        return sum(each.viewers for each in self._views.values()) >= MOST_VIEWERS
+
+    async def events(self, target: ViewTarget) -> AsyncIterator[bytes]:
+        """The newest picture, each time that there is one, and what is to be said instead; until it is over."""
+        view = self._views.get(target)
+        if view is None or view.is_closing:
+            if self._closed or not self._has_room():
+                yield notice_event(
+                    "ended", f"{self._limit} live views are open, and no more are allowed here: leave another"
+                )
+                return
+            try:
+                view = self._views[target] = _ViewProcess(target.flags(self._connection_flags, self._runs_dir))
+            except OSError as error:
+                yield notice_event("ended", f"no process can be started here: {error}")
+                return
+            self._tasks.add(view.task)
+            view.task.add_done_callback(self._tasks.discard)
+        async for each in view.events():
+            yield each
+
+    def _has_room(self) -> bool:
+        """Whether there may be one more; a view that nobody looks at makes room."""
+        self._views = {target: each for target, each in self._views.items() if not each.is_closing}
+        if len(self._views) < self._limit:
+            return True
+        idle = next((each for each in self._views.values() if not each.viewers), None)
+        if idle is not None:
+            idle.task.cancel()
+        return idle is not None
+
+    async def close(self) -> None:
+        """Let everybody go, and end every process."""
+        self._closed = True
+        for each in self._tasks:
+            each.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+
+class _ViewProcess:
+    """One process, and all who look at its pictures. Who is slow misses some, and holds back nobody."""
+
+    def __init__(self, flags: Sequence[str]) -> None:
+        self.viewers = 0
+        self.is_closing = False  # its process is to end
+        self._over = False  # nothing comes after the latest
+        self._latest = notice_event(
+            "starting", "Starting: the first picture takes some seconds, on a busy host half a minute."
+        )
+        self._pictures = 0
+        self._sending_since: dict[
+            object, float
+        ] = {}  # since when each of those to whom something is being sent takes it
+        self._changed = asyncio.Event()  # set, and replaced, as something becomes the latest
+        self._ended = asyncio.Event()  # its process closed the stream
+        self._loop = asyncio.get_running_loop()
+        # It hears of the death of the thread that started it, so this is the loop's own.
+        self._child = VerbProcess(
+            "live", *flags, "--fps", RATE, "--out", "-", inside=(*NICE, *parent_death_command()), read=self._read
+        )
+        self.task = asyncio.create_task(self._run())
+
+    async def events(self) -> AsyncIterator[bytes]:
+        """The latest, then each that is newer."""
+        self.viewers += 1
+        seen, viewer = None, object()
+        try:
+            while True:
+                changed = self._changed
+                if self._latest is not seen:
+                    seen = self._latest
+                    self._sending_since[viewer] = self._loop.time()
+                    yield seen
+                    del self._sending_since[viewer]
+                elif self._over:
+                    return
+                else:
+                    await changed.wait()
+        finally:
+            self._sending_since.pop(viewer, None)
+            self.viewers -= 1
+
+    @property
+    def _has_active_viewer(self) -> bool:
+        late = self._loop.time() - STALLED
+        return self.viewers > sum(since < late for since in self._sending_since.values())
+
+    async def _run(self) -> None:
+        """Until the process ends, or nobody looks any more."""
+        clock = self._loop.time
+        left, heard = clock() + LINGER, ""
+        try:
+            while not self._ended.is_set() and clock() < left:
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._ended.wait(), CHECK_INTERVAL)
+                if self._has_active_viewer:
+                    left = clock() + LINGER
+                if not self._pictures and self._child.lines and (said := self._child.lines[-1]) != heard:
+                    heard = said
+                    self._publish(notice_event("waiting", said))
+        finally:
+            self.is_closing = True
+            await asyncio.shield(asyncio.create_task(asyncio.to_thread(self._stop_process)))
+            self._over = True
+            self._publish(notice_event("ended", _end_reason(self._child)))
+
+    def _stop_process(self) -> None:
+        """In a thread: a process that has ended its stream ends by itself, any other holds nothing and is killed."""
+        if self._ended.is_set():
+            with suppress(subprocess.TimeoutExpired):
+                self._child.popen.wait(PATIENCE)
+        self._child.end(patience=0)
+
+    def _read(self, stream: IO[bytes]) -> None:
+        """In a thread: what was drawn twice is sent once."""
+        before = b""
+        with suppress(RuntimeError), stream:  # the loop may be closed
+            for picture, facts in read_parts(stream):
+                if picture != before:
+                    before = picture
+                    self._loop.call_soon_threadsafe(self._publish_picture, _picture_event(picture, facts))
+            self._loop.call_soon_threadsafe(self._ended.set)
+
+    def _publish_picture(self, picture: bytes) -> None:
+        self._pictures += 1
+        self._publish(picture)
+
+    def _publish(self, latest: bytes) -> None:
+        self._latest = latest
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+
+def notice_event(state: str, text: str) -> bytes:
+    """What stands in a picture's place: `starting`, `waiting`, or `ended`."""
+    return event("told", {"state": state, "text": truncate(text.strip(), LONGEST)})
+
+
+def _picture_event(picture: bytes, facts: Mapping[str, Any]) -> bytes:
+    shown = {name: truncate(value, LONGEST) if isinstance(value, str) else value for name, value in facts.items()}
+    return event("picture", {"facts": shown, "jpeg": b64encode(picture).decode()})
+
+
+def _end_reason(child: VerbProcess) -> str:
+    code = child.popen.returncode
+    return f"The process that draws it was ended by signal {-code}." if code < 0 else child.last_line()

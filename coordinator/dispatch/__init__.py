@@ -1,0 +1,1 @@
+"""Which worker gets which job: leases, credit, losses, speculative copies. Pure."""

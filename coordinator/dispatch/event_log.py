@@ -1,0 +1,72 @@
+"""What happened to jobs and workers of late: a bounded ring of typed events. Pure: events and a clock in.
+
+Kept in blocks that only grow, so that a view of it costs the same however much is kept, and any thread may read it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterator
+from typing import NamedTuple
+
+from dreamfleet.common.monitoring.status import EventKind
+from dreamfleet.common.protocol.messages import Job
+
+BLOCK, BLOCKS = 256, 128  # events of a block, and blocks that are kept
+MOST_NAMED = 10_000  # jobs whose names are kept: many more than can be in workers' hands
+
+
+class FleetEvent(NamedTuple):
+    """One event at a moment of the monotonic clock; `job` is kind, generation, candidate and episode, or unknown."""
+
+    at: float
+    what: EventKind
+    worker: str
+    job: tuple[str, int, int, int] | None
+
+
+class EventLogView:
+    """The story as it was when the view was taken."""
+
+    def __init__(self, blocks: tuple[list[FleetEvent], ...], last: int) -> None:
+        self._blocks = blocks
+        self._last = last  # events of the last block, which may grow
+
+    def latest(
+        self, worker: str = "", job: tuple[int, int] | None = None, kinds: Collection[str] = ()
+    ) -> Iterator[FleetEvent]:
+        """Events from the newest to the oldest: of a worker or a host by name, of a candidate, of `kinds`, or all."""
+        for number, block in enumerate(reversed(self._blocks)):
+            for each in reversed(block if number else block[: self._last]):
+                if worker and worker not in (each.worker, each.worker.partition("/")[0]):
+                    continue
+                if kinds and each.what not in kinds:
+                    continue
+                if job is None or (each.job is not None and each.job[1:3] == job):
+                    yield each
+
+
+class EventLog:
+    """Takes events in; what is too old is forgotten."""
+
+    def __init__(self) -> None:
+        self._blocks: deque[list[FleetEvent]] = deque([[]], maxlen=BLOCKS)
+        self._names: dict[bytes, tuple[str, int, int, int]] = {}
+
+    def add_given(self, now: float, worker: str, job: Job) -> None:
+        """A worker was given a job."""
+        if job.digest not in self._names and len(self._names) >= MOST_NAMED:
+            del self._names[next(iter(self._names))]
+        self._names[job.digest] = (job.kind, job.generation, job.candidate, job.episode)
+        self.add(now, "given", worker, job.digest)
+
+    def add(self, now: float, what: EventKind, worker: str, digest: bytes | None = None) -> None:
+        """Something happened to a worker, or to a job in its hands."""
+        if len(self._blocks[-1]) >= BLOCK:
+            self._blocks.append([])
+        job = None if digest is None else self._names.get(digest)
+        self._blocks[-1].append(FleetEvent(now, what, worker, job))
+
+    def view(self) -> EventLogView:
+        """It as it is now, for other threads."""
+        return EventLogView(tuple(self._blocks), len(self._blocks[-1]))

@@ -1,0 +1,1 @@
+"""Several verbs in sequence: the demonstration, iteration, contrast."""

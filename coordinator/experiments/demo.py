@@ -1,0 +1,291 @@
+"""The demonstration: a coordinator and one worker a core on this machine, as anybody would start them by hand.
+
+Two runs: one in the dream, and one in reality from the dream's best mean. Spawns console commands and watches over
+Zenoh; imports neither the run nor the worker.
+"""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from statistics import fmean, stdev
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from dreamfleet.common.cli.config import option
+from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
+from dreamfleet.common.host.processes import (
+    VerbProcess,
+    parent_death_command,
+    run_verb_for_json,
+    run_verb_to_end,
+    shell_command,
+)
+from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.monitoring.status_panel import RunPanel
+from dreamfleet.common.runs.records import best_evaluation
+from dreamfleet.common.runs.run_folder import CONTROLLER, open_run
+from dreamfleet.coordinator.settings.config import NO_SUBSPACE
+
+REFRESH = 0.5
+START_SECONDS = 30.0
+PAGE_PACKAGES = ("plotly", "starlette", "uvicorn")
+PLOT, VIDEO, SCHEDULE = "fitness.png", "drive.mp4", "stages.toml"
+DREAM_EVALUATIONS, REAL_EVALUATIONS = (
+    (2, 8, 16),
+    (3, 16, 64),
+)  # generations between evaluations, tracks of each, of a confirmation
+SUBSPACE_SIGMA0, FULL_SIGMA0 = 0.3, 0.1  # first step sizes from zero: in a subspace, and of all parameters
+SUBSPACE_SIGMA0_AFTER_DREAM, FULL_SIGMA0_AFTER_DREAM = 0.15, 0.06  # the same after a dream
+# In reality candidates drive one track each until a mean drives well, for so many steps at most: far from a good driver
+# generations tell more than tracks, and large steps more than small ones.
+ABLE_SCORE, QUICK_STEPS = 800, 700_000
+LATE_SIGMA0 = 0.06  # step size in a subspace from there on
+OFFROAD_COST = "offroad_cost=2"  # by candidates in reality: grass foretells losses that one track is too few to show
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """How long and how large; the defaults suit two cores."""
+
+    dream_minutes: float = option(0.5, "dream for so long first; 0: not at all")
+    minutes: float = option(4.5, "then evolve in reality for so long; 0: not at all")
+    temperature: float = option(1.5, "of the dream")
+    population: int = option(24, "candidates a generation in reality")
+    episodes: int = option(4, f"episodes a candidate in reality, after one each until a mean drives {ABLE_SCORE}")
+    horizon: int = option(1000, "steps of an episode at most in reality")
+    patience: int = option(100, "cut an episode after so many steps without reward in reality")
+    sigma0: float | None = option(
+        None,
+        f"first step size from zero (default {SUBSPACE_SIGMA0} in a subspace, else {FULL_SIGMA0}); "
+        f"after a dream {SUBSPACE_SIGMA0_AFTER_DREAM} and {FULL_SIGMA0_AFTER_DREAM}",
+    )
+    bundle: str = option("tiny", "the frozen world model: a shipped name or a file")
+    subspace: str | None = option(
+        None, "the few features that both searches keep to; none: all parameters (default the bundle's, if one ships)"
+    )
+    seed: int = option(1, "makes the runs")
+    tracks: int = option(16, "unseen tracks that the outcome is judged on")
+    workers: int = option(0, "worker processes; 0: one a core")
+    port: int = option(7447, "port of the embedded router")
+    page: bool = option(
+        True, "serve a web page about the runs while they go on, on this computer alone; it needs the extra `dashboard`"
+    )
+
+    def __post_init__(self) -> None:
+        if min(self.minutes, self.dream_minutes) < 0 or self.tracks < 1 or self.workers < 0:
+            raise UsageError("--minutes and --workers must not be negative, --tracks at least 1")
+        if not self.minutes and not self.dream_minutes:
+            raise UsageError("--minutes and --dream-minutes cannot both be 0: nothing would evolve")
+
+
+@dataclass(frozen=True)
+class DemoRun:
+    """One of the demonstration's runs."""
+
+    run: str
+    what: str
+    flags: Mapping[str, object]
+    schedule: str = ""  # TOML
+
+
+class Demo:
+    """One demonstration run in `runs_dir`."""
+
+    def __init__(self, config: DemoConfig, name: str, runs_dir: Path) -> None:
+        self._config = config
+        self._runs_dir = runs_dir
+        self._demo_runs = plan_runs(config, name, runs_dir)
+        self._endpoint = f"tcp/127.0.0.1:{config.port}"
+        self._console = Console()
+
+    def play(self) -> None:
+        """Evolve, judge, draw, record, and say what to try next."""
+        with ExitStack() as stack:
+            self._show_page(stack)
+            for demo_run in self._demo_runs:
+                self._evolve(demo_run)
+        best = max(reversed(self._demo_runs), key=self._confirmed)  # of equals the last
+        folder = self._runs_dir / best.run
+        controller = folder / CONTROLLER
+        self._print(
+            f"judging run {best.run}'s controller on unseen tracks, whole episodes, in gymnasium's own environment"
+        )
+        drives = self._judge(controller)
+        self._console.print(self._table(best, drives))
+        for demo_run in self._demo_runs:
+            self._plot(demo_run)
+        track, score = median_drive(drives)
+        self._print(f"recording the median of these drives ({score:.0f} on track {track}), and what the model dreams")
+        run_verb_to_end("record", "--controller", controller, "--out", folder / VIDEO, "--steps", 1000, "--seed", track)
+        self._print_next_steps(folder)
+
+    def _show_page(self, stack: ExitStack) -> None:
+        """Serve a page about the runs until the stack is left; without its packages, or a port, there is none."""
+        if not self._config.page or any(find_spec(package) is None for package in PAGE_PACKAGES):
+            return
+        where = ("--connect", self._endpoint, "--runs-dir", self._runs_dir)
+        page = stack.enter_context(
+            VerbProcess("dashboard", *where, "--host", "127.0.0.1", "--port", 0, inside=parent_death_command())
+        )
+        with suppress(DreamfleetError):
+            self._print(page.wait_for("the dashboard is at", timeout=START_SECONDS).strip())
+
+    def _confirmed(self, demo_run: DemoRun) -> float:
+        """A stage's confirmed score: in reality, on fresh tracks that are the same in every stage."""
+        with open_run(self._runs_dir, demo_run.run) as run:
+            found = run.confirmation()
+        return -math.inf if found is None else found.mean
+
+    def _judge(self, controller: Path) -> dict[int, float]:
+        """Score by track, on tracks that no part of the demonstration has seen."""
+        told = run_verb_for_json("evaluate", "--controller", controller, "--episodes", self._config.tracks, "--json")
+        return dict(zip(told["seeds"], told["scores"], strict=True))
+
+    def _table(self, chosen: DemoRun, drives: Mapping[int, float]) -> Table:
+        """What each stage's best look promised, what was confirmed, and what the chosen one did on unseen tracks."""
+        table = Table("run", "its best evaluation", "confirmed on fresh tracks", "on unseen tracks", box=None)
+        for demo_run in self._demo_runs:
+            with open_run(self._runs_dir, demo_run.run) as run:
+                best, confirmed = best_evaluation(run.evaluations()), run.confirmation()
+            table.add_row(
+                demo_run.run,
+                "-" if best is None else _format_score(best.mean, best.error, best.episodes),
+                "-" if confirmed is None else _format_score(confirmed.mean, confirmed.error, confirmed.episodes),
+                _format_drives(list(drives.values())) if demo_run is chosen else "",
+            )
+        return table
+
+    def _evolve(self, demo_run: DemoRun) -> None:
+        workers = self._config.workers or usable_cores()
+        self._print(f"{demo_run.what}: a coordinator and {workers} workers on this machine")
+        logs = self._runs_dir / demo_run.run
+        flags = {
+            "run": demo_run.run, "runs-dir": self._runs_dir, "listen": self._endpoint, "bundle": self._config.bundle,
+            **demo_run.flags,
+        }  # fmt: skip
+        if demo_run.schedule:
+            logs.mkdir(parents=True, exist_ok=True)
+            (logs / SCHEDULE).write_text(demo_run.schedule)
+            flags["schedule"] = logs / SCHEDULE
+        arguments = [text for name, value in flags.items() for text in (f"--{name}", value)]
+        with ExitStack() as stack:
+            log = logs / "coordinator.log"
+            coordinator = stack.enter_context(
+                VerbProcess("coordinator", *arguments, inside=parent_death_command(), log=log)
+            )
+            client = stack.enter_context(self._connect(coordinator))
+            for name in (f"core-{number}" for number in range(workers)):
+                where = ("--connect", self._endpoint, "--run", demo_run.run, "--name", name, "--slots", 1)
+                stack.enter_context(
+                    VerbProcess("worker", *where, inside=parent_death_command(), log=logs / f"{name}.log")
+                )
+            self._watch(client, coordinator.popen, demo_run.run)
+            if coordinator.finish()[0] != 0:
+                raise DreamfleetError(f"the coordinator failed; its words are in {log}")
+
+    def _connect(self, coordinator: VerbProcess) -> Client:
+        deadline = time.monotonic() + START_SECONDS
+        while True:
+            if coordinator.popen.poll() is not None:
+                raise DreamfleetError(coordinator.last_line())
+            try:
+                return Client((self._endpoint,))
+            except ConnectionFailedError:
+                if time.monotonic() > deadline:
+                    raise
+
+    def _watch(self, client: Client, coordinator: subprocess.Popen[bytes], run: str) -> None:
+        with Live(console=self._console, refresh_per_second=4) as live:
+            while coordinator.poll() is None:
+                with suppress(ConnectionFailedError):  # it is starting, or has just ended
+                    live.update(RunPanel(client.status(run), client.worker_flags, fitted=self._console.is_terminal))
+                try:
+                    coordinator.wait(REFRESH)
+                except subprocess.TimeoutExpired:
+                    continue
+
+    def _plot(self, demo_run: DemoRun) -> None:
+        from dreamfleet.coordinator.analysis.plot import plot_fitness
+
+        path = self._runs_dir / demo_run.run / PLOT
+        with open_run(self._runs_dir, demo_run.run) as run:
+            plot_fitness(run, path)
+        self._console.print(f"{path}: fitness over generations", markup=False)
+
+    def _print_next_steps(self, folder: Path) -> None:
+        controller = folder / CONTROLLER
+        told = f": the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
+        self._console.print(Text.assemble("\n", (f"In {folder}", "bold"), told))
+        for command in (
+            shell_command("replay", folder.name, "--candidate", "0/0", "--runs-dir", self._runs_dir),
+            shell_command("evaluate", "--controller", controller, "--episodes", 100),
+            shell_command("coordinator", "--run", "mine", "--preset", "frugal", "--listen", self._endpoint)
+            + f"   # and beside it: {shell_command('worker', '--connect', self._endpoint)}",
+        ):
+            self._console.print(f"  {command}", style="green", highlight=False, soft_wrap=True, markup=False)
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, style="bold", markup=False)
+
+
+def median_drive(drives: Mapping[int, float]) -> tuple[int, float]:
+    """The track and score of the middle drive, neither the best nor a crash; of an even number the lower one."""
+    return sorted(drives.items(), key=lambda drive: (drive[1], drive[0]))[(len(drives) - 1) // 2]
+
+
+def _format_score(mean: float, error: float, episodes: int) -> str:
+    return f"{mean:.0f} ± {error:.0f} ({episodes})"
+
+
+def _format_drives(scores: Sequence[float]) -> str:
+    error = stdev(scores) / math.sqrt(len(scores)) if len(scores) > 1 else 0.0
+    return f"{_format_score(fmean(scores), error, len(scores))}, {min(scores):.0f} to {max(scores):.0f}"
+
+
+def _evaluation_flags(every: int, tracks: int, confirming: int) -> dict[str, object]:
+    return {"evaluate-every": every, "evaluation-episodes": tracks, "confirm-episodes": confirming}
+
+
+def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, ...]:
+    """The demonstration's runs, in order."""
+    from dreamfleet.common.runs.lookup import shipped_subspace_name
+
+    found = []
+    subspace = (shipped_subspace_name(config.bundle) or NO_SUBSPACE) if config.subspace is None else config.subspace
+    few = subspace != NO_SUBSPACE
+    search: dict[str, object] = {"subspace": subspace, "covariance": "full"} if few else {}
+    sigma0 = (SUBSPACE_SIGMA0 if few else FULL_SIGMA0) if config.sigma0 is None else config.sigma0
+    reality: dict[str, object] = {
+        **search, "population": config.population, "horizon": config.horizon,
+        "patience": config.patience, "sigma0": sigma0, "seed": config.seed, "minutes": config.minutes,
+        "variant": OFFROAD_COST, **_evaluation_flags(*REAL_EVALUATIONS),
+    }  # fmt: skip
+    if config.dream_minutes:
+        dream = f"{name}-dream"
+        flags = {
+            **search, "preset": "dream", "temperature": config.temperature, "sigma0": sigma0, "seed": config.seed,
+            "minutes": config.dream_minutes, **_evaluation_flags(*DREAM_EVALUATIONS),
+        }  # fmt: skip
+        found.append(DemoRun(dream, f"evolving in the dream for {config.dream_minutes:g} minutes", flags))
+        reality |= {
+            "init": runs_dir / dream / CONTROLLER,
+            "sigma0": SUBSPACE_SIGMA0_AFTER_DREAM if few else FULL_SIGMA0_AFTER_DREAM,
+        }
+    if config.minutes:
+        schedule = (
+            f"[[stage]]\nscore = {ABLE_SCORE}\nsteps = {QUICK_STEPS}\nepisodes = 1\n\n"
+            f"[[stage]]\nepisodes = {config.episodes}\n" + (f"sigma0 = {LATE_SIGMA0}\n" if few else "")
+        )
+        found.append(DemoRun(name, f"evolving in reality for {config.minutes:g} minutes", reality, schedule))
+    return tuple(found)

@@ -1,0 +1,116 @@
+"""What an iteration is; what of it may change while it is under way."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from typing import Literal
+
+from dreamfleet.common.cli.config import option
+from dreamfleet.common.cli.presets import NAMES, check_preset
+from dreamfleet.common.errors import UsageError
+
+# They change no round that is finished, nor what it means; what `--run-flags` lead to is compared instead of them.
+CHANGEABLE = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
+MOST_SEED = 2**31 - 1  # each round's training multiplies its own
+# Flags of a training that are iterate's to give.
+RUN_FLAGS = ("run_flags", "later_run_flags")
+RESERVED_FLAGS = ("--data", "--preset", "--device", "--seed", "--continue-from", "--new", "--summary", "--json")
+LEAST = {
+    "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
+    "mdnrnn_updates": 1, "gate_drives": 0, "gate_losses": 0, "seed": 0, "local": 0, "jobs": 1,
+    "views": 0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class IterateConfig:
+    """How many rounds, and what each drives, learns, dreams and is held to."""
+
+    init: str = option(
+        "", "controller to go on from, and with it its world model: a file, or one that ships (default none)"
+    )
+    rounds: int = option(5, "rounds in all: each makes a world model and evolves in its dream; more may follow later")
+    preset: str = option("tiny", f"training preset to begin with: {', '.join(NAMES['training'])}")
+    drives: int | None = option(
+        None, "random drives that the first round learns from (default the preset's, 620 of tiny)"
+    )
+    more_drives: int = option(0, "random drives that each later round adds")
+    own_drives: int = option(80, "drives of the last round's own means, or --init's, that each round adds")
+    means: int = option(4, "means that drive these: the reported one, the last one, then the best evaluated ones")
+    noise: float = option(0.3, "on the actions of these drives, in halves of an action's range")
+    spells: float = option(0.0, "chance of each of their steps that an action which rests, as a brake, is tried")
+    drive_steps: int | None = option(None, "steps of a drive at most (default the preset's)")
+    vae: Literal["decoder", "whole", "keep"] = option("decoder", "what of the VAE learns on in later rounds")
+    vae_updates: int | None = option(
+        None, "updates of the VAE in each later round (default what --vae-flags say, else 1800)"
+    )
+    mdnrnn_updates: int | None = option(
+        None, "updates of the MDN-RNN in each later round (default what --mdnrnn-flags say, else 600)"
+    )
+    vae_flags: str = option("", 'flags of `train vae` in every round, as one text: "--updates 900 --batch 50"')
+    mdnrnn_flags: str = option("", "flags of `train mdnrnn` in every round")
+    run_flags: str = option(
+        "--generations 32", "flags of each round's `coordinator`, whose preset is dream unless another is named"
+    )
+    later_run_flags: str = option("", "flags that follow these wherever a world model came before: --temperature 1")
+    go_on: bool = option(
+        False, "begin each evolution at the last round's optimum, fitted to the new model, instead of at zero"
+    )
+    subspace: bool = option(
+        False, "let each such evolution search what its model foretells of the last drives alone: needs --go-on"
+    )
+    views: int = option(
+        0, "beside it so many directions that foretell what the model will see, as `subspace` finds them"
+    )
+    gate_drives: int = option(20, "drives of `inspect --probe` that a new world model is held to the old by; 0: none")
+    gate_losses: int = option(30, "losses of `inspect --losses` that it is held to it by; 0: none")
+    seed: int = option(0, "makes the iteration: drives, training, populations and tracks follow from it")
+    local: int | None = option(None, "scoring processes here (default one a core, or none where --listen is given)")
+    jobs: int | None = option(None, "processes that drive for the data set here (default one a core)")
+    device: Literal["cpu", "cuda", "auto"] = option("cpu", "that trains: cpu, cuda, or auto")
+
+    def __post_init__(self) -> None:
+        for name, least in LEAST.items():
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {value}")
+        check_preset("training", self.preset)
+        if not 0 <= self.noise <= 10:
+            raise UsageError(f"--noise must be from 0 to 10, not {self.noise}")
+        if not 0 <= self.spells <= 1:
+            raise UsageError(f"--spells must be from 0 to 1, not {self.spells}")
+        if self.gate_drives == 1 or 0 < self.gate_losses < 4:
+            raise UsageError("--gate-drives must be 0 or at least 2, --gate-losses 0 or at least 4")
+        if self.subspace and not self.go_on:
+            raise UsageError("--subspace changes a controller that is there: give --go-on too")
+        if self.views and not self.subspace:
+            raise UsageError("--views are beside the features of --subspace: give that too")
+        if self.seed > MOST_SEED:
+            raise UsageError(f"--seed must be at most {MOST_SEED}, not {self.seed}")
+        for name in ("vae_flags", "mdnrnn_flags", *RUN_FLAGS):
+            _check_reserved(name, split_flags(name, getattr(self, name)))
+
+    def is_from_scratch(self, number: int) -> bool:
+        """Whether a round has nothing before it: no world model, no controller."""
+        return number == 1 and not self.init
+
+    def flags_of_run(self, number: int) -> tuple[str, ...]:
+        """The flags of a round's `coordinator`; of one that is said twice the latter counts."""
+        names = RUN_FLAGS[:1] if self.is_from_scratch(number) else RUN_FLAGS
+        return tuple(word for name in names for word in split_flags(name, getattr(self, name)))
+
+
+def _check_reserved(name: str, given: tuple[str, ...]) -> None:
+    said = {word.partition("=")[0] for word in given if word.startswith("--")}
+    taken = [flag for flag in RESERVED_FLAGS if any(flag.startswith(word) for word in said)]  # flags may be shortened
+    if taken and name not in RUN_FLAGS:
+        raise UsageError(f"--{name.replace('_', '-')}: {', '.join(taken)} of each training is iterate's own to give")
+
+
+def split_flags(name: str, text: str) -> tuple[str, ...]:
+    """Flags that were given as one text; `UsageError` if its quotes do not match."""
+    try:
+        return tuple(shlex.split(text))
+    except ValueError as error:
+        raise UsageError(f"--{name.replace('_', '-')} {text!r}: {error}") from error

@@ -1,0 +1,89 @@
+"""Whether a new world model takes the place of the old one, by what `inspect` measured of both.
+
+Two figures, of which more is better. *Knows*: the mean, over the quantities of the simulator's truth, of the R² of a
+linear map from [z, h] on held-out drives. *Loses*: how many dreams begun shortly before real losses of the road lose it
+too, less how many do where reality loses nothing; reality's is 1. A dream that loses none, or all, has 0.
+
+A new model is refused if a figure that both have is clearly worse: lower by more than two standard errors of the
+difference, and by more than `MARGIN`. What could not be measured of both refuses nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+MARGIN = 0.02
+ERRORS = 2.0
+KNOWS, LOSES = "knows", "loses"
+CALM = "no loss"  # as `inspect` names the beginnings behind which reality loses nothing
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A measured value and its standard error."""
+
+    value: float
+    error: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.2f} ± {self.error:.2f}"
+
+    def is_clearly_below(self, other: Figure) -> bool:
+        """Whether it is clearly worse than the other one."""
+        return other.value - self.value > max(MARGIN, ERRORS * math.hypot(self.error, other.error))
+
+
+Figures = Mapping[str, Figure | None]
+NOTHING = Figure(0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class GateDecision:
+    """Whether the new model is kept, and why, in words."""
+
+    kept: bool
+    why: str
+
+
+def judge(old: Figures, new: Figures) -> GateDecision:
+    """Hold the new model's figures to the old one's."""
+    both = {name: (before, after) for name in (KNOWS, LOSES)
+            if (before := old.get(name)) is not None and (after := new.get(name)) is not None}  # fmt: skip
+    if not both:
+        return GateDecision(True, "kept: nothing was measured of both")
+    worse = [name for name, (before, after) in both.items() if after.is_clearly_below(before)]
+    told = ", ".join(f"{name} {before} -> {after}" for name, (before, after) in both.items())
+    return GateDecision(not worse, f"{told}: {'refused, clearly worse in ' + ' and '.join(worse) if worse else 'kept'}")
+
+
+def figures(measured: Mapping[str, Any]) -> dict[str, Figure | None]:
+    """The two figures of a model from the answers of `inspect --probe` and `inspect --losses`, where it has them."""
+    return {KNOWS: knows(measured.get("probe")), LOSES: loses(measured.get("losses"))}
+
+
+def knows(probe: Mapping[str, Any] | None) -> Figure | None:
+    """Of `inspect --probe --json`; a quantity below 0 is not known. The error is the mean, as if all erred together."""
+    if not probe or "probe" not in probe:
+        return None
+    told = [each["found"]["zh_linear"] for each in probe["probe"]["known"]]
+    found = [Figure(**each) if each["value"] > 0 else NOTHING for each in told]
+    return Figure(_mean(each.value for each in found), _mean(each.error for each in found))
+
+
+def loses(losses: Mapping[str, Any] | None) -> Figure | None:
+    """Of `inspect --losses --json`: of the dreams that begin furthest before a loss; `None` without calm ones."""
+    if not losses or "losses" not in losses:
+        return None
+    begun = {each["begun"]: each["figures"]["lost"]["dream"] for each in losses["losses"]["begun"]}
+    before = next((each for name, each in begun.items() if name != CALM), None)
+    if before is None or CALM not in begun:
+        return None
+    return Figure(before["value"] - begun[CALM]["value"], math.hypot(before["error"], begun[CALM]["error"]))
+
+
+def _mean(values: Iterable[float]) -> float:
+    taken = list(values)
+    return sum(taken) / len(taken)

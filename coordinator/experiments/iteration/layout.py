@@ -1,0 +1,86 @@
+"""Where everything of an iteration lies in its folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+EPISODES, ENCODED = "episodes", "encoded"
+BUNDLE, CONTROLLER = "bundle.zip", "controller.npz"  # as a run's folder has them
+
+
+@dataclass(frozen=True)
+class IterationFolder:
+    """The folder: one data set of all drives, a folder a round with its models, and the rounds' runs.
+
+    A round's folder is a data folder of its own for the verbs that train: it leads to the drives by links.
+    """
+
+    root: Path
+
+    @property
+    def ledger(self) -> Path:
+        """What is finished."""
+        return self.root / "iteration.json"
+
+    @property
+    def lock(self) -> Path:
+        """Held by whoever works here."""
+        return self.root / "iteration.lock"
+
+    @property
+    def runs(self) -> Path:
+        """The rounds' runs."""
+        return self.root / "runs"
+
+    def round(self, number: int) -> Path:
+        """A round's models."""
+        return self.root / "rounds" / f"{number:02d}"
+
+    def log(self, number: int, name: str) -> Path:
+        """What a verb of a round said."""
+        return self.round(number) / "logs" / f"{name}.log"
+
+    def bundle(self, number: int) -> Path:
+        """A round's frozen world model; of round 0 beside its controller, where controllers look for theirs."""
+        return self.round(number) / (f"round-{number}.zip" if number else BUNDLE)
+
+    def checkpoint(self, number: int, model: str) -> Path:
+        """The weights that a round's training of `vae` or `mdnrnn` ended with."""
+        return self.round(number) / f"{model}.safetensors"
+
+    def run_name(self, number: int) -> str:
+        """Of a round's evolution."""
+        return f"round-{number:02d}"
+
+    def run(self, number: int) -> Path:
+        """The folder of a round's evolution."""
+        return self.runs / self.run_name(number)
+
+    def optimum(self, number: int) -> Path:
+        """The controller that a round ended with; of round 0 the one that the iteration goes on from."""
+        return (self.run(number) if number else self.round(number)) / CONTROLLER
+
+    def means(self, number: int) -> Path:
+        """The means of a round's run that drive for the next one, beside the world model that they see."""
+        return self.round(number) / "means"
+
+    def gate_file(self, number: int) -> Path:
+        """The figures of a round's gate, as they were measured."""
+        return self.round(number) / "gate.json"
+
+    def refitted(self, number: int) -> Path:
+        """The last round's optimum, fitted to this round's new world model."""
+        return self.round(number) / "moved.npz"
+
+    def start(self, number: int) -> Path:
+        """Where a round's evolution begins, if not at zero."""
+        return self.round(number) / "start.npz"
+
+    def subspace(self, number: int) -> Path:
+        """What a round's evolution searches, if not everything."""
+        return self.round(number) / "subspace.npz"
+
+    def relative(self, path: Path) -> str:
+        """A path below the folder, as the ledger writes it."""
+        return path.relative_to(self.root).as_posix()

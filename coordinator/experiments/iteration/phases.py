@@ -1,0 +1,304 @@
+"""Doing a phase: its verbs called, what it made and measured told. Again after a kill, it goes on or ends the same."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.errors import BundleError, DatasetError, UsageError
+from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.regular_files import path_exists
+from dreamfleet.common.host.stop_signals import Stop
+from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
+from dreamfleet.common.runs.run_folder import BUNDLE as RUN_BUNDLE
+from dreamfleet.common.runs.run_folder import JOURNAL, RunFolder, open_run
+from dreamfleet.coordinator.experiments.iteration import artefacts, gate
+from dreamfleet.coordinator.experiments.iteration.commands import Commands, Words
+from dreamfleet.coordinator.experiments.iteration.layout import ENCODED, EPISODES
+from dreamfleet.coordinator.experiments.iteration.plan import (
+    BUNDLE,
+    COLLECT,
+    DRIVE,
+    ENCODE,
+    EVOLVE,
+    GATE,
+    INIT,
+    MDNRNN,
+    TAKE,
+    VAE,
+    Phase,
+)
+from dreamfleet.coordinator.experiments.local_run import LocalFleet, evolve
+
+log = logging.getLogger("dreamfleet.coordinator.iterate")
+
+
+@dataclass(frozen=True)
+class PhaseResult:
+    """What a phase called, told and made."""
+
+    commands: tuple[Words, ...] = ()
+    figures: dict[str, Any] | None = None
+    made: tuple[Path, ...] = ()
+
+
+class PhaseRunner:
+    """The phases of an iteration at one moment of it: `commands` knows what is finished."""
+
+    def __init__(
+        self, commands: Commands, local_fleet: Callable[[], LocalFleet], ask: Callable[[Words, Path], Any], stop: Stop
+    ):
+        """`ask` runs a verb to its end, logging to a path, and returns its JSON answer."""
+        self._commands, self._local_fleet, self._ask, self._stop = commands, local_fleet, ask, stop
+        self._layout, self._ledger, self._config = commands.layout, commands.ledger, commands.config
+
+    def do(self, phase: Phase) -> PhaseResult:
+        """Do it, or do what is left of it."""
+        number = phase.round
+        self._link_data(number)
+        done: dict[str, Callable[[int], PhaseResult]] = {
+            INIT: self._init, COLLECT: self._collect, TAKE: self._import_kept, DRIVE: self._drive, VAE: self._vae,
+            ENCODE: self._encode, MDNRNN: self._mdnrnn, BUNDLE: self._bundle, GATE: self._gate, EVOLVE: self._evolve,
+        }  # fmt: skip
+        return done[phase.name](number)
+
+    def _link_data(self, number: int) -> None:
+        """The round's folder, which leads to the one data set."""
+        folder = self._layout.round(number)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (EPISODES, ENCODED):
+            (self._layout.root / name).mkdir(exist_ok=True)
+            if not path_exists(folder / name):
+                (folder / name).symlink_to(Path("..", "..", name), target_is_directory=True)
+
+    def _call(self, number: int, name: str, words: Words) -> Any:
+        return self._ask(words, self._layout.log(number, name))
+
+    def _init(self, number: int) -> PhaseResult:
+        """The controller that the iteration goes on from, its world model, and what training goes on from."""
+        layout, words = self._layout, self._commands.unbundle()
+        controller, bundle = find_init(self._config.init, layout.runs)
+        checkpoints = [layout.checkpoint(number, model) for model in (VAE, MDNRNN)]
+        for path in checkpoints:  # of a life that was killed
+            path.unlink(missing_ok=True)
+        _copy(bundle.path, layout.bundle(number))
+        self._call(number, INIT, words)
+        for tried in self._commands.check_trainings():
+            self._call(number, INIT, tried)
+        controller.save(layout.optimum(number))
+        pilots = self._save_pilots(controller, [controller.parameters], layout.means(number), layout.bundle(number))
+        figures = {"sha256": bundle.sha256, "controller": self._config.init}
+        return PhaseResult((words,), figures, (layout.bundle(number), *checkpoints, layout.optimum(number), *pilots))
+
+    def _collect(self, number: int) -> PhaseResult:
+        return self._drives(number, COLLECT, self._commands.collect(number))
+
+    def _import_kept(self, number: int) -> PhaseResult:
+        return self._drives(number, TAKE, self._commands.import_kept(number))
+
+    def _drive(self, number: int) -> PhaseResult:
+        pilots = sorted(self._layout.means(number - 1).glob("[0-9]*.npz"))
+        return self._drives(number, DRIVE, self._commands.drive(pilots))
+
+    def _drives(self, number: int, name: str, words: Words) -> PhaseResult:
+        told, known = self._call(number, name, words), self._ledger.files
+        new = [path for path in artefacts.drive_files(self._layout) if self._layout.relative(path) not in known]
+        return PhaseResult((words,), {"episodes": told["episodes"], "new": len(new)}, tuple(new))
+
+    def _vae(self, number: int) -> PhaseResult:
+        if self._config.is_from_scratch(number) or self._config.vae != "keep":
+            return self._train(number, VAE)
+        before, path = (self._layout.checkpoint(each, VAE) for each in (self._ledger.model_round(number - 1), number))
+        _copy(before, path)
+        return PhaseResult(made=(path,))
+
+    def _mdnrnn(self, number: int) -> PhaseResult:
+        self._encode(number)  # latents that went, were damaged or are of a later round's encoder; mostly none
+        return self._train(number, MDNRNN)
+
+    def _train(self, number: int, model: str) -> PhaseResult:
+        words = self._commands.train(number, model)
+        return PhaseResult((words,), self._call(number, model, words), (self._layout.checkpoint(number, model),))
+
+    def _encode(self, number: int) -> PhaseResult:
+        words = self._commands.encode(number)
+        self._call(number, ENCODE, words)
+        return PhaseResult((words,))
+
+    def _bundle(self, number: int) -> PhaseResult:
+        self._encode(number)  # as before the training: recorded states are of latents too
+        words = self._commands.bundle(number)
+        told = self._call(number, BUNDLE, words)
+        provenance = Bundle.open(self._layout.bundle(number)).manifest.provenance
+        facts = {name: provenance[name] for name in ("frames", "quality")}
+        return PhaseResult((words,), {"sha256": told["sha256"], **facts}, (self._layout.bundle(number),))
+
+    def _gate(self, number: int) -> PhaseResult:
+        refitted, gate_file = self._layout.refitted(number), self._layout.gate_file(number)
+        commands = self._commands.gate(number)
+        fitting = self._commands.refit(number, refitted) if self._config.gate_losses else ()
+        unfitted = self._refit(number, fitting) if fitting else {}
+        if unfitted:
+            del commands["new"]["losses"]
+        told = {side: {what: self._measure(number, f"{side}-{what}", words) for what, words in each.items()}
+                for side, each in commands.items()}  # fmt: skip
+        if unfitted:
+            told["new"]["losses"] = unfitted
+        _write_json(gate_file, told)
+        figures = {side: gate.figures(each) for side, each in told.items()}
+        verdict = gate.judge(figures["old"], figures["new"])
+        plain = {side: {name: each and asdict(each) for name, each in found.items()} for side, found in figures.items()}
+        words = tuple(words for each in commands.values() for words in each.values())
+        made = (refitted, gate_file) if fitting and not unfitted else (gate_file,)
+        return PhaseResult((fitting, *words) if fitting else words, {**plain, **asdict(verdict)}, made)
+
+    def _refit(self, number: int, words: Words) -> dict[str, Any]:
+        """Nothing, or why the last optimum cannot be fitted to the new model."""
+        try:
+            self._call(number, "gate-refit", words)
+        except UsageError as error:
+            return {"failed": str(error)}
+        return {}
+
+    def _measure(self, number: int, name: str, words: Words) -> dict[str, Any]:
+        """What `inspect` tells; drives that lose too few roads, or all of them at once, tell nothing."""
+        try:
+            return dict(self._call(number, f"gate-{name}", words))
+        except UsageError as error:
+            return {"failed": str(error)}
+
+    def _evolve(self, number: int) -> PhaseResult:
+        layout, name = self._layout, self._layout.run_name(number)
+        words: tuple[Words, ...] = ()
+        if not self._ended(number):
+            local_fleet = self._local_fleet()
+            log.info("run %s is reached at %s", name, ", ".join(local_fleet.listen))
+            words = (self._run_command(number, local_fleet),)
+            evolve(words[0], name, local_fleet, layout.round(number) / "logs", self._stop)
+        with open_run(layout.runs, name) as run:
+            pilots, means = self._pilots(run, layout.means(number))
+            told = _describe_run(run)
+        made = (layout.run(number) / RUN_BUNDLE, layout.optimum(number), *pilots)
+        return PhaseResult(words, {**told, "means": means}, made)
+
+    def _ended(self, number: int) -> bool:
+        if not path_exists(self._layout.run(number) / JOURNAL):
+            return False
+        with open_run(self._layout.runs, self._layout.run_name(number)) as run:
+            return run.ended is not None
+
+    def _run_command(self, number: int, local_fleet: LocalFleet) -> Words:
+        if path_exists(self._layout.run(number) / JOURNAL):
+            return self._commands.resume_run(number, local_fleet.listen, local_fleet.security)
+        start, subspace = None, None
+        if self._config.go_on and not self._config.is_from_scratch(number):
+            start = self._layout.start(number)
+            self._write_start(number, start)
+            subspace = self._find_subspace(number) if self._config.subspace else None
+        return self._commands.begin_run(
+            number, local_fleet.listen, (*local_fleet.coordinator, *local_fleet.security), start, subspace
+        )
+
+    def _find_subspace(self, number: int) -> Path | None:
+        """Where a round's search goes; `None`, everywhere, if its model foretells nothing of the last drives."""
+        path = self._layout.subspace(number)
+        try:
+            self._call(number, "subspace", self._commands.subspace(number, path))
+        except UsageError as error:
+            log.warning("round %d searches all parameters: %s", number, error)
+            return None
+        return path
+
+    def _write_start(self, number: int, path: Path) -> None:
+        """Write the last round's optimum as a controller of the world model that counts now."""
+        layout = self._layout
+        if self._ledger.model_round(number) == self._ledger.model_round(number - 1):
+            shutil.copyfile(layout.optimum(number - 1), path)
+        elif path_exists(layout.refitted(number)):
+            shutil.copyfile(layout.refitted(number), path)
+        else:
+            self._call(number, "refit", self._commands.refit(number, path))
+
+    def _pilots(self, run: RunFolder, folder: Path) -> tuple[list[Path], list[int]]:
+        """The means that drive for the next round, as files beside a link to their world model; their generations."""
+        reported = Controller.load(run.controller_path)
+        told = reported.provenance.get("generation")
+        others = other_means(run.evaluations(), told, self._config.means - 1)
+        vectors = [reported.parameters, *(run.evaluated_mean(each) for each in others)]
+        return self._save_pilots(reported, vectors, folder, run.bundle_path), [int(told or 0), *others]
+
+    def _save_pilots(
+        self, like: Controller, vectors: Sequence[NDArray[np.float32]], folder: Path, bundle: Path
+    ) -> list[Path]:
+        """Controllers of these parameters, beside a link to their world model, which lies in the same layout."""
+        folder.mkdir(parents=True, exist_ok=True)
+        if not path_exists(folder / RUN_BUNDLE):
+            (folder / RUN_BUNDLE).symlink_to(Path("..", "..", "..", self._layout.relative(bundle)))
+        paths = [folder / f"{row}.npz" for row in range(len(vectors))]
+        for path, vector in zip(paths, vectors, strict=True):
+            replace(like, parameters=vector, provenance={}).save(path)
+        return paths
+
+
+def find_init(name: str, runs_dir: Path) -> tuple[Controller, Bundle]:
+    """The controller that an iteration goes on from, and its world model; a `DreamfleetError` says what is missing."""
+    controller, beside = find_controller(name, runs_dir)
+    try:
+        bundle = find_bundle_of(controller, None, beside)
+    except BundleError as error:
+        raise BundleError(
+            f"{error}".replace("name it with --bundle FILE", f"put it beside {name}, as {RUN_BUNDLE}")
+        ) from error
+    if bundle is None:
+        raise UsageError(f"controller {name} sees no world model, and an iteration goes on with one")
+    return controller, bundle
+
+
+def other_means(evaluations: Sequence[StoredEvaluation], reported: int | None, count: int) -> list[int]:
+    """The generations of evaluated means beside the reported one's: the last, then the best; of equals the first.
+
+    The last one is the dream's own optimum, whatever reality made of it: no drives teach the next model more.
+    """
+    last = max((each.generation for each in evaluations), default=None)
+    others = [each for each in evaluations if each.generation != reported]
+    others.sort(key=lambda each: (each.generation != last, -each.mean, each.generation))
+    return [each.generation for each in others[:count]]
+
+
+def _describe_run(run: RunFolder) -> dict[str, Any]:
+    history = run.history()
+    steps = sum(each.steps for each in history)
+    return {"run": run.name, "ended": run.ended, "generations": len(history), "steps": steps, "score": _score(run)}
+
+
+def _score(run: RunFolder) -> dict[str, Any] | None:
+    confirmed = run.confirmation()
+    judged = confirmed or best_evaluation(run.evaluations())
+    if judged is None:
+        return None
+    facts = {"generation": judged.generation, "episodes": judged.episodes, "confirmed": confirmed is not None}
+    return {"mean": judged.mean, "error": judged.error, **facts}
+
+
+def _copy(before: Path, path: Path) -> None:
+    try:
+        with before.open("rb") as source, atomic_write(path) as target:
+            shutil.copyfileobj(source, target)
+    except OSError as error:
+        raise DatasetError(f"cannot write {path}: {error.strerror}; make room, or choose another --data") from error
+
+
+def _write_json(path: Path, content: Any) -> None:
+    with atomic_write(path) as file:
+        file.write(json.dumps(content, indent=1).encode())

@@ -1,0 +1,113 @@
+"""An iteration from phase to phase: each is in the ledger before the next begins."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
+from dreamfleet.common.host.processes import shell_command
+from dreamfleet.common.host.stop_signals import Stop
+from dreamfleet.coordinator.experiments.iteration import artefacts
+from dreamfleet.coordinator.experiments.iteration.commands import Commands, Words
+from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
+from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
+from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
+from dreamfleet.coordinator.experiments.iteration.phases import PhaseRunner
+from dreamfleet.coordinator.experiments.iteration.plan import Phase, PhasePlan
+from dreamfleet.coordinator.experiments.local_run import LocalFleet
+from dreamfleet.coordinator.experiments.verb_process import run_for_json, run_verb
+
+log = logging.getLogger("dreamfleet.coordinator.iterate")
+
+
+class Iteration:
+    """One life of it, in a folder that is held."""
+
+    def __init__(
+        self,
+        layout: IterationFolder,
+        config: IterateConfig,
+        ledger: IterationLedger,
+        local_fleet: Callable[[], LocalFleet],
+        stop: Stop,
+        network_flags: Words = (),
+    ) -> None:
+        """`reached` are the flags of its command that no ledger keeps: where workers come to, and how."""
+        self.ledger = ledger
+        self._resume_command = shell_command("iterate", "--data", layout.root, *network_flags)
+        self._layout, self._config, self._local_fleet, self._stop = layout, config, local_fleet, stop
+        self._plan = PhasePlan(config, bool(ledger.run.get("collect_every")))
+
+    def redo(self, phase: Phase) -> None:
+        """Forget a finished phase and all behind it, and remove what they made."""
+        phases = self._plan.phases_from(phase, self.ledger.finished)
+        self.ledger = artefacts.undo(self._layout, self.ledger, phases)
+        self.ledger.save(self._layout.ledger)
+
+    def begin(self) -> None:
+        """Look whether what is finished is still there; of a new one, whether training takes its flags.
+
+        With `init` its first phase looks, for then they must fit a model that is there.
+        """
+        artefacts.check(self._layout, self.ledger)
+        if self.ledger.entries or self._config.init:
+            return
+        commands = Commands(self._config, self._layout, self.ledger)
+        for model in ("vae", "mdnrnn"):
+            if getattr(self._config, f"{model}_flags"):
+                self._check_flags(commands.check_training(model), model)
+
+    def run_remaining(
+        self,
+        on_begin: Callable[[Phase], None],
+        on_finished: Callable[[FinishedPhase], None],
+        on_line: Callable[[str], None],
+    ) -> None:
+        """Do what is left; `before` hears of each phase as it begins, `after` when it is in the ledger.
+
+        `hear` is told each line of what a phase's verbs say of how far they are.
+        """
+        while (phase := self._plan.next(self.ledger.finished)) is not None:
+            on_begin(phase)
+            entry = self._run_phase(phase, on_line)
+            self.ledger = self.ledger.add(entry)
+            self.ledger.save(self._layout.ledger)
+            on_finished(entry)
+
+    def _run_phase(self, phase: Phase, on_line: Callable[[str], None]) -> FinishedPhase:
+        commands, begun = Commands(self._config, self._layout, self.ledger), time.monotonic()
+        with self._explain_errors(phase):
+            done = PhaseRunner(commands, self._local_fleet, partial(self._ask, on_line), self._stop).do(phase)
+            made = artefacts.hash_artefacts(self._layout, done.made)
+        seconds, at = round(time.monotonic() - begun, 1), datetime.now(UTC).isoformat(timespec="seconds")
+        seed = commands.seed(phase)
+        return FinishedPhase(phase.round, phase.name, seed, seconds, at, done.commands, done.figures or {}, made)
+
+    @contextmanager
+    def _explain_errors(self, phase: Phase) -> Iterator[None]:
+        """Say of which phase an error is, and of a stop how it goes on."""
+        try:
+            yield
+        except StoppedError as error:
+            raise StoppedError(
+                f"{phase}: {error}; what is finished is kept, and goes on with: {self._resume_command}"
+            ) from error
+        except DreamfleetError as error:
+            raise type(error)(f"{phase}: {error}") from error
+
+    def _ask(self, on_line: Callable[[str], None], words: Words, path: Path) -> Any:
+        log.debug("dreamfleet %s", " ".join(words))
+        return run_for_json(words, path, self._stop, on_line)
+
+    def _check_flags(self, words: Words, model: str) -> None:
+        try:
+            run_verb(words, self._layout.root / "logs" / f"{model}.log", self._stop)
+        except UsageError as error:
+            raise UsageError(f"--{model}-flags: {error}") from error

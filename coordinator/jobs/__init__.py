@@ -1,0 +1,1 @@
+"""What is to be scored: generations, evaluations, confirmations, collected rollouts. Pure."""

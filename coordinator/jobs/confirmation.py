@@ -1,0 +1,143 @@
+"""Which evaluated mean a run reports, and what it is worth. Pure: scores in, work out.
+
+The best of many evaluations on few tracks is in part the luckiest. So the best few are driven again, by successive
+halving: all on some tracks, the better half of them on as many tracks more, until one is left. Whatever chose it has
+been kind to it, so its score comes from tracks that took no part in any choice.
+
+Everything follows from the finished evaluations and from scores that the journal holds: a life of the coordinator that
+is interrupted anywhere goes on to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import fsum
+
+import numpy as np
+
+from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.runs.records import StoredConfirmation
+from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, validation_seeds
+from dreamfleet.coordinator.jobs.work import Work, make_work
+
+FINALISTS = 4
+FindScores = Callable[[list[bytes]], Mapping[bytes, float]]
+"""Scores of those of these jobs that have one."""
+
+
+@dataclass(frozen=True)
+class Finalist:
+    """The mean after `generation`, as float32 bytes, and its mean score on all tracks that have judged it so far."""
+
+    generation: int
+    vector: bytes
+    episodes: int
+    mean: float
+
+    def with_scores(self, scores: Sequence[float]) -> Finalist:
+        """With a round's scores added."""
+        episodes = self.episodes + len(scores)
+        mean = fsum((self.mean * self.episodes, *scores)) / episodes
+        return Finalist(self.generation, self.vector, episodes, mean)
+
+
+class Confirmation:
+    """One confirmation: rounds of about `episodes` episodes each, however many finalists are left.
+
+    `closed` is how many generations of the run are.
+    """
+
+    def __init__(self, spec: TaskSpec, episodes: int, finalists: Sequence[Finalist], closed: int) -> None:
+        self.outcome: StoredConfirmation | None = None  # once there is one
+        self._spec = spec
+        self._episodes = episodes
+        self._closed = closed
+        self._remaining = list(finalists)
+        self._next = CHOOSING_OFFSET  # the first track of the next round that chooses
+        self._digests: list[bytes] = []  # of the open round, finalist by finalist
+        self._scores: dict[bytes, float] = {}
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Episodes of the open round: done, wanted."""
+        return len(self._scores), len(self._digests)
+
+    @property
+    def remaining_episodes(self) -> int:
+        """Episodes until there is an outcome."""
+        done, wanted = self.progress
+        return wanted - done + total_episodes(_better_half(self._remaining), self._episodes)
+
+    @property
+    def round_description(self) -> str:
+        """The open round in words."""
+        seeds = len(self._digests) // len(self._remaining)
+        if len(self._remaining) == 1:
+            fresh = plural(seeds, "fresh seed")
+            return f"confirming: generation {self._remaining[0].generation}'s mean on {fresh}, for its score"
+        names = ", ".join(str(each.generation) for each in self._remaining)
+        more = plural(seeds, "more seed")
+        return f"confirming: the means of generations {names} on {more} each; the better half goes on"
+
+    @property
+    def in_progress(self) -> bool:
+        """Whether the open round still wants scores."""
+        return len(self._scores) < len(self._digests)
+
+    def advance(self, known: FindScores) -> list[Work]:
+        """Close the round, whose scores are all there, and open the next: its missing jobs; none with the outcome."""
+        missing: list[Work] = []
+        while self.outcome is None and not missing:
+            if self._digests:
+                self._close()
+            if self.outcome is None:
+                missing = self._open(known)
+        return missing
+
+    def record(self, digest: bytes, score: float) -> None:
+        """Take one accepted score."""
+        if digest in self._digests:
+            self._scores[digest] = score
+
+    def _open(self, known: FindScores) -> list[Work]:
+        first, count = CONFIRMING_OFFSET, self._episodes
+        if len(self._remaining) > 1:
+            first, count = self._next, max(1, self._episodes // len(self._remaining))
+            self._next += count
+        seeds = validation_seeds(count, first)
+        work = [
+            job
+            for each in self._remaining
+            for job in make_work(self._spec, "evaluate", each.generation, 0, each.vector, seeds, first=first)
+        ]
+        self._digests = [each.job.digest for each in work]
+        self._scores = dict(known(self._digests))
+        return [each for each in work if each.job.digest not in self._scores]
+
+    def _close(self) -> None:
+        scores = np.array([self._scores[digest] for digest in self._digests]).reshape(len(self._remaining), -1)
+        self._digests, self._scores = [], {}
+        if len(self._remaining) == 1:
+            self.outcome = self._outcome(scores[0])
+            return
+        judged = [each.with_scores(row.tolist()) for each, row in zip(self._remaining, scores, strict=True)]
+        judged.sort(key=lambda each: (-each.mean, each.generation))
+        self._remaining = judged[: _better_half(judged)]
+
+    def _outcome(self, scores: np.ndarray[tuple[int], np.dtype[np.float64]]) -> StoredConfirmation:
+        std = float(scores.std(ddof=1)) if len(scores) > 1 else 0.0
+        return StoredConfirmation(self._remaining[0].generation, len(scores), float(scores.mean()), std, self._closed)
+
+
+def total_episodes(finalists: int, episodes: int) -> int:
+    """All that a confirmation of so many finalists drives, if its rounds are of about `episodes`."""
+    if finalists < 2:
+        return finalists * episodes
+    return finalists * max(1, episodes // finalists) + total_episodes(-(-finalists // 2), episodes)
+
+
+def _better_half(standing: Sequence[Finalist]) -> int:
+    """How many go on; none where one is left."""
+    return -(-len(standing) // 2) if len(standing) > 1 else 0

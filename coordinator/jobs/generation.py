@@ -1,0 +1,110 @@
+"""One generation: a population, its jobs, the results so far. Pure: no clock, no transport."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.protocol.result_bounds import to_finite
+from dreamfleet.coordinator.jobs.work import Work, make_work
+
+
+@dataclass(frozen=True)
+class CandidateScores:
+    """A generation's candidates at one moment: a column each, in the order of the population."""
+
+    generation: int
+    done: list[int]  # episodes scored
+    wanted: list[int]  # episodes, as far as that is known
+    fitness: list[float | None]  # the mean of the scored episodes; `None` before the first
+
+
+class Generation:
+    """Which candidate's which episode each digest is, and its fitness once known.
+
+    With `racing` every candidate drives the first half of the episodes, and after this barrier the better half of the
+    candidates the others; of equals the one with the lower index goes on. `own` is the run's specification where
+    `spec`, at a raised temperature or in a later stage, is another. Of a dream's episodes a candidate drives the first
+    `driven` in the world that it dreams of.
+    """
+
+    def __init__(
+        self, number: int, spec: TaskSpec, vectors: Sequence[bytes], seeds: Sequence[int], *, racing: bool = False,
+        run_spec: TaskSpec | None = None, driven: int = 0,
+    ) -> None:  # fmt: skip
+        self.number = number
+        self.spec = spec
+        self.is_one_point = len(set(vectors)) == 1 < len(vectors)  # as they travel: nothing can be learned from it
+        parts = (spec.with_overrides(driven=True), seeds[:driven], 0), (spec, seeds[driven:], driven)
+        self.work = [
+            work
+            for candidate, vector in enumerate(vectors)
+            for each, some, first in parts
+            for work in make_work(each, "score", number, candidate, vector, some, run_spec or spec, first)
+        ]
+        # Equal vectors have equal digests: one job then fills the place of each of them.
+        self._places: dict[bytes, list[tuple[int, int]]] = {}
+        for work in self.work:
+            self._places.setdefault(work.job.digest, []).append((work.job.candidate, work.job.episode))
+        self._scores = np.full((len(vectors), len(seeds)), np.nan)
+        self._first = -(-len(seeds) // 2) if racing else len(seeds)
+        self._wanted = np.zeros(self._scores.shape, dtype=bool)
+        self._wanted[:, : self._first] = True
+        self.steps = 0
+
+    @property
+    def missing(self) -> list[Work]:
+        """Wanted jobs without a result, each digest once, candidate by candidate."""
+        first = {work.job.digest: work for work in reversed(self.work)}
+        open_places = self._wanted & np.isnan(self._scores)
+        return [first[digest] for digest, places in self._places.items() if any(open_places[each] for each in places)]
+
+    @property
+    def done(self) -> int:
+        """Episodes scored."""
+        return int(np.isfinite(self._scores).sum())
+
+    @property
+    def total(self) -> int:
+        """Episodes wanted, as far as that is known."""
+        return int((self._wanted | np.isfinite(self._scores)).sum())
+
+    @property
+    def complete(self) -> bool:
+        """Whether every wanted episode is scored."""
+        return self.done == self.total
+
+    def record(self, digest: bytes, fitness: float, steps: int) -> bool:
+        """Take one accepted result of this generation; whether it opened the second half."""
+        for place in self._places[digest]:
+            self._scores[place] = fitness
+        self.steps += steps
+        return self._open_second_half()
+
+    def fitness(self) -> NDArray[np.float64]:
+        """What the strategy is told `(population,)`: the mean of each candidate's own episodes."""
+        return np.asarray(np.nanmean(self._scores, axis=1))
+
+    def candidate_scores(self) -> CandidateScores:
+        """How each candidate is doing now."""
+        scored = np.isfinite(self._scores)
+        done = scored.sum(axis=1)
+        with np.errstate(over="ignore"):  # of a generation that an older version closed
+            totals = np.where(scored, self._scores, 0.0).sum(axis=1)
+        means = [
+            to_finite(total / count) if count else None
+            for total, count in zip(totals.tolist(), done.tolist(), strict=True)
+        ]
+        return CandidateScores(self.number, done.tolist(), (self._wanted | scored).sum(axis=1).tolist(), means)
+
+    def _open_second_half(self) -> bool:
+        first = self._scores[:, : self._first]
+        if self._first == self._scores.shape[1] or self._wanted[:, self._first :].any() or np.isnan(first).any():
+            return False
+        better = np.argsort(-first.mean(axis=1), kind="stable")[: -(-len(first) // 2)]
+        self._wanted[better, self._first :] = True
+        return True

@@ -1,0 +1,57 @@
+"""Closed generations with running sums: what is asked of them costs the same however long a run is. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
+from dreamfleet.common.runs.records import StoredGeneration
+
+
+class History:
+    """Every closed generation, oldest first; it only grows."""
+
+    def __init__(self, rows: Iterable[StoredGeneration] = ()) -> None:
+        self.steps = 0  # environment steps of all of them
+        self.seconds = 0.0
+        self._rows: list[StoredGeneration] = []
+        for row in rows:
+            self.append(row)
+
+    def append(self, row: StoredGeneration) -> None:
+        """Take the generation that has just been closed."""
+        self._rows.append(row)
+        self.steps = clamp_count(self.steps + row.steps)
+        self.seconds = to_finite(self.seconds + row.seconds)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def rows(self) -> Sequence[StoredGeneration]:
+        """All of them, not to be changed; nothing is copied."""
+        return self._rows
+
+    @property
+    def last(self) -> StoredGeneration | None:
+        """The one that was closed last."""
+        return self._rows[-1] if self._rows else None
+
+    def view(self) -> HistoryView:
+        """It as it is now, for other threads; nothing is copied."""
+        return HistoryView(self._rows, len(self._rows))
+
+
+class HistoryView:
+    """The first `length` rows of a list that only grows, so that any thread may read them at any time."""
+
+    def __init__(self, rows: list[StoredGeneration], length: int) -> None:
+        self._rows = rows
+        self._length = length
+
+    def __len__(self) -> int:
+        return self._length
+
+    def part(self, offset: int, limit: int) -> list[StoredGeneration]:
+        """At most `limit` rows from `offset` on."""
+        return self._rows[offset : min(offset + limit, self._length)]

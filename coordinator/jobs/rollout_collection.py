@@ -1,0 +1,80 @@
+"""Rollouts of the mean that are kept: the next world model then learns from what evolved controllers see."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
+from dreamfleet.common.runs.run_folder import rollout_path
+from dreamfleet.common.runs.seeds import collection_seed
+from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler
+from dreamfleet.coordinator.jobs.work import Work, make_work
+
+
+@dataclass(frozen=True)
+class RolloutCollection:
+    """The distribution's mean after `generation`, as float32 bytes, to be driven on `episodes` training tracks."""
+
+    generation: int
+    vector: bytes
+    episodes: int
+
+    def work(self, spec: TaskSpec, run_seed: int, run_spec: TaskSpec | None = None) -> list[Work]:
+        """Its jobs; `own` is the run's specification where `spec` is another."""
+        seeds = [collection_seed(run_seed, self.generation, episode) for episode in range(self.episodes)]
+        return make_work(spec, "collect", self.generation, 0, self.vector, seeds, run_spec)
+
+
+class RolloutCollections:
+    """A run's kept rollouts: which are still to come, and each one's file in the run's `folder` once it is whole."""
+
+    def __init__(self, folder: Path) -> None:
+        self.uploads = UploadAssembler()
+        self._folder = folder
+        self._missing: set[bytes] = set()  # digests
+        self._scheduled = 0  # rollouts, ever
+
+    def open(self, work: list[Work], known: Container[bytes]) -> list[Work]:
+        """Want these rollouts, of which some may be kept already; the missing jobs."""
+        missing = [each for each in work if each.job.digest not in known]
+        self._scheduled += len(work)
+        self._missing.update(each.job.digest for each in missing)
+        return missing
+
+    def finish(self, digest: bytes) -> None:
+        """Count a rollout whose result was accepted."""
+        self._missing.discard(digest)
+
+    @property
+    def in_progress(self) -> int:
+        """Rollouts that are still to come."""
+        return len(self._missing)
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Rollouts of the whole run: kept, wanted."""
+        return self._scheduled - len(self._missing), self._scheduled
+
+    def receive(self, worker: str, result: Result, work: Work | None) -> Result | None:
+        """The result as it may be judged, its rollout on disk if it has one; `None` while the rollout is on its way."""
+        if work is None or work.job.kind != "collect" or result.fitness is None:
+            return result
+        if result.upload is None:
+            return replace(result, fitness=None, error="the rollout was not kept: update dreamfleet on this host")
+        data = self.uploads.get_complete(worker, result.digest, result.upload)
+        if data is None:
+            return None
+        self._save_rollout(work.job, data)
+        return result
+
+    def _save_rollout(self, job: Job, data: bytes) -> None:
+        path = rollout_path(self._folder, job.generation, job.episode)
+        try:
+            with atomic_write(path) as file:
+                file.write(data)
+        except OSError as error:
+            raise JournalError(f"cannot write {path}: {error.strerror}; make room and continue the run") from error

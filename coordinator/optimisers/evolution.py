@@ -1,0 +1,184 @@
+"""A run's optimiser: built from the run's settings, held to its contract, and continued from the journal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.subspace import SearchSpace, Subspace
+from dreamfleet.common.errors import DreamfleetError, JournalError, UsageError
+from dreamfleet.common.printable import one_line
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.runs.seeds import search_seed
+from dreamfleet.common.runs.stages import Stage
+from dreamfleet.coordinator.optimisers.api import Search
+from dreamfleet.coordinator.optimisers.checkpoint import PREFIX, Checkpoint, Head
+from dreamfleet.coordinator.optimisers.registry import build_optimiser
+
+Covariance = Literal["diagonal", "full"]
+
+
+@dataclass(frozen=True)
+class EvolutionConfig:
+    """What makes one search: `dimension` parameters, `population` candidates a generation, first step `sigma0`."""
+
+    dimension: int
+    population: int
+    sigma0: float
+    covariance: Covariance
+    seed: int
+    optimiser: str = "cma"
+    optimiser_options: tuple[str, ...] = ()  # each as name=value
+    space: SearchSpace | None = None  # what the search keeps to; `None`: all parameters
+
+    def __post_init__(self) -> None:
+        if self.population < 2:
+            raise UsageError(f"population must be at least 2, not {self.population}")
+        if not 0 < self.sigma0 < float("inf"):
+            raise UsageError(f"sigma0 must be a positive number, not {self.sigma0}")
+
+    @classmethod
+    def of(cls, settings: RunSettings, stage: Stage, subspace: Subspace | None = None) -> EvolutionConfig:
+        """As a run's settings say for the search that goes on in this stage; `subspace` is the run's."""
+        return cls(
+            settings.controller.size,
+            stage.population,
+            stage.sigma0,
+            settings.covariance,
+            search_seed(settings.seed, stage.search),
+            settings.optimiser,
+            settings.optimiser_options,
+            None if subspace is None or stage.whole else SearchSpace(subspace, settings.controller),
+        )
+
+    def search(self, start: NDArray[np.float64]) -> Search:
+        """What the optimiser is built from, to begin at `start` `(dimension,)`: of a subspace at its origin."""
+        mean = start if self.space is None else np.zeros(self.space.dimension)
+        # It is a setting of its own, older than options; its default is none, so that every optimiser takes it.
+        covariance = () if self.covariance == "diagonal" else (f"covariance={self.covariance}",)
+        options = _options([*self.optimiser_options, *covariance])
+        return Search(mean, self.population, self.sigma0, self.seed, options)
+
+
+class Evolution:
+    """Maximises fitness by the run's optimiser; a checkpoint is taken between tell and ask.
+
+    >>> evolution = Evolution(EvolutionConfig(dimension=3, population=4, sigma0=0.1, covariance="diagonal", seed=1))
+    >>> candidates = evolution.ask()
+    >>> evolution.tell(np.array([1.0, 2.0, 3.0, 4.0]))
+    """
+
+    def __init__(self, config: EvolutionConfig, start: NDArray[np.float64] | None = None) -> None:
+        self._config = config
+        self._origin = np.zeros(config.dimension) if start is None else np.asarray(start, dtype=np.float64)
+        self._optimiser = build_optimiser(config.optimiser, config.search(self._origin))
+        self._is_open = False  # asked, and not yet told
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """The best guess `(dimension,)`."""
+        return self._to_parameters(np.array(self._optimiser.mean, dtype=np.float64))
+
+    @property
+    def sigma(self) -> float:
+        """The overall step size, of a search in a subspace in its coordinates."""
+        return float(self._optimiser.sigma)
+
+    @property
+    def axis_ratio(self) -> float | None:
+        """The longest axis of the distribution by the shortest; `None` where the optimiser does not say."""
+        with np.errstate(all="ignore"):
+            found = getattr(self._optimiser, "axis_ratio", None)
+        return float(found) if isinstance(found, (int, float)) and math.isfinite(found) else None
+
+    def ask(self) -> NDArray[np.float64]:
+        """The next population `(population, dimension)`; `DreamfleetError` if the optimiser breaks its contract."""
+        asked = np.asarray(self._optimiser.ask(), dtype=np.float64)
+        space = self._config.space
+        wanted = self._config.population, self._config.dimension if space is None else space.dimension
+        if asked.shape != wanted:
+            raise DreamfleetError(f"optimiser {self._config.optimiser!r} asked for {asked.shape} numbers, not {wanted}")
+        asked = self._to_parameters(asked)
+        with np.errstate(over="ignore"):
+            travels = np.isfinite(asked.astype(np.float32)).all() and np.isfinite(self.sigma)
+        if not travels:
+            raise DreamfleetError(
+                f"optimiser {self._config.optimiser!r} asked for what no single-precision number can hold, at "
+                f"step size {self.sigma:g}: it cannot go on; fork the run with another --sigma0 or --optimiser"
+            )
+        self._is_open = True
+        return asked
+
+    def tell(self, fitness: NDArray[np.float64]) -> None:
+        """Update the distribution; `fitness` `(population,)`, larger is better, in the order of `ask`."""
+        if fitness.shape != (self._config.population,) or not np.isfinite(fitness).all():
+            raise ValueError(f"tell needs {self._config.population} finite numbers")  # pycma accepts NaN silently
+        self._optimiser.tell(fitness)
+        self._is_open = False
+
+    def prepare(self) -> None:
+        """Do now what the next `ask` would do, as far as it does not depend on `tell`."""
+        self._optimiser.prepare()
+
+    def state(self) -> Checkpoint:
+        """Everything that the next `ask` depends on."""
+        assert not self._is_open, "a state is taken between tell and ask"
+        state = self._optimiser.state()
+        unfit = [name for name, array in state.items() if name.startswith(PREFIX) or array.dtype.hasobject]
+        if unfit:
+            raise DreamfleetError(
+                f"optimiser {self._config.optimiser!r} has a state that cannot be kept, in {', '.join(unfit)}: arrays "
+                f"hold numbers or text, and names that begin with {PREFIX!r} are taken"
+            )
+        origin = None if self._config.space is None else self._origin
+        head = Head(self._config.optimiser, self._optimiser.requirement, self.mean, self.sigma, origin)
+        return Checkpoint(head, state)
+
+    def _read_origin(self, head: Head) -> NDArray[np.float64]:
+        """From where a state's coordinates count; `ValueError` if it does not say."""
+        origin = None if head.origin is None else np.asarray(head.origin, dtype=np.float64)
+        if origin is None or origin.shape != self._origin.shape:
+            raise ValueError("the origin of its subspace is not there")
+        if not (np.abs(origin) <= np.finfo(np.float32).max).all():  # false for NaN too
+            raise ValueError("the origin of its subspace holds what no single-precision number can")
+        return origin
+
+    def _to_parameters(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The parameters `(..., dimension)` that what the optimiser knows of stands for."""
+        space = self._config.space
+        return coordinates if space is None else space.lift(self._origin, coordinates)
+
+    def restore(self, state: bytes) -> None:
+        """Continue from a packed `state` of an equal configuration; `JournalError` if another optimiser wrote it."""
+        checkpoint, name, requirement = Checkpoint.unpack(state), self._config.optimiser, self._optimiser.requirement
+        head = checkpoint.head
+        if head.name != name:
+            raise JournalError(f"this state was written by optimiser {head.name!r}, not by {name!r}")
+        if head.requirement != requirement:
+            raise JournalError(
+                f"this run was written with {head.requirement}: pip install {head.requirement} (now {requirement})"
+            )
+        try:
+            if self._config.space is not None:
+                self._origin = self._read_origin(head)
+            self._optimiser.restore(checkpoint.state)
+        except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+            why = one_line(f"{type(error).__name__}: {error}")
+            raise JournalError(f"the journal's last state is damaged ({why}): restore it from a copy") from error
+        self._is_open = False
+
+
+def _options(given: Sequence[str]) -> dict[str, str]:
+    """Options from `name=value` each; an empty text is none."""
+    options: dict[str, str] = {}
+    for text in filter(None, given):
+        name, equals, value = text.partition("=")
+        if not equals or not name or name in options:
+            raise UsageError(f"--optimiser-options takes name=value, each name once, not {text!r}")
+        options[name] = value
+    return options

@@ -1,0 +1,158 @@
+"""What a run wants beside scoring: its mean evaluated, rollouts of it kept. It fills what scoring leaves idle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
+from dreamfleet.common.runs.run_folder import CONFIRMED, CONTROLLER
+from dreamfleet.common.runs.scoring_params import ScheduleState
+from dreamfleet.coordinator.jobs.confirmation import FINALISTS, Confirmation, total_episodes
+from dreamfleet.coordinator.jobs.evaluation import Evaluation, Evaluations
+from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection, RolloutCollections
+from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.run.report import ControllerWriter
+from dreamfleet.coordinator.settings.run_provenance import build_provenance
+from dreamfleet.coordinator.storage.journal import Journal
+
+
+class BackgroundJobs:
+    """Evaluations and kept rollouts of one run, and the report that follows from the evaluations."""
+
+    def __init__(
+        self, journal: Journal, settings: RunSettings, run_uid: str, history: History,
+        evaluations: Iterable[StoredEvaluation], agenda: ScheduleState,
+    ) -> None:  # fmt: skip
+        """`agenda` knows the terms of each generation before the means after it are wanted."""
+        folder = journal.path.parent
+        self.evaluations = Evaluations(evaluations)
+        self.rollout_collections = RolloutCollections(folder)
+        self.report = ControllerWriter(
+            folder / CONTROLLER, run_uid, settings, lambda: build_provenance(journal, settings, len(history))
+        )
+        self._journal = journal
+        self._settings = settings
+        self._history = history
+        self._agenda = agenda
+        self._confirmation: Confirmation | None = None  # while the run is ending
+        text = journal.fact(CONFIRMED)
+        self._confirmed = None if text is None else StoredConfirmation.from_json(text)
+
+    @property
+    def in_progress(self) -> bool:
+        """Whether anything is still to come of what was begun."""
+        confirming = self._confirmation is not None and self._confirmation.in_progress
+        return bool(self.evaluations.in_progress or self.rollout_collections.in_progress or confirming)
+
+    @property
+    def confirmed(self) -> StoredConfirmation | None:
+        """The confirmed score of what is reported; `None` where what is reported is not confirmed."""
+        found = self._confirmed
+        return found if found is not None and found.covers(self.evaluations.best) else None
+
+    @property
+    def confirming(self) -> tuple[int, int]:
+        """Episodes of the confirmation's open round: done, wanted."""
+        return (0, 0) if self._confirmation is None else self._confirmation.progress
+
+    def episodes_until_end(self, *, ending: bool) -> int:
+        """Episodes of means that are waited for when a limit is reached, as `ending` says it is: as far as is known.
+
+        Those of evaluations in progress, of the last one, and of the confirmation.
+        """
+        settings, (done, wanted) = self._settings, self.evaluations.progress
+        if self._confirmation is not None:
+            return wanted - done + self._confirmation.remaining_episodes
+        if ending and self._confirmed is not None and self._confirmed.closed == len(self._history):
+            return wanted - done
+        last = not ending and settings.evaluate_every > 0
+        finalists = min(len(self.evaluations) + self.evaluations.in_progress + last, FINALISTS)
+        confirming = total_episodes(finalists, settings.confirm_episodes)
+        return wanted - done + last * settings.evaluation_episodes + confirming
+
+    @property
+    def round_description(self) -> str:
+        """The confirmation's open round, in words."""
+        return "" if self._confirmation is None else self._confirmation.round_description
+
+    def begin(self, mean: bytes, now: float) -> list[Work]:
+        """Continue where the last incarnation ended: what is reported, and the missing jobs."""
+        if (last := self._history.last) is not None:
+            self.report.generation_closed(last.number, mean, self._history.steps, now)
+        if (judged := self.confirmed or self.evaluations.best) is not None:
+            self.report.set_judged(judged, self._journal.evaluated_vector(judged.generation), self._history.steps)
+        evaluations = [
+            each for evaluation in self._journal.pending_evaluations() for each in self._evaluate(evaluation)
+        ]
+        return evaluations + [each for item in self._journal.scheduled_collections() for each in self._collect(item)]
+
+    def schedule(self, generation: int, mean: bytes, now: float, *, last: bool) -> list[Work]:
+        """The jobs that are due after a generation was closed; after the `last` one all are."""
+        settings, work = self._settings, []
+        self.report.generation_closed(generation, mean, self._history.steps, now)
+        if _is_due(settings.evaluate_every, generation, last=last):
+            evaluation = Evaluation(generation, mean, settings.evaluation_episodes)
+            self._journal.schedule_evaluation(evaluation)
+            work += self._evaluate(evaluation)
+        if _is_due(settings.collect_every, generation, last=last):
+            collection = RolloutCollection(generation, mean, settings.collect_episodes)
+            self._journal.schedule_collection(collection)
+            work += self._collect(collection)
+        return work
+
+    def count(self, work: Work, result: Result) -> None:
+        """Take an accepted result, which is in the journal."""
+        if work.job.kind == "collect":
+            self.rollout_collections.finish(result.digest)
+            return
+        assert result.fitness is not None
+        for generation in self.evaluations.record(result.digest, result.fitness):
+            self._finish(generation)
+        if self._confirmation is not None:
+            self._confirmation.record(result.digest, result.fitness)
+
+    def confirm(self) -> list[Work]:
+        """The run is ending and nothing is in progress: the next jobs that confirm what it reports.
+
+        None once it is confirmed, or where nothing was evaluated.
+        """
+        closed = len(self._history)
+        if self._confirmation is None:
+            if self._confirmed is not None and self._confirmed.closed == closed:
+                return []
+            episodes, finalists = self._settings.confirm_episodes, self._journal.finalists(FINALISTS)
+            if not (episodes and finalists):
+                return []
+            self._confirmation = Confirmation(self._settings.task, episodes, finalists, closed)
+        work = self._confirmation.advance(self._journal.fitness_of)
+        if (outcome := self._confirmation.outcome) is not None:
+            self._journal.set_fact(CONFIRMED, outcome.to_json())
+            self._confirmation, self._confirmed = None, outcome
+            self.report.set_judged(outcome, self._journal.evaluated_vector(outcome.generation), self._history.steps)
+        return work
+
+    def _evaluate(self, evaluation: Evaluation) -> list[Work]:
+        wanted = [each.job.digest for each in evaluation.work(self._settings.task)]
+        work = self.evaluations.open(evaluation, self._settings.task, self._journal.fitness_of(wanted))
+        self._finish(evaluation.generation)
+        return work
+
+    def _finish(self, generation: int) -> None:
+        found = self.evaluations.finish(generation)
+        if found is None:
+            return
+        finished, vector = found
+        self._journal.finish_evaluation(generation, finished.mean, finished.std)
+        if self.evaluations.best is finished:
+            self.report.set_judged(finished, vector, self._history.steps)
+
+    def _collect(self, collection: RolloutCollection) -> list[Work]:
+        known = self._journal.results_of("collect", collection.generation)
+        spec, settings = self._agenda.spec(collection.generation), self._settings
+        return self.rollout_collections.open(collection.work(spec, settings.seed, settings.task), known)
+
+
+def _is_due(every: int, generation: int, *, last: bool) -> bool:
+    return every > 0 and (generation % every == every - 1 or last)

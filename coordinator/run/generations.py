@@ -1,0 +1,136 @@
+"""From the strategy to generations and back: what is asked is journalled, continued to the bit, and told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.scoring_params import ScheduleState, ScoringParams
+from dreamfleet.common.runs.seeds import training_seed
+from dreamfleet.common.runs.stages import Stage, stages_of
+from dreamfleet.coordinator.jobs.generation import CandidateScores, Generation
+from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, stored_start_mean, stored_subspace
+from dreamfleet.coordinator.storage.journal import Journal, StoredOpenGeneration
+
+
+class Generations:
+    """One generation is open at a time; `evaluations` are the finished ones, by generation, as they become known."""
+
+    def __init__(
+        self, journal: Journal, settings: RunSettings, agenda: ScheduleState, history: History,
+        evaluations: Mapping[int, StoredEvaluation],
+    ) -> None:  # fmt: skip
+        self.history = history
+        self.scoring_params: ScoringParams  # of the generation that is open
+        self.last: CandidateScores | None = None  # of the generation that was closed last
+        self._journal = journal
+        self._settings = settings
+        self._agenda = agenda
+        self._evaluations = evaluations
+        self._subspace = stored_subspace(journal.fact(SUBSPACE_FACT), settings, journal.path)
+        self._strategy = self._search(stages_of(settings)[0], stored_start_mean(journal))
+
+    @property
+    def mean(self) -> bytes:
+        """The distribution's mean as it would travel."""
+        return vector_bytes(self._strategy.mean)
+
+    @property
+    def sigma(self) -> float:
+        """The strategy's overall step size."""
+        return self._strategy.sigma
+
+    @property
+    def axis_ratio(self) -> float | None:
+        """The longest axis of the strategy's distribution by the shortest; `None` where it does not say."""
+        return self._strategy.axis_ratio
+
+    def prepare(self) -> None:
+        """Work ahead while workers are busy."""
+        self._strategy.prepare()
+
+    def begin(self) -> Generation:
+        """The first generation of a new run, or the one that was open when the last incarnation ended."""
+        stored = self._journal.last_generation()
+        if stored is None:
+            return self.open(0)
+        before = self._journal.generation(stored.number - 1)
+        earlier = None if before is None else self._terms(before.number)
+        self.scoring_params = self._terms(stored.number)
+        if self.scoring_params.stage.search > 1:
+            self._strategy = self._search(self.scoring_params.stage, self._strategy.mean)
+        self._strategy.restore(stored.state)
+        vectors = tuple(vector_bytes(x) for x in self._strategy.ask())
+        if vectors != stored.vectors:
+            raise JournalError(
+                f"generation {stored.number} cannot be continued: the strategy asks for another population than the "
+                "journal holds; use the host and package versions that wrote it"
+            )
+        if before is not None and earlier is not None:
+            self.last = self._recall(before, earlier).candidate_scores()
+        return self._recall(stored, self.scoring_params)
+
+    def open(self, number: int) -> Generation:
+        """Ask for the next population; it is written with the strategy's state from before."""
+        self.scoring_params = scoring_params = self._terms(number)
+        if number and scoring_params.begun.since == number and scoring_params.stage.starts_new_search:
+            self._strategy = self._search(scoring_params.stage, self._strategy.mean)
+        state, sigma = self._strategy.state(), self._strategy.sigma
+        vectors = [vector_bytes(x) for x in self._strategy.ask()]
+        seeds = [
+            training_seed(self._settings.seed, number, episode) for episode in range(scoring_params.stage.episodes)
+        ]
+        self._journal.open_generation(number, state, sigma, seeds, vectors)
+        return self._generation(number, vectors, seeds, scoring_params)
+
+    def close(self, generation: Generation, seconds: float) -> StoredGeneration:
+        """Tell the strategy what the generation gave; it took so many seconds."""
+        fitness = generation.fitness()
+        closed = StoredGeneration(
+            number=generation.number,
+            mean=float(fitness.mean()),
+            std=float(fitness.std()),
+            best=float(fitness.max()),
+            worst=float(fitness.min()),
+            sigma=self._strategy.sigma,
+            steps=generation.steps,
+            seconds=seconds,
+        )
+        self._strategy.tell(fitness)
+        self._journal.close_generation(closed, fitness)
+        self.history.append(closed)
+        self.last = generation.candidate_scores()
+        return closed
+
+    def _terms(self, number: int) -> ScoringParams:
+        return self._agenda.scoring_params(number, self.history.rows, self._evaluations)
+
+    def _search(self, stage: Stage, start: NDArray[np.float64] | None) -> Evolution:
+        return Evolution(EvolutionConfig.of(self._settings, stage, self._subspace), start)
+
+    def _recall(self, stored: StoredOpenGeneration, scoring_params: ScoringParams) -> Generation:
+        generation = self._generation(stored.number, stored.vectors, stored.seeds, scoring_params)
+        for digest, (fitness, steps) in self._journal.results_of("score", stored.number).items():
+            generation.record(digest, fitness, steps)
+        return generation
+
+    def _generation(
+        self, number: int, vectors: Sequence[bytes], seeds: Sequence[int], scoring_params: ScoringParams
+    ) -> Generation:
+        run_spec, stage = self._settings.task, scoring_params.stage
+        return Generation(
+            number,
+            scoring_params.spec,
+            vectors,
+            seeds,
+            racing=stage.racing,
+            run_spec=run_spec,
+            driven=stage.driven_episodes,
+        )

@@ -1,0 +1,1 @@
+"""The coordinator on Zenoh: name lock, inbound queue, status, metrics."""

@@ -1,0 +1,105 @@
+"""What has arrived and waits for the owner thread: bounded by kind, in count and in bytes. Pure: sizes and a clock in.
+
+Whatever comes over the wire is said again by whoever needs it to be heard: results and uploads until their verdict,
+beats each interval, hellos until they are answered; a departure that was overlooked shows as silence. So what is too
+much is dropped and counted: no flood fills the memory, and one of a kind leaves room for the others.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import threading
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import Any
+
+from dreamfleet.common.protocol.messages import MAX_MESSAGE
+
+
+@dataclass(frozen=True)
+class QueueLimit:
+    """How much of a kind may wait; and how many may come in a second, a burst aside."""
+
+    count: int
+    size: int  # bytes
+    rate: float = math.inf
+
+
+HELLO_PATIENCE = 32  # events after which a hello is taken before others
+QUEUE_LIMITS = {
+    "result": QueueLimit(2048, 16 << 20),
+    "beat": QueueLimit(2048, 8 << 20),
+    "upload": QueueLimit(512, 20 << 20),
+    "token": QueueLimit(4096, 1),  # without a payload
+    "hello": QueueLimit(256, 4 << 20, 100.0),  # each costs what dozens of results cost, and who is not heard asks again
+    "control": QueueLimit(64, 1 << 20),
+}
+
+
+class InboundQueue:
+    """A queue that any thread may put into; one takes out."""
+
+    def __init__(self, bounds: dict[str, QueueLimit] = QUEUE_LIMITS) -> None:
+        self._bounds = bounds
+        self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()  # one for each event, and for each wake
+        self._first: deque[tuple[str, Any, int]] = deque()
+        self._later: deque[tuple[str, Any, int]] = deque()
+        self._passed_over = 0
+        self._count: Counter[str] = Counter()
+        self._size: Counter[str] = Counter()
+        self._budget = {kind: (float(bound.count), -math.inf) for kind, bound in bounds.items()}  # how many, as of when
+        self._dropped: Counter[str] = Counter()
+        self._lock = threading.Lock()
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """What was not taken in, by reason."""
+        with self._lock:
+            return Counter(self._dropped)
+
+    def put(self, kind: str, event: Any, size: int, now: float) -> bool:
+        """Take in an event of so many bytes; whether there was room for it."""
+        with self._lock:
+            if why := self._drop_reason(kind, size, now):
+                self._dropped[why] += 1
+                return False
+            self._count[kind] += 1
+            self._size[kind] += size
+            (self._later if kind == "hello" else self._first).append((kind, event, size))
+        self._wakeups.put(None)
+        return True
+
+    def wake(self) -> None:
+        """End a wait without an event. Safe in a signal handler."""
+        self._wakeups.put(None)
+
+    def get(self, timeout: float) -> tuple[str, Any]:
+        """The oldest event, hellos after all else but for one in a while; `queue.Empty` after `timeout` seconds."""
+        self._wakeups.get(timeout=timeout)
+        with self._lock:
+            hello = self._later and (not self._first or self._passed_over >= HELLO_PATIENCE)
+            waiting = self._later if hello else self._first
+            self._passed_over = 0 if hello else self._passed_over + 1
+            if not waiting:
+                return "wake", None
+            kind, event, size = waiting.popleft()
+            self._count[kind] -= 1
+            self._size[kind] -= size
+        return kind, event
+
+    def _drop_reason(self, kind: str, size: int, now: float) -> str:
+        bound = self._bounds[kind]
+        if size > MAX_MESSAGE:
+            return "oversize"
+        if self._count[kind] >= bound.count or self._size[kind] + size > bound.size:
+            return "too many at once"
+        return "" if bound.rate == math.inf or self._spend_token(kind, bound, now) else "too many in a second"
+
+    def _spend_token(self, kind: str, bound: QueueLimit, now: float) -> bool:
+        """Whether one more may come now: as many as may wait at once, and then `rate` a second."""
+        left, then = self._budget[kind]
+        left = min(left + bound.rate * max(now - then, 0.0), float(bound.count))
+        enough = left >= 1.0
+        self._budget[kind] = (left - enough, now)
+        return enough

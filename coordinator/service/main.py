@@ -1,0 +1,139 @@
+"""From a request to a served run: the folder, its lock, its journal, the service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import monotonic
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.cli.global_config import GlobalConfig
+from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
+from dreamfleet.common.protocol.keys import check_run_name
+from dreamfleet.common.protocol.messages import Intervals
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.runs.run_folder import ARCHIVE, BUNDLE, JOURNAL, open_run, run_lock
+from dreamfleet.common.security.certificate_ledger import RevocationWatcher
+from dreamfleet.common.security.credentials import Credentials
+from dreamfleet.common.transport.session import Network
+from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.service.service import Service
+from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.settings.resume_settings import resume_command, serving_facts
+from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, StartPoint
+from dreamfleet.coordinator.storage.file_watch import FileWatch
+from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.coordinator.storage.served_bundle import ServedBundle
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What to serve; without `config` the run is continued."""
+
+    name: str
+    runs_dir: Path
+    config: RunConfig | None
+    limits: LimitsConfig
+    network: NetworkConfig
+    start: StartPoint | None = None  # of a new run; it begins with zero parameters otherwise
+    credentials: Credentials | None = None
+    join: Path | None = None  # the file of the credentials
+    access_dir: Path = GlobalConfig.access_dir  # whose list says what is revoked
+
+    @property
+    def folder(self) -> Path:
+        """Where the run lies."""
+        return self.runs_dir / check_run_name(self.name)
+
+    @property
+    def with_absolute_paths(self) -> RunRequest:
+        """The same with paths that hold in whichever folder somebody is."""
+        access = self.access_dir if self.access_dir == GlobalConfig.access_dir else self.access_dir.absolute()
+        join = None if self.join is None else self.join.absolute()
+        return replace(self, runs_dir=self.runs_dir.absolute(), join=join, access_dir=access)
+
+    def resume_command(self, folder: Path | None = None) -> str:
+        """The command that continues the run, also in a `folder` that it was moved to."""
+        return resume_command(folder or self.folder, self.join, self.access_dir)
+
+
+def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
+    """Serve a new or continued run until it ends or is stopped; `on_stoppable` is handed the way to stop it."""
+    folder = request.folder
+    if request.config is not None and request.name == ARCHIVE:
+        raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
+    settings, bundle = _resolve_settings(request, folder)
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise JournalError(
+            f"cannot write in {request.runs_dir}: {error.strerror}; choose another --runs-dir"
+        ) from error
+    with run_lock(folder), ExitStack() as stack:
+        journal = stack.enter_context(closing(_open_journal(request, folder, settings, bundle)))
+        served = stack.enter_context(closing(ServedBundle(folder / BUNDLE))) if bundle else None
+        file_watch = stack.enter_context(
+            closing(FileWatch(journal, served, request.with_absolute_paths.resume_command))
+        )
+        service = _service(request, file_watch, served)
+        on_stoppable(service.stop)
+        fleet, strict = Fleet(request.network.beat, request.network.evaluation_share), request.network.strict
+        try:
+            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), strict=strict))
+        except ConnectionFailedError as error:
+            if request.config is None:
+                raise
+            raise ConnectionFailedError(
+                f"{error}; the run is made, and begins with: {request.resume_command()}"
+            ) from error
+
+
+def _service(request: RunRequest, file_watch: FileWatch, bundle: ServedBundle | None) -> Service:
+    network = request.network
+    intervals = Intervals(network.beat, network.beat)
+    revocations = RevocationWatcher(request.access_dir, request.credentials)
+    reached = Network(network.listen, network.connect, request.credentials, revocations.revoked_seats)
+    return Service(request.name, reached, intervals, file_watch, bundle, network.metrics_port, revocations)
+
+
+def _open_journal(request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None) -> Journal:
+    """The run's journal, with how it is served.
+
+    It is written before anything else can fail, as is where a new run begins, in the transaction that makes the run: a
+    coordinator that finds its port taken, or is killed, is continued with all that it was told.
+    """
+    facts = serving_facts(request.limits, request.network)
+    if request.config is not None:
+        start = request.start.facts if request.start else {}
+        loaded_subspace = {SUBSPACE_FACT: request.config.loaded_subspace.text} if request.config.loaded_subspace else {}
+        return Journal.create(folder, settings, bundle.path if bundle else None, {**facts, **start, **loaded_subspace})
+    journal = Journal(folder / JOURNAL)
+    for name, text in facts.items():
+        journal.set_fact(name, text)
+    journal.commit()
+    return journal
+
+
+def _resolve_settings(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle | None]:
+    """What the run is, and its verified bundle if it has one."""
+    if request.config is not None:
+        return _resolve_new_settings(request.config, request.start)
+    with open_run(request.runs_dir, request.name) as stored:
+        settings = stored.settings
+    if not settings.task.bundle:
+        return settings, None
+    return settings, Bundle.open(folder / BUNDLE, settings.task.bundle)
+
+
+def _resolve_new_settings(config: RunConfig, start: StartPoint | None) -> tuple[RunSettings, Bundle | None]:
+    if start is not None and config.needs_no_bundle == (not start.bundle):
+        config = start.apply_to(config)
+    bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
+    settings = config.settings(bundle)
+    if start is not None:
+        start.check(settings)
+    return settings, bundle

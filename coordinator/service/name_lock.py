@@ -1,0 +1,121 @@
+"""A coordinator's claim to its run's name on the wire, for as long as it serves: of two of one name one must leave."""
+
+from __future__ import annotations
+
+import queue
+from contextlib import ExitStack
+from time import monotonic, time
+from typing import Any
+
+import zenoh
+
+from dreamfleet.common.errors import RefusedError
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import decode_json, encode_json
+from dreamfleet.common.protocol.messages import ClaimNote
+from dreamfleet.common.serialization.validation import MalformedError
+from dreamfleet.common.transport.session import LEASE_MS, enqueue_into
+from dreamfleet.coordinator.service.leader_check import LeaderCheck
+
+DISCOVERY_SECONDS = 0.3  # seconds in which the tokens that are there come into sight
+PATIENCE = LEASE_MS / 1000 + 1  # a token of one who is gone vanishes before
+TIMEOUT = 2.0  # seconds of a question
+
+
+class NameLock:
+    """Watches the other coordinators' tokens; `stack` ends the watch, and first takes the own token back."""
+
+    def __init__(self, session: zenoh.Session, run: str, nonce: str, stack: ExitStack) -> None:
+        self._session = session
+        self._run = run
+        self._nonce = nonce
+        self._rivals = LeaderCheck(nonce, PATIENCE)
+        self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._stack = stack
+        watcher = session.liveliness().declare_subscriber(
+            keys.live_coordinator(run, "*"), enqueue_into(self._inbox, "token"), history=True
+        )
+        stack.callback(watcher.undeclare)
+
+    def acquire(self) -> None:
+        """Take the name; `RefusedError` if somebody who lives has it: a newcomer has nothing to lose."""
+        until = monotonic() + DISCOVERY_SECONDS
+        while (now := monotonic()) < until or self._rivals.has_any:
+            self._listen(now, DISCOVERY_SECONDS / 10)
+            if self._rivals.live(now):
+                raise RefusedError(f"run {self._run} has a live coordinator already: stop it, or choose another --run")
+        token = self._session.liveliness().declare_token(keys.live_coordinator(self._run, self._nonce))
+        self._stack.callback(token.undeclare)
+
+    def announce(self, run_uid: str, incarnation: int) -> None:
+        """Say from now on who this coordinator is, to whoever asks."""
+        note = ClaimNote(run_uid=run_uid, incarnation=incarnation, nonce=self._nonce, began=time())
+        self._rivals.own_note, payload = note, encode_json(note)
+        key = keys.claim(self._run, self._nonce)
+
+        def answer(query: zenoh.Query) -> None:
+            """In the queryable's own thread: the loop may be busy."""
+            with query:
+                if query.payload is not None:  # who asks says who it is
+                    self._inbox.put(("note", query.payload.to_bytes()))
+                query.reply(key, payload, encoding="application/json")
+
+        queryable = self._session.declare_queryable(key, zenoh.handlers.Callback(answer, indirect=False))
+        self._stack.callback(queryable.undeclare)
+
+    def check(self, now: float) -> None:
+        """`RefusedError` if another coordinator of this name goes on, so that this one leaves."""
+        self._listen(now, 0.0)
+        found = self._rivals.find_stronger(now)
+        if found is not None:
+            raise RefusedError(self._explain(found[1]))
+
+    def _listen(self, now: float, wait: float) -> None:
+        """Take in what was seen and said, waiting for so many seconds at most; ask whoever is new."""
+        try:
+            self._handle(*self._inbox.get(timeout=wait), now) if wait else self._handle(*self._inbox.get_nowait(), now)
+            while True:
+                self._handle(*self._inbox.get_nowait(), now)
+        except queue.Empty:
+            pass
+        for nonce in self._rivals.due_to_ask(now):
+            self._ask(nonce)
+
+    def _handle(self, kind: str, event: Any, now: float) -> None:
+        if kind == "token":
+            nonce = str(event.key_expr).rsplit("/", 1)[-1]
+            if event.kind == zenoh.SampleKind.DELETE:
+                self._rivals.vanish(nonce)
+            else:
+                self._rivals.appear(nonce, now)
+            return
+        try:
+            self._rivals.record_note(decode_json(ClaimNote, event))
+        except MalformedError:
+            return
+
+    def _ask(self, nonce: str) -> None:
+        def record_note(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._inbox.put(("note", reply.ok.payload.to_bytes()))
+
+        own = self._rivals.own_note
+        self._session.get(
+            keys.claim(self._run, nonce), zenoh.handlers.Callback(record_note, indirect=False), timeout=TIMEOUT,
+            payload=None if own is None else encode_json(own), encoding="application/json",
+        )  # fmt: skip
+
+    def _explain(self, other: ClaimNote | None) -> str:
+        own = self._rivals.own_note
+        same = other is not None and own is not None and other.run_uid == own.run_uid
+        who = "of another version" if other is None else f"in incarnation {other.incarnation}"
+        what = "this very run" if same else f"a run {self._run}"
+        remedy = (
+            "continue only one copy of a run: stop the other one first, or rename this one's folder"
+            if same
+            else "stop the other one, rename this run's folder, or keep their routers apart"
+        )
+        return (
+            f"another coordinator serves {what} on this network, {who}: it goes on, this one leaves; nothing is lost, "
+            f"the journal is whole; {remedy}, then --resume"
+        )

@@ -1,0 +1,178 @@
+"""What the `status` keys answer, all from one snapshot: JSON that stays under the message limit. Pure."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, replace
+from typing import Any, Protocol, TypeVar
+
+from dreamfleet.common.monitoring.status import STATUS_SCHEMA_VERSION, Event, Population, WorkerStatus
+from dreamfleet.common.protocol.codec import encode_json
+from dreamfleet.common.protocol.messages import MAX_MESSAGE
+from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
+from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.coordinator.dispatch.event_log import FleetEvent
+from dreamfleet.coordinator.jobs.generation import CandidateScores
+from dreamfleet.coordinator.service.status import Snapshot, full_status
+
+PAGE_BYTES = 36_000  # of the rows of a page
+PAGE, CANDIDATES = 100, 1000  # rows of a page, candidates of a page
+HEAD_WORKERS, HEAD_HISTORY, HEAD_CANDIDATES = 11_000, 12_000, 6_000  # bytes of each head in the status
+PARAMETERS = 4_000  # parameters of a controller in one answer: 21 KB in base64
+
+
+T = TypeVar("T")
+Row = TypeVar("Row", WorkerStatus, StoredGeneration, StoredEvaluation)
+
+
+class Parameters(Protocol):
+    """A query's parameters."""
+
+    def get(self, key: str) -> str | None:
+        """One of them, if it was given."""
+
+
+def answer(snapshot: Snapshot, part: str, parameters: Parameters) -> bytes:
+    """The JSON of one part, a page of those that may be long, and of `best` part of the parameters.
+
+    Of the `story` as many of the last events as one answer holds.
+    """
+    if part == "":
+        return status(snapshot)
+    offset, limit = _number(parameters.get("offset"), 0), _number(parameters.get("limit"), 10**9)
+    documents: dict[str, Callable[[], dict[str, Any]]] = {
+        "generation": lambda: _generation(snapshot),
+        "workers": lambda: _workers(snapshot, offset, limit),
+        "history": lambda: _history(snapshot, offset, limit),
+        "evaluations": lambda: _evaluations(snapshot, offset, limit),
+        "candidates": lambda: _candidates(snapshot, parameters.get("generation"), offset, limit),
+        "best": lambda: _best(snapshot, offset),
+        "story": lambda: _story(snapshot, parameters),
+    }
+    head = {"schema": STATUS_SCHEMA_VERSION, "run": snapshot.status.run, "run_uid": snapshot.status.run_uid}
+    return json.dumps({**head, **documents[part]()}, allow_nan=False).encode()
+
+
+def status(snapshot: Snapshot) -> bytes:
+    """The whole document; the heads give way where the rest is unusually long."""
+    share = 1.0
+    while True:
+        payload = encode_json(_with_heads(snapshot, share))
+        if len(payload) <= MAX_MESSAGE or share < 0.01:
+            return payload
+        share /= 2
+
+
+def _with_heads(snapshot: Snapshot, share: float) -> Any:
+    candidates = int(HEAD_CANDIDATES * share)
+    whole = full_status(snapshot)
+    return replace(
+        whole,
+        recent=tuple(reversed(_head(reversed(whole.recent), int(HEAD_HISTORY * share)))),
+        worker_list=tuple(_head(whole.worker_list, int(HEAD_WORKERS * share))),
+        population=_population(snapshot.candidate_scores, 0, CANDIDATES, candidates),
+        last_population=None if snapshot.last is None else _population(snapshot.last, 0, CANDIDATES, candidates),
+    )
+
+
+def _generation(snapshot: Snapshot) -> dict[str, Any]:
+    last = snapshot.status.last
+    return {**asdict(snapshot.status.generation), "last": None if last is None else asdict(last)}
+
+
+def _workers(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
+    rows = _head(snapshot.workers[offset : offset + min(limit, PAGE)], PAGE_BYTES)
+    return {"offset": offset, "total": len(snapshot.workers), "workers": [asdict(each) for each in rows]}
+
+
+def _history(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
+    rows = _head(snapshot.history.part(offset, min(limit, PAGE)), PAGE_BYTES)
+    return {"offset": offset, "total": len(snapshot.history), "history": [asdict(each) for each in rows]}
+
+
+def _evaluations(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
+    found = snapshot.evaluations
+    rows = _head(found[offset : offset + min(limit, PAGE)], PAGE_BYTES)
+    return {"offset": offset, "total": len(found), "evaluations": [asdict(each) for each in rows]}
+
+
+def _candidates(snapshot: Snapshot, generation: str | None, offset: int, limit: int) -> dict[str, Any]:
+    """Those of the open generation, or of the one that was closed last if it is asked for by its number."""
+    last = snapshot.last
+    chosen = last if last is not None and generation == str(last.generation) else snapshot.candidate_scores
+    return asdict(_population(chosen, offset, min(limit, CANDIDATES), PAGE_BYTES))
+
+
+def _story(snapshot: Snapshot, parameters: Parameters) -> dict[str, Any]:
+    """The last events of a worker, of a candidate's jobs (`generation/index`), of kinds, or all; the newest last."""
+    worker, what = parameters.get("worker") or "", parameters.get("what") or ""
+    generation, slash, index = (parameters.get("job") or "").partition("/")
+    chosen = (_number(generation, -1), _number(index, -1)) if slash else None
+    found = list(snapshot.event_log.latest(worker, chosen, what.split(",") if what else ()))
+    plain = (asdict(_event(each, snapshot.now)) for each in found)
+    rows = _fitting(plain, PAGE_BYTES, lambda row: len(json.dumps(row)) + 2)
+    return {"total": len(found), "story": rows[::-1]}
+
+
+def _event(each: FleetEvent, now: float) -> Event:
+    job = "" if each.job is None else "{} {}/{}/{}".format(*each.job)
+    return Event(round(now - each.at, 3), each.what, each.worker, job)
+
+
+def _best(snapshot: Snapshot, offset: int) -> dict[str, Any]:
+    """The best evaluation, and the controller as it would be saved, its parameters from `offset` on."""
+    best, reported = snapshot.status.best, snapshot.reported
+    document = {"best": None if best is None else asdict(best), "evaluations": snapshot.status.evaluations}
+    confirmed = snapshot.status.confirmed
+    document["confirmed"] = None if confirmed is None else asdict(confirmed)
+    if reported is None:
+        return {**document, "controller": None}
+    controller = reported.controller()
+    part = controller.parameters[offset : offset + PARAMETERS].astype("<f4").tobytes()
+    about = {
+        "shape": to_dict(controller.shape),
+        "task": controller.task,
+        "bundle": controller.bundle,
+        "provenance": controller.provenance,
+        "options": controller.options,
+        "version": controller.version,
+        "sha256": controller.sha256,  # of all parameters: parts of one controller have the same
+        "dtype": "<f4",
+        "offset": offset,
+        "total": len(controller.parameters),
+        "parameters": base64.b64encode(part).decode(),
+    }
+    return {**document, "controller": about}
+
+
+def _population(candidate_scores: CandidateScores, offset: int, limit: int, size: int) -> Population:
+    """At most `limit` candidates from `offset` on whose JSON is about `size` bytes long at most."""
+    part = slice(offset, offset + limit)
+    columns = zip(
+        candidate_scores.done[part], candidate_scores.wanted[part], candidate_scores.fitness[part], strict=True
+    )
+    rows = _fitting(columns, size, lambda row: len(json.dumps(row)) + 4)
+    done, wanted, fitness = zip(*rows, strict=True) if rows else ((), (), ())
+    return Population(candidate_scores.generation, offset, len(candidate_scores.done), done, wanted, fitness)
+
+
+def _head(rows: Iterable[Row], size: int) -> list[Row]:
+    """The first rows whose JSON is `size` bytes long at most."""
+    return _fitting(rows, size, lambda row: len(json.dumps(asdict(row))) + 2)
+
+
+def _fitting(rows: Iterable[T], size: int, measure: Callable[[T], int]) -> list[T]:
+    """As many of the first rows as fit into `size`, and one at least."""
+    kept: list[T] = []
+    for row in rows:
+        size -= measure(row)
+        if size < 0 and kept:
+            break
+        kept.append(row)
+    return kept
+
+
+def _number(text: str | None, default: int) -> int:
+    return int(text) if text is not None and text.isdecimal() and len(text) < 19 else default

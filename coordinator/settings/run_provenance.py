@@ -1,0 +1,38 @@
+"""Drawing up the receipt of a run's controller, from what its journal holds at that moment."""
+
+from __future__ import annotations
+
+import platform
+from functools import cache
+
+from dreamfleet.common.host.packages import package_version
+from dreamfleet.common.runs.effort import START_EFFORT, parse_start_effort
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.runs.run_provenance import RunProvenance, StartProvenance, validation_seed_ranges
+from dreamfleet.coordinator.settings.start import START_MEAN, START_SOURCE, SUBSPACE_FACT
+from dreamfleet.coordinator.storage.journal import Journal
+
+DECIDING_PACKAGES = ("dreamfleet", "numpy", "cma", "cmaes")  # packages whose versions decide what is asked for
+
+
+def build_provenance(journal: Journal, settings: RunSettings, generations: int) -> RunProvenance:
+    """The receipt of a run that has closed so many generations. It costs the same however long the run is."""
+    return RunProvenance(
+        generations, journal.effort, _start(journal), journal.fingerprint(), journal.classes.mixed, versions(),
+        validation_seed_ranges(settings), journal.fact(SUBSPACE_FACT), journal.classes,
+    )  # fmt: skip
+
+
+def _start(journal: Journal) -> StartProvenance | None:
+    """Where the run began; `None` also for a journal from before the mean was kept."""
+    source, mean = journal.fact(START_SOURCE), journal.fact(START_MEAN)
+    if source is None or mean is None:
+        return None
+    return StartProvenance.of(source, mean, parse_start_effort(journal.fact(START_EFFORT)))
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Of what a coordinator computes with, on this host."""
+    found = {name: package_version(name) for name in DECIDING_PACKAGES}
+    return {"python": platform.python_version(), **{name: each for name, each in found.items() if each is not None}}

@@ -1,0 +1,131 @@
+"""A schedule as it is given: stages in a file of their own, or as `[[stage]]` in a configuration file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.cli.config import Table, option, read_table, read_toml
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs.records import MAX_STAGES, STAGE_FIELDS, RunSettings, StageSettings
+from dreamfleet.common.runs.stages import Stage, stages_of
+
+STAGE, NO_SCHEDULE = "stage", "none"
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """One `[[stage]]`: what ends it, and what it names anew."""
+
+    generations: int | None = option(None, "it ends after so many of its generations,")
+    steps: int | None = option(None, "or so many environment steps of its own,")
+    score: float | None = option(None, "or when a mean that was asked in it is evaluated at this score")
+    horizon: int | None = option(None, "as --horizon; what is not named is as in the stage before")
+    patience: int | None = option(None, "as --patience")
+    episodes: int | None = option(None, "as --episodes")
+    population: int | None = option(None, "as --population; another one begins the search anew from the mean")
+    sigma0: float | None = option(None, "as --sigma0; begins the search anew from the mean")
+    racing: bool | None = option(None, "as --racing")
+    driven: float | None = option(None, "as --driven")
+    whole: bool = option(False, "true: from here on the search leaves the subspace, from the mean; it needs a sigma0")
+
+    def __post_init__(self) -> None:
+        for name in ("generations", "steps"):
+            value = getattr(self, name)
+            if value is not None and not 1 <= value < 2**63:
+                raise UsageError(f"{name} must be from 1 to {2**63 - 1}, not {value}")
+        if self.score is not None and not math.isfinite(self.score):
+            raise UsageError(f"score must be a number, not {self.score}")
+
+    @property
+    def settings(self) -> StageSettings:
+        """As a journal keeps it."""
+        named: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        return StageSettings(**{**named, "generations": self.generations or 0, "steps": self.steps or 0})
+
+
+def find_schedule(name: str | None, file: Table) -> tuple[StageSettings, ...] | None:
+    """The stages in the file of this name, else those of the configuration `file`; `None`: neither has any."""
+    if name == NO_SCHEDULE:
+        return ()
+    if name is not None:
+        return read_stages(read_toml(Path(name), (), arrays=(STAGE,)).get(STAGE, ()), name)
+    return read_stages(file[STAGE], "the configuration file") if STAGE in file else None
+
+
+def read_stages(tables: Sequence[Table], where: str) -> tuple[StageSettings, ...]:
+    """A schedule from its tables; `UsageError` for what none can be, whatever the run."""
+    if not 1 <= len(tables) <= MAX_STAGES:
+        raise UsageError(
+            f"{where} holds {len(tables)} stages, and a schedule has 1 to {MAX_STAGES}: write each as [[stage]]"
+        )
+    return tuple(_read_stage(number, table) for number, table in enumerate(tables, 1))
+
+
+def _read_stage(number: int, table: Table) -> StageSettings:
+    name = f"stage {number}"
+    values = read_table(StageConfig, name, table)
+    try:
+        return StageConfig(**values).settings
+    except UsageError as error:
+        raise UsageError(f"{name}: {error}") from error
+
+
+def split_first_stage(stages: tuple[StageSettings, ...]) -> tuple[dict[str, Any], tuple[StageSettings, ...]]:
+    """What the first stage names, which are the run's own settings, and the schedule without that."""
+    if not stages:
+        return {}, ()
+    first = stages[0]
+    if first.whole:
+        raise UsageError("stage 1: whole is of a later stage, which leaves the subspace; without --subspace all are")
+    return first.overrides, (first.end, *stages[1:]) if first.has_end or len(stages) > 1 else ()
+
+
+def remaining_settings(settings: RunSettings, stage: Stage) -> dict[str, Any]:
+    """The settings of a run that begins with this stage of another, counted anew, and goes on as that would."""
+    stages = (stage.end, *settings.stages[stage.number :]) if stage.number < len(settings.stages) else ()
+    return {**{name: getattr(stage, name) for name in STAGE_FIELDS}, "stages": stages}
+
+
+def check_schedule(settings: RunSettings) -> None:
+    """`UsageError` for a stage that never ends before the last one, or by what can never be reached."""
+    stages = stages_of(settings)
+    for before, stage, each in zip(stages, stages[1:], settings.stages[1:], strict=False):
+        if each.whole and before.whole:
+            raise UsageError(f"stage {stage.number}: the search is whole already; leave that out, or give --subspace")
+        if each.whole and each.sigma0 is None:
+            raise UsageError(
+                f"stage {stage.number} leaves the subspace, where a step is something else: give it a sigma0"
+            )
+    for stage in stages[:-1]:
+        if not stage.end.has_end:
+            raise UsageError(
+                f"stage {stage.number} never ends, and stage {stage.number + 1} would never begin: give it "
+                "generations, steps or a score"
+            )
+        _check_end(stage, settings.evaluate_every)
+    if stages[-1].end.has_end:
+        raise UsageError(
+            f"stage {stages[-1].number} is the last and names an end: leave it out there; the run itself ends by "
+            "--generations, --steps and the like"
+        )
+
+
+def _check_end(stage: Stage, every: int) -> None:
+    end, name = stage.end, f"stage {stage.number}"
+    if end.score is not None and not every:
+        raise UsageError(f"{name} ends by the score of an evaluated mean: give --evaluate-every too")
+    if end.score is not None and 0 < end.generations <= every:
+        raise UsageError(
+            f"{name} never ends by its score: an evaluation counts {every} generations later (--evaluate-every), and "
+            f"it has {end.generations}: give it more, or leave the score out"
+        )
+    most = end.generations * stage.population * stage.episodes * stage.horizon
+    if end.generations and end.steps > most:
+        raise UsageError(
+            f"{name} never ends by its steps: {end.generations} generations have {most} at most; leave one of the two "
+            "out"
+        )

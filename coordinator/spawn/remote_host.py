@@ -1,0 +1,180 @@
+"""What is done on one host, in order: connect, look, install, start, show the log, end."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.coordinator.spawn.agent import JOIN, JOIN_HERE, LEAST_FREE
+from dreamfleet.coordinator.spawn.config import Host
+from dreamfleet.coordinator.spawn.connection import Connection
+from dreamfleet.coordinator.spawn.parcel import Parcel, pack, runs_here
+
+OnText = Callable[[str], None]
+FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class FleetAddress:
+    """How the workers find their coordinator: endpoints, a join file, or both."""
+
+    connect: tuple[str, ...]
+    join: bytes = field(default=b"", repr=False)
+
+
+@dataclass(frozen=True)
+class HostStatus:
+    """How a host is: of its worker, the slots (`None` where there is none), and seconds since it began."""
+
+    host: str
+    state: str
+    what: str
+    slots: int | None = None
+    since: float | None = None
+
+
+class RemoteHost:
+    """One host's connection and what is done through it; every method raises `DreamfleetError` with why it failed."""
+
+    def __init__(self, host: Host, fleet_address: FleetAddress, on_progress: OnText, on_log_line: OnText) -> None:
+        self.host = host
+        self._fleet_address = fleet_address
+        self._on_progress = on_progress
+        self._on_log_line = on_log_line
+        self._connection: Connection | None = None
+        self._closed = threading.Event()
+        self._root = {"root": host.spawn.remote_dir}
+        self.forwards = host.forwards(fleet_address.connect, joins=bool(fleet_address.join))
+
+    def check(self) -> HostStatus:
+        """How the host is, and what would be done; nothing is changed there."""
+        found = self._inspect(())
+        mine = next((each for each in found["workers"] if each["name"] == self.host.name and each["running"]), None)
+        if mine:
+            return self._status("running", mine)
+        environment = self._environment(found)
+        there = "is there" if environment in (None, *found["environments"]) else "is to be made"
+        version = ".".join(map(str, found["python"]))
+        return HostStatus(
+            self.host.name,
+            "ready",
+            f"Python {version}, {found['machine']}, {found['free'] / 1e9:.1f} GB free, its environment {there}",
+        )
+
+    def bring_up(self) -> HostStatus:
+        """Have the worker run there, in an environment that is made if it lacks."""
+        found = self._inspect(self.forwards)
+        python = self._python(found)
+        connect = self._endpoints()
+        words = ["-P", "-m", "dreamfleet", "worker", "--name", self.host.name, "--slots", str(self.host.spawn.slots)]
+        words += ["--connect", *connect] if connect else []
+        words += ["--join", JOIN_HERE] if self._fleet_address.join else []
+        words += self.host.flags
+        facts = {"python": python, "words": words, "env": self.host.environment}
+        text = json.dumps(facts, sort_keys=True).encode() + hashlib.sha256(self._fleet_address.join).digest()
+        files = {JOIN: self._fleet_address.join} if self._fleet_address.join else {}
+        started = self._ask("start", sent=files, **facts, name=self.host.name, slots=self.host.spawn.slots,
+                            held=bool(self.forwards), digest=hashlib.sha256(text).hexdigest())  # fmt: skip
+        return self._status(started["outcome"], started)
+
+    def follow(self) -> HostStatus | None:
+        """Show the worker's log until it ends, which is told; `None` if `leave` was called meanwhile."""
+        followed = self._ask("follow", name=self.host.name)
+        return self._status("ended", followed) if followed["ended"] else None
+
+    def stop_following(self) -> None:
+        """End a `follow` that is under way. From any thread."""
+        if self._connection is not None:
+            self._connection.interrupt()
+
+    def end(self, *, all_workers: bool, now: bool, keep: bool) -> HostStatus:
+        """End its worker, or all that are there, and remove what belongs to them."""
+        if self._connection is None:
+            self._connect(())
+        names = None if all_workers else [self.host.name]
+        ended = self._ask("end", names=names, now=now, keep=keep)["ended"]
+        left = [each["name"] for each in ended if each["running"]]
+        if left:
+            return HostStatus(self.host.name, "left", f"{', '.join(left)} left")
+        return HostStatus(self.host.name, "nothing", "no worker runs there")
+
+    def close(self) -> None:
+        """End the connection, and with it what lives by its tunnel. From any thread."""
+        self._closed.set()
+        if self._connection is not None:
+            self._connection.close()
+
+    def _connect(self, forwards: tuple[str, ...]) -> None:
+        spawn = self.host.spawn
+        self._connection = Connection(self.host.ssh, self.host.address, spawn.remote_python, forwards)
+        if self._closed.is_set():
+            self._connection.close()
+        self._connection.start_agent()
+
+    def _inspect(self, forwards: tuple[str, ...]) -> dict[str, Any]:
+        self._connect(forwards)
+        found: dict[str, Any] = self._ask("look")
+        self._check(found)
+        return found
+
+    def _check(self, found: Mapping[str, Any]) -> None:
+        if not found["writable"]:
+            raise DreamfleetError(f"{found['root']} cannot be written there: name another --remote-dir")
+        name = self._environment(found)
+        if name is None or name in found["environments"]:
+            return
+        if not found["venv"]:
+            raise DreamfleetError("its Python has no venv: install it there (Debian: apt install python3-venv)")
+        if found["free"] < LEAST_FREE:
+            raise DreamfleetError(
+                f"{found['free'] / 1e6:.0f} MB are free at {found['root']}, and an environment takes "
+                f"{LEAST_FREE / 1e6:.0f}: make room there, or name another --remote-dir"
+            )
+        pack_for(self.host.spawn.wheelhouse, found).check_fits(found["machine"])
+
+    def _environment(self, found: Mapping[str, Any]) -> str | None:
+        """The name of the environment that the worker runs in; `None` where it is installed in its Python."""
+        if self.host.spawn.remote_python and found["installed"]:
+            return None
+        return pack_for(self.host.spawn.wheelhouse, found).environment(tuple(found["python"]), found["machine"])
+
+    def _python(self, found: Mapping[str, Any]) -> str:
+        """The Python that the worker runs in, once it is installed."""
+        name = self._environment(found)
+        if name is None:
+            return str(found["executable"])
+        parcel = pack_for(self.host.spawn.wheelhouse, found)
+        files = {} if name in found["environments"] else parcel.files()
+        if files and not runs_here(found["system"], found["machine"]):
+            self._on_progress(f"is {found['system']} on {found['machine']}: gymnasium draws there, which is slower")
+        made = self._ask("install", sent=files, environment=name, wheel=parcel.wheel.name,
+                         offline=parcel.wheelhouse is not None)  # fmt: skip
+        return str(made["python"])
+
+    def _endpoints(self) -> list[str]:
+        """Where the worker connects: what it is told, or the tunnel's ends on its own side."""
+        if not self.forwards:
+            return list(self._fleet_address.connect)
+        assert self._connection is not None
+        return [f"tcp/127.0.0.1:{port}" for port in self._connection.ports(self.forwards)]
+
+    def _ask(self, do: str, sent: Mapping[str, bytes] | None = None, **facts: object) -> Any:
+        assert self._connection is not None
+        return self._connection.ask(do, self._on_message, sent, **self._root, **facts)
+
+    def _on_message(self, kind: str, text: str) -> None:
+        (self._on_log_line if kind == "line" else self._on_progress)(text)
+
+    def _status(self, state: str, told: Mapping[str, Any]) -> HostStatus:
+        return HostStatus(self.host.name, state, told["last"], told["slots"] or None, told["age"])
+
+
+def pack_for(wheelhouse: Path | None, found: Mapping[str, Any]) -> Parcel:
+    """What is sent to a host of this system and processor."""
+    return pack(wheelhouse, native=runs_here(found["system"], found["machine"]))

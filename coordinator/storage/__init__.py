@@ -1,0 +1,1 @@
+"""The run's journal, its backup, and a watch over its files."""

@@ -1,0 +1,136 @@
+"""A second copy of a run's folder, whole and durable, also while a coordinator serves the run.
+
+SQLite copies the journal as it is at one moment; everything else in the folder is frozen, or follows from the journal.
+The copy is a run like any other.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.files.atomic_write import fsync_path
+from dreamfleet.common.runs.run_folder import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS, RunFolder, open_run, run_lock
+
+
+def back_up(source: RunFolder, target: Path) -> None:
+    """Copy the run into the folder `target`, of its own name; an earlier copy of the same run there is replaced.
+
+    Whatever ends this, one whole copy is left if there was one. `UsageError` for a target that is something else, a
+    run that is served from there, or the run itself; `JournalError` where the disk refuses.
+    """
+    with _journal_errors(target):
+        _check_target(source, target)
+    aside, former = (target.with_name(f".{target.name}.{word}") for word in ("part", "former"))
+    with _journal_errors(target), _backup_lock(target):
+        _clear(target, aside, former)  # an earlier call may have been killed
+        try:
+            aside.mkdir(mode=0o700)
+            _copy_run(source, aside)
+            with _hold_target(target):
+                if target.exists():
+                    target.rename(former)
+                aside.rename(target)
+            fsync_path(target.parent)
+        finally:
+            _clear(target, aside, former)
+
+
+@contextmanager
+def _backup_lock(target: Path) -> Iterator[None]:
+    """Inside, nobody else backs up into this folder: what the one has half copied the other would take for its own."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    path = target.with_name(f".{target.name}.lock")
+    while True:
+        with path.open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UsageError(f"another backup into {target} is at work: wait for it") from None
+            if not path.exists() or not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
+                continue  # who held it has removed it
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
+def _clear(target: Path, aside: Path, former: Path) -> None:
+    """Leave one copy under its name: the new one if it has come to be, else the earlier one."""
+    if former.exists() and not target.exists():
+        former.rename(target)
+    for left in (aside, former):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _check_target(source: RunFolder, target: Path) -> None:
+    if target.is_symlink():
+        raise UsageError(f"{target} is a link: name the folder of runs that it leads to with --to")
+    if target.exists() and target.samefile(source.path):
+        raise UsageError(f"{target} is the run itself: name another folder with --to")
+    if not (target / JOURNAL).exists():
+        if target.exists():
+            raise UsageError(f"{target} exists and is no run: name another folder with --to")
+        return
+    with open_run(target.parent, target.name) as other:
+        if other.uid != source.uid:
+            raise UsageError(f"{target} is another run of this name: name another folder with --to")
+
+
+def _copy_run(source: RunFolder, folder: Path) -> None:
+    """The controller first: it may lag behind the journal, as after a kill, and must not be ahead of it.
+
+    What the journal names lies in the folder before the journal does, so that it is copied behind it.
+    """
+    with suppress(FileNotFoundError):  # there is none before the first closed generation
+        shutil.copy2(source.controller_path, folder / CONTROLLER)
+    _copy_journal(source, folder / JOURNAL)
+    if source.spec.bundle:
+        shutil.copy2(source.bundle_path, folder / BUNDLE)
+    with RunFolder(folder) as copy:
+        drives = copy.rollouts()
+    if drives:
+        (folder / ROLLOUTS).mkdir()
+    for drive in drives:
+        shutil.copy2(source.path / ROLLOUTS / drive.name, folder / ROLLOUTS / drive.name)
+    for path in (*folder.rglob("*"), folder):
+        fsync_path(path)
+
+
+def _copy_journal(source: RunFolder, path: Path) -> None:
+    where = f"{(source.path / JOURNAL).absolute().as_uri()}?mode=ro"
+    try:
+        with closing(sqlite3.connect(where, uri=True)) as live, closing(sqlite3.connect(path)) as copy:
+            live.backup(copy)
+            copy.execute("PRAGMA journal_mode = DELETE")  # one file, without a log beside it
+            found = copy.execute("PRAGMA quick_check(1)").fetchone()[0]
+    except sqlite3.Error as error:
+        raise JournalError(f"the journal of run {source.name} cannot be copied to {path.parent}: {error}") from error
+    if found != "ok":
+        raise JournalError(f"the journal of run {source.name} is damaged: {found}; the earlier copy is kept")
+
+
+@contextmanager
+def _hold_target(target: Path) -> Iterator[None]:
+    """Hold the earlier copy, so that nobody goes on from it while it is replaced."""
+    if not target.exists():
+        yield
+        return
+    with run_lock(target):
+        yield
+
+
+@contextmanager
+def _journal_errors(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        why = error.strerror or error
+        raise JournalError(f"cannot back up into {target}: {why}; an earlier copy, if there is one, is kept") from error

@@ -1,0 +1,439 @@
+"""The only writer of a run's journal: every result is on disk before it counts."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+import sqlite3
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from time import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.errors import DreamfleetError, JournalError
+from dreamfleet.common.files.atomic_write import atomic_write, fsync_path
+from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count
+from dreamfleet.common.protocol.messages import Job, Result
+from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS, LONGEST_EPISODE, max_steps, to_finite
+from dreamfleet.common.runs import schema
+from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.run_folder import (
+    BUNDLE,
+    ENDED_AT,
+    JOURNAL,
+    RunFolder,
+    class_counts_query,
+    efforts_query,
+)
+from dreamfleet.common.runs.stages import begun_stages
+from dreamfleet.coordinator.jobs.confirmation import Finalist
+from dreamfleet.coordinator.jobs.evaluation import Evaluation
+from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
+from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
+
+sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
+
+MOST_VARIABLES = 500  # of one SQL statement
+FINGERPRINT, HOST_CLASS = "fingerprint", "host_class"  # the facts' names
+
+
+@dataclass(frozen=True)
+class StoredOpenGeneration:
+    """A generation that was asked and not yet told: its state before `ask`, its seeds and its population."""
+
+    number: int
+    state: bytes
+    seeds: tuple[int, ...]
+    vectors: tuple[bytes, ...]  # float32, as they travel
+
+
+class Journal:
+    """Writes of one coordinator's life: they wait in memory, in order, until `commit` or until something is read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._incarnation = 0
+        self._stamp: tuple[int, int] | None = None  # of the file, as the last commit left it
+        self._opened: int | None = None  # the latest generation
+        self._effort: Effort | None = None  # of every result, once somebody asked
+        self._counted: Counter[tuple[str, str]] | None = None  # results by class and fingerprint, likewise
+        self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
+        with _journal_errors(path):
+            self._connection = sqlite3.connect(path, timeout=5)
+            try:
+                schema.migrate(self._connection, schema.check_schema(self._connection, path))
+                self._connection.execute("PRAGMA journal_mode = WAL")
+                self._connection.execute("PRAGMA synchronous = FULL")
+            except BaseException:
+                self._connection.close()
+                raise
+
+    @classmethod
+    def create(
+        cls, folder: Path, settings: RunSettings, bundle: Path | None, facts: Mapping[str, str] | None = None
+    ) -> Journal:
+        """A new run in `folder`, which holds its own copy of the bundle, if any; whole or not at all.
+
+        `facts` are what else the run must never be without: where it begins, and how it is served.
+        """
+        path = folder / JOURNAL
+        if path.exists():
+            raise JournalError(
+                f"run {folder.name} exists: choose another --run, or continue it with --resume; "
+                f"`dreamfleet runs delete {folder.name}` removes it"
+            )
+        aside = path.with_suffix(".new")
+        own = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": _now()}
+        try:
+            # What a journal that was removed left beside it would be taken for this one's, and damage it.
+            for left in (aside, *sqlite_side_files(aside), *sqlite_side_files(path)):
+                left.unlink(missing_ok=True)
+            if bundle is not None:
+                with bundle.open("rb") as source, atomic_write(folder / BUNDLE) as copy:
+                    shutil.copyfileobj(source, copy)
+            aside.touch(mode=0o600)  # its log has the same mode
+            with _journal_errors(path), closing(sqlite3.connect(aside)) as connection:
+                schema.migrate(connection, 0)
+                connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", {**own, **(facts or {})}.items())
+                connection.commit()
+            aside.replace(path)
+            fsync_path(folder)
+        except OSError as error:
+            raise JournalError(f"cannot write in {folder}: {error.strerror}; choose another --runs-dir") from error
+        return cls(path)
+
+    def close(self) -> None:
+        """Fold the write-ahead log into the journal and release it."""
+        self._connection.close()
+
+    @property
+    def is_overwritten(self) -> bool:
+        """Whether somebody else wrote into the journal's own file, and what it holds now is not what was committed.
+
+        Only a commit of this connection writes there, so the file is looked into where its time or size is another's.
+        """
+        if self._stamp in (None, _stamp(self.path)):
+            return False
+        self._stamp = _stamp(self.path)
+        where = f"file:{self.path.absolute()}?mode=ro"  # what lies there, and not what this connection remembers
+        try:
+            with closing(sqlite3.connect(where, uri=True)) as reader:
+                sound = reader.execute("PRAGMA quick_check(1)").fetchone()[0] == "ok"
+                last = reader.execute("SELECT max(number) FROM generation").fetchone()[0]
+        except sqlite3.Error:
+            return True
+        return not sound or last != self._opened
+
+    def save_copy(self, path: Path) -> None:
+        """Write all that is committed into a new file, checked, whole or not at all."""
+        aside = path.with_name(f".{path.name}.part")
+        try:
+            with _journal_errors(path), closing(sqlite3.connect(aside)) as copy:
+                self._connection.backup(copy)
+                copy.execute("PRAGMA journal_mode = DELETE")  # one file, without a log beside it
+                found = copy.execute("PRAGMA quick_check(1)").fetchone()[0]
+                last = copy.execute("SELECT max(number) FROM generation").fetchone()[0]
+            if found != "ok" or last != self._opened:
+                raise JournalError("what the open connection still holds is not whole: restore the folder from a copy")
+            with aside.open("rb") as file:
+                os.fsync(file.fileno())
+            aside.replace(path)
+            fsync_path(path.parent)
+        finally:
+            for left in (aside, *sqlite_side_files(aside)):
+                left.unlink(missing_ok=True)
+
+    def check_incarnation(self) -> None:
+        """`JournalError` if another coordinator began a life in this journal: a lock held neither of them back."""
+        found = int(self.fact("incarnation") or 0)
+        if found != self._incarnation:
+            raise JournalError(
+                f"another coordinator serves {self.path} too (incarnation {found}, this one is {self._incarnation}): "
+                "this one leaves; what it committed is whole, and the other one goes on with it"
+            )
+
+    def commit(self) -> None:
+        """Make everything written so far durable."""
+        self._flush()
+        own = self._stamp in (None, _stamp(self.path))
+        with _journal_errors(self.path):
+            self._connection.commit()
+        if own:  # else somebody wrote there since the last commit, which `overwritten` looks into
+            self._stamp = _stamp(self.path)
+
+    def fact(self, key: str) -> str | None:
+        """One of the run's facts, such as `uid` or `fingerprint`."""
+        row = self._read("SELECT value FROM run WHERE key = ?", key).fetchone()
+        return None if row is None else str(row[0])
+
+    def fingerprint(self) -> str | None:
+        """That of the first accepted result; `None` before it.
+
+        Journals from before that was the rule name their first worker's, which means nothing without a result.
+        """
+        scored = self._read("SELECT 1 FROM result LIMIT 1").fetchone() is not None
+        return self.fact(FINGERPRINT) if scored else None
+
+    def host_class(self) -> str | None:
+        """That of the first accepted result; `None` before it.
+
+        In journals from before there were classes its fingerprint tells it.
+        """
+        fingerprint = self.fingerprint()
+        return None if fingerprint is None else self.fact(HOST_CLASS) or class_from_fingerprint(fingerprint)
+
+    @property
+    def classes(self) -> HostClasses:
+        """What all results are of: read once, then counted with each."""
+        if self._counted is None:
+            self._counted = count(self._read(class_counts_query()))
+        return HostClasses.of(self._counted)
+
+    def end(self, why: str) -> None:
+        """The run ended, now; one that had ended before, with nothing left to do, keeps its time."""
+        if self.fact("ended") is None:
+            self.set_fact(ENDED_AT, _now())
+        self.set_fact("ended", why)
+
+    def set_fact(self, key: str, value: str) -> None:
+        """Write one of the run's facts."""
+        self._write("INSERT OR REPLACE INTO run (key, value) VALUES (?, ?)", key, value)
+
+    def drop_fact(self, key: str) -> None:
+        """Forget one of the run's facts."""
+        self._write("DELETE FROM run WHERE key = ?", key)
+
+    def begin_incarnation(self) -> int:
+        """Number of this life of the coordinator, from 1; durable before anything is published."""
+        number = int(self.fact("incarnation") or 0) + 1
+        self.set_fact("incarnation", str(number))
+        self.commit()
+        self._incarnation = number
+        self._opened = self._read("SELECT max(number) FROM generation").fetchone()[0]
+        return number
+
+    def open_generation(
+        self, number: int, state: Checkpoint, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]
+    ) -> None:
+        """Write a population, and the strategy's state from before it was asked; two states stay."""
+        self._write(
+            "INSERT INTO generation (number, seeds, opened, sigma) VALUES (?, ?, ?, ?)",
+            number, json.dumps(list(seeds)), time(), sigma,
+        )  # fmt: skip
+        rows = [(number, index, vector) for index, vector in enumerate(vectors)]
+        self._write_all("INSERT INTO candidate (generation, number, vector) VALUES (?, ?, ?)", rows)
+        self._write("INSERT INTO strategy (generation, state) VALUES (?, ?)", number, state)
+        self._write("DELETE FROM strategy WHERE generation < ?", number - 1)
+        self._opened = number
+
+    def close_generation(self, closed: StoredGeneration, fitness: NDArray[np.float64]) -> None:
+        """Write what the strategy is told."""
+        self._write_all(
+            "UPDATE candidate SET fitness = ? WHERE generation = ? AND number = ?",
+            [(float(value), closed.number, index) for index, value in enumerate(fitness)],
+        )
+        self._write(
+            "UPDATE generation SET closed = ?, mean = ?, std = ?, best = ?, worst = ?, steps = ?, seconds = ? "
+            "WHERE number = ?",
+            time(), closed.mean, closed.std, closed.best, closed.worst, closed.steps, closed.seconds, closed.number,
+        )  # fmt: skip
+
+    def add_result(
+        self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str = ""
+    ) -> None:
+        """Write an accepted result; without a class its fingerprint tells it."""
+        self._write(
+            "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
+            "fingerprint, incarnation, host_class) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], result.fitness,
+            result.steps, result.seconds, worker, fingerprint, incarnation, host_class,
+        )  # fmt: skip
+        if self._counted is not None:
+            self._counted[host_class or class_from_fingerprint(fingerprint), fingerprint] += 1
+        if self._effort is not None:
+            made = result.steps, int(result.seconds * 1e6)
+            self._effort += Effort.of(job.task, job.kind, *made, driven=bool(job.driven))
+
+    @property
+    def effort(self) -> Effort:
+        """What all results took: summed up once, then counted with each, so that it costs the same however many."""
+        if self._effort is None:
+            settings = RunSettings.from_json(self.fact("settings") or "")
+            rows = self._read(efforts_query(begun_stages(settings, *self.read_closed())))
+            task = settings.task.task
+            told = (Effort.of(task, kind, *made, driven=bool(driven)) for kind, _, _, driven, *made in rows)
+            self._effort = sum(told, Effort())
+        return self._effort
+
+    def drop_excessive(self, horizon: int) -> int:
+        """Forget what older versions took in and what would spoil what is still to be told; how many results that is.
+
+        Those of closed generations were told, and stay.
+        """
+        within = "abs(fitness) <= ? AND steps BETWEEN 0 AND CASE kind WHEN 'evaluate' THEN ? ELSE ? END"
+        still = "kind != 'score' OR generation IN (SELECT number FROM generation WHERE closed IS NULL)"
+        query = f"DELETE FROM result WHERE NOT ({within}) AND ({still}) RETURNING digest"  # noqa: S608
+        bounds = LARGEST_FITNESS, max_steps(LONGEST_EPISODE), max_steps(horizon)
+        dropped = len(self._read(query, *bounds))
+        self._effort = self._counted = None
+        self.commit()
+        return dropped
+
+    def schedule_evaluation(self, evaluation: Evaluation) -> None:
+        """Write that the mean of a generation is to be evaluated."""
+        self._write(
+            "INSERT INTO evaluation (generation, vector, episodes) VALUES (?, ?, ?)",
+            evaluation.generation, evaluation.vector, evaluation.episodes,
+        )  # fmt: skip
+
+    def finish_evaluation(self, generation: int, mean: float, std: float) -> None:
+        """Write what an evaluation gave."""
+        self._write("UPDATE evaluation SET mean = ?, std = ? WHERE generation = ?", mean, std, generation)
+
+    def schedule_collection(self, collection: RolloutCollection) -> None:
+        """Write that drives of a generation's mean are to be kept."""
+        self._write(
+            "INSERT INTO collection (generation, vector, episodes) VALUES (?, ?, ?)",
+            collection.generation, collection.vector, collection.episodes,
+        )  # fmt: skip
+
+    def scheduled_collections(self) -> list[RolloutCollection]:
+        """Everything that was scheduled to be kept, oldest first."""
+        query = "SELECT generation, vector, episodes FROM collection ORDER BY generation"
+        return [RolloutCollection(*row) for row in self._read(query)]
+
+    def last_generation(self) -> StoredOpenGeneration | None:
+        """The generation that was open when the last incarnation ended; `None` in a new run."""
+        row = self._read("SELECT max(number) FROM generation").fetchone()
+        return None if row[0] is None else self.generation(row[0])
+
+    def generation(self, number: int) -> StoredOpenGeneration | None:
+        """One of the last two generations, as it was asked; `None` if its state is not kept any more."""
+        row = self._read(
+            "SELECT state, seeds FROM generation JOIN strategy ON number = generation WHERE number = ?", number
+        ).fetchone()
+        if row is None:
+            return None
+        vectors = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number).fetchall()
+        try:
+            return StoredOpenGeneration(
+                number, row[0], tuple(json.loads(row[1])), tuple(vector for (vector,) in vectors)
+            )
+        except (ValueError, TypeError) as error:
+            raise JournalError(f"{self.path} is damaged: {error}; restore it from a copy") from error
+
+    def read_closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
+        """Every closed generation and finished evaluation, oldest first."""
+        with RunFolder(self.path.parent) as folder:
+            return folder.history(), folder.evaluations()
+
+    def results_of(self, kind: str, generation: int) -> dict[bytes, tuple[float, int]]:
+        """Fitness and steps of a generation's accepted results, by digest."""
+        query = "SELECT digest, fitness, steps FROM result WHERE kind = ? AND generation = ?"
+        return {digest: (to_finite(fitness), steps) for digest, fitness, steps in self._read(query, kind, generation)}
+
+    def fitness_of(self, digests: Sequence[bytes]) -> dict[bytes, float]:
+        """Fitness of those of these jobs that have an accepted result, whichever generation asked for it."""
+        found: dict[bytes, float] = {}
+        for start in range(0, len(digests), MOST_VARIABLES):
+            some = digests[start : start + MOST_VARIABLES]
+            marks = ", ".join("?" * len(some))
+            found.update(self._read(f"SELECT digest, fitness FROM result WHERE digest IN ({marks})", *some))  # noqa: S608
+        return found
+
+    def pending_evaluations(self) -> list[Evaluation]:
+        """Evaluations that were scheduled and not finished, oldest first."""
+        query = "SELECT generation, vector, episodes FROM evaluation WHERE mean IS NULL ORDER BY generation"
+        return [Evaluation(*row) for row in self._read(query)]
+
+    def finalists(self, count: int) -> list[Finalist]:
+        """The best evaluated means, best first; of generations with one mean and of equals the earliest."""
+        query = (
+            "SELECT min(generation), vector, episodes, mean FROM evaluation WHERE mean IS NOT NULL GROUP BY vector "
+            "ORDER BY mean DESC, 1 LIMIT ?"
+        )
+        rows = self._read(query, count).fetchall()
+        return [Finalist(generation, vector, episodes, to_finite(mean)) for generation, vector, episodes, mean in rows]
+
+    def evaluated_vector(self, generation: int) -> bytes:
+        """The mean after a generation that was scheduled to be evaluated."""
+        (vector,) = self._read("SELECT vector FROM evaluation WHERE generation = ?", generation).fetchone()
+        return bytes(vector)
+
+    def _write(self, statement: str, *values: Any) -> None:
+        self._write_all(statement, [values])
+
+    def _write_all(self, statement: str, rows: list[tuple[Any, ...]]) -> None:
+        if self._writes and self._writes[-1][0] == statement:
+            self._writes[-1][1].extend(rows)
+        else:
+            self._writes.append((statement, rows))
+
+    def _flush(self) -> None:
+        writes, self._writes = self._writes, []
+        with _journal_errors(self.path):
+            for statement, rows in writes:
+                self._connection.executemany(statement, rows)
+
+    def _read(self, query: str, *values: Any) -> _Rows:
+        self._flush()
+        with _journal_errors(self.path):
+            return _Rows(self._connection.execute(query, values).fetchall())
+
+
+class _Rows(list[Any]):
+    """What was read, to its end: a damaged page shows while it is read, and not in whoever goes through the rows."""
+
+    def fetchone(self) -> Any:
+        """The first row, if there is one."""
+        return self[0] if self else None
+
+    def fetchall(self) -> list[Any]:
+        """All of them."""
+        return self
+
+
+def _now() -> str:
+    """ISO 8601, UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """When a file was written last, and how long it is; `None`: it is not there."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+def sqlite_side_files(path: Path) -> tuple[Path, ...]:
+    """What SQLite may keep beside a database: its write-ahead log, that log's index, or a rollback journal."""
+    return tuple(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))
+
+
+@contextmanager
+def _journal_errors(path: Path) -> Iterator[None]:
+    """SQLite's errors as one line that says what to do."""
+    try:
+        yield
+    except DreamfleetError:
+        raise
+    except sqlite3.OperationalError as error:
+        raise JournalError(f"cannot write {path}: {error}; nothing counted that was not written before") from error
+    except sqlite3.IntegrityError as error:
+        raise JournalError(
+            f"{path} was not written: {error}; what was committed before is whole, and the run can be continued"
+        ) from error
+    except sqlite3.DatabaseError as error:
+        raise JournalError(f"{path} is damaged or no journal: {error}; restore it from a copy") from error

@@ -1,0 +1,131 @@
+"""Measure the structure of the code: rooms, floors, imports between rooms, folder sizes, class names, wording.
+
+`make structure` prints the figures; `tests/test_structure.py` holds those that must not grow.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+import re
+import sys
+import tokenize
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+SIDES = ("common", "coordinator", "worker")
+# Words that a reader has to read twice; `style` in CONTRIBUTING.md says what to write instead.
+RIDDLES = re.compile(r"\b(tell|tells|telling|told|untold|whoever|whomever)\b|\b(?:is|are|was|were|be|been) had\b")
+LONG_FILE = 400
+
+
+def sources(*folders: str) -> list[Path]:
+    """The Python files below these folders of the repository, as paths relative to it."""
+    found = (path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+    return sorted(path.relative_to(ROOT) for path in found)
+
+
+def room_of(module: str) -> str:
+    """The room of a module: the first part of its name below its side; a flat module is a room by itself."""
+    return module.split(".")[1] if "." in module else ""
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    """The modules of this project that a file imports, at its top or in a function, without `dreamfleet.`."""
+    for node in ast.walk(ast.parse((ROOT / path).read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("dreamfleet."):
+            module = node.module.removeprefix("dreamfleet.")
+            yield from (f"{module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (each.name.removeprefix("dreamfleet.") for each in node.names if "dreamfleet." in each.name)
+
+
+def room_arrows(side: str) -> dict[str, set[str]]:
+    """Which rooms of a side each of its rooms imports."""
+    arrows: dict[str, set[str]] = defaultdict(set)
+    for path in sources(side):
+        own = room_of(".".join(path.with_suffix("").parts))
+        if own == "__init__":
+            continue
+        others = {room_of(name) for name in imports_of(path) if name.startswith(f"{side}.")}
+        arrows[own] |= others - {own, "", "__init__"}
+    return dict(arrows)
+
+
+def floors(arrows: dict[str, set[str]]) -> tuple[list[list[str]], int]:
+    """The rooms by floor, the lowest first, and how many arrows close a cycle, so that no floor can hold them."""
+    left, built, upward = dict(arrows), [], 0
+    while left:
+        ready = sorted(room for room, others in left.items() if not others & left.keys())
+        if not ready:  # the room with the fewest arrows into the rest goes first, against those arrows
+            ready = [min(sorted(left), key=lambda room: len(left[room] & left.keys()))]
+            upward += len(left[ready[0]] & left.keys())
+        built.append(ready)
+        for room in ready:
+            del left[room]
+    return built, upward
+
+
+def class_names() -> dict[str, list[str]]:
+    """Every public class name that more than one module defines, with those modules."""
+    homes: dict[str, list[str]] = defaultdict(list)
+    for path in sources(*SIDES):
+        for node in ast.parse((ROOT / path).read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes[node.name].append(str(path))
+    return {name: paths for name, paths in homes.items() if len(paths) > 1}
+
+
+def riddles(path: Path) -> list[tuple[int, str]]:
+    """Lines of a Python file whose names, comments or docstrings hold a word of `RIDDLES`."""
+    text, found = (ROOT / path).read_text(), []
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        words = token.string.replace("_", " ") if token.type == tokenize.NAME else token.string
+        plain = token.type in (tokenize.NAME, tokenize.COMMENT, tokenize.STRING)
+        if plain and RIDDLES.search(words):
+            found += [(token.start[0], match.group()) for match in RIDDLES.finditer(words)]
+    return found
+
+
+def measure() -> dict[str, object]:
+    """All figures, as `--json` prints them."""
+    figures: dict[str, object] = {}
+    for side in SIDES:
+        arrows = room_arrows(side)
+        layers, upward = floors(arrows)
+        figures[side] = {
+            "rooms": len(arrows),
+            "floors": len(layers),
+            "arrows": sum(len(others) for others in arrows.values()),
+            "upward": upward,
+            "files": len(sources(side)),
+            "lines": sum((ROOT / path).read_text().count("\n") for path in sources(side)),
+            "layers": layers[::-1],
+        }
+    folders = Counter(str(path.parent) for path in sources(*SIDES) if path.name != "__init__.py")
+    lengths = {str(path): (ROOT / path).read_text().count("\n") for path in sources(*SIDES)}
+    figures["most_files_in_a_folder"] = folders.most_common(1)[0]
+    figures["files_under_40_lines"] = sum(2 < lines < 40 for lines in lengths.values())
+    figures["files_over_400_lines"] = {path: lines for path, lines in lengths.items() if lines > LONG_FILE}
+    figures["duplicate_class_names"] = class_names()
+    figures["riddles"] = {part: sum(len(riddles(path)) for path in sources(part)) for part in (*SIDES, "tests")}
+    return figures
+
+
+def main() -> None:
+    """Print the figures; with `--json` as one document."""
+    figures = measure()
+    if "--json" in sys.argv[1:]:
+        print(json.dumps(figures, indent=1))
+        return
+    for name, value in figures.items():
+        print(f"{name}:")
+        for each in value.items() if isinstance(value, dict) else [("", value)]:
+            print("  " + " ".join(str(part) for part in each).strip())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+import numpy as np
+
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Continuous
+from dreamfleet.common.artifacts.car_racing_variants import Variant
+
+ONE_PEDAL = Variant(pedals="one").controls
+
+
+def logits(*outputs):
+    return np.arctanh(np.array(outputs, np.float32))
+
+
+def test_one_pedal_is_gas_above_zero_and_brake_below():
+    assert (ONE_PEDAL.outputs, ONE_PEDAL.actions) == (2, 3)
+    for pedal, gas, brake in ((0.75, 0.75, 0), (-0.5, 0, 0.5), (0.0, 0, 0)):
+        np.testing.assert_allclose(ONE_PEDAL.to_action(logits(0.25, pedal)), [0.25, gas, brake], atol=1e-6)
+
+
+def test_a_shifted_pedal_gives_gas_where_its_output_is_zero():
+    shifted = Variant(pedals="one", pedal_shift=0.25).controls
+    for pedal, gas, brake in ((0.0, 0.25, 0), (-0.25, 0, 0), (-0.5, 0, 0.25), (0.9, 1, 0)):
+        np.testing.assert_allclose(shifted.to_action(logits(0.0, pedal)), [0, gas, brake], atol=1e-6)
+
+
+def test_a_brake_that_shares_its_output_feels_every_step_of_it():
+    """The plain brake is flat wherever its own output is below zero: no small step finds it."""
+    near = [np.array([0, pedal], np.float32) for pedal in (0.3, 0.31, -0.3, -0.31)]
+    assert len({ONE_PEDAL.to_action(each).tobytes() for each in near}) == 4
+    flat = [np.array([0, 0, brake], np.float32) for brake in (-0.3, -0.31)]
+    assert np.array_equal(*(STEERING_GAS_BRAKE.to_action(each) for each in flat))
+
+
+def test_the_largest_output_of_choices_is_done_and_of_equals_the_first():
+    five = Variant(actions="discrete").controls
+    assert (five.outputs, five.actions) == (5, 3)
+    assert five.to_action(np.array([9, -1, 0, 9, 3], np.float32)).tolist() == [0, 0, 0]
+    many = np.random.default_rng(0).normal(size=(64, 5)).astype(np.float32) * 9
+    done = five.to_action(many)
+    assert done.dtype == np.float32
+    assert all(np.array_equal(five.to_action(row), action) for row, action in zip(many, done, strict=True))
+    assert np.array_equal(five.to_outputs(done), np.eye(5)[many.argmax(axis=1)])
+    assert not five.to_outputs(np.array([[0.5, 0, 0]], np.float32)).any(), "what is no choice was none"
+
+
+def test_many_actions_are_each_the_one_alone():
+    many = np.random.default_rng(0).normal(size=(256, 2)).astype(np.float32)
+    together = ONE_PEDAL.to_action(many)
+    assert together.shape == (256, 3)
+    assert together.dtype == np.float32
+    assert all(np.array_equal(ONE_PEDAL.to_action(row), action) for row, action in zip(many, together, strict=True))
+
+
+def test_actions_go_back_to_what_a_controller_gives():
+    given = np.array([[0.25, -0.5], [-1.0, 0.75], [0.0, 0.0]], np.float32)
+    np.testing.assert_allclose(
+        ONE_PEDAL.to_outputs(ONE_PEDAL.to_action(np.arctanh(given * 0.9))), given * 0.9, atol=1e-6
+    )
+    action = np.array([[0.1, 0.2, 0.3]], np.float32)
+    assert STEERING_GAS_BRAKE.to_outputs(action) is action
+
+
+def test_an_action_has_an_output_of_its_own_unless_it_says_otherwise():
+    assert (STEERING_GAS_BRAKE.outputs, STEERING_GAS_BRAKE.actions) == (3, 3)
+    assert Continuous.between([-1, -2], [1, 2]).output_indices == ()
+    logits = np.random.default_rng(0).normal(size=3).astype(np.float32)
+    own = Continuous(*(getattr(STEERING_GAS_BRAKE, name) for name in ("scale", "shift", "low", "high")), (0, 1, 2))
+    assert np.array_equal(own.to_action(logits), STEERING_GAS_BRAKE.to_action(logits))

@@ -1,0 +1,187 @@
+import os
+import shutil
+import zipfile
+
+import numpy as np
+import onnx
+import pytest
+
+from dreamfleet.common.artifacts.bundle import (
+    DECODER,
+    DREAM_GRAPH,
+    ENCODER,
+    LINEAR_CONTROLLER,
+    MANIFEST,
+    POLICY,
+    Bundle,
+    hash_file,
+    write_bundle,
+)
+from dreamfleet.common.artifacts.bundle_store import BundleStore, find_bundle, shipped_bundles
+from dreamfleet.common.errors import BundleError
+from tests.support.bundles import states, write_random_bundle
+
+LARGEST_SHIPPED = 16_000_000
+
+
+def parts_of(bundle):
+    return {name: bundle.read(name) for name in bundle.manifest.parts}
+
+
+def test_equal_parts_give_equal_files(random_bundle, tmp_path):
+    again = write_bundle(tmp_path / "again.zip", random_bundle.manifest, parts_of(random_bundle))
+    assert again.sha256 == random_bundle.sha256 == hash_file(random_bundle.path)
+
+
+def test_what_ships_is_whole_and_small():
+    assert "tiny" in shipped_bundles()
+    for name, path in shipped_bundles().items():
+        bundle = find_bundle(name)
+        assert path.stat().st_size <= LARGEST_SHIPPED
+        assert bundle.controller_shape.size == 867
+        assert bundle.manifest.provenance["quality"]["reconstruction_error"] < 25
+
+
+def truncate(path):
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+def text(path):
+    path.write_text("this is no bundle")
+
+
+def flip_a_byte(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def drop_a_part(path):
+    rewrite(path, lambda name, data: None if name == ENCODER else data)
+
+
+def swap_a_part(path):
+    rewrite(path, lambda name, data: data[::-1] if name == ENCODER else data)
+
+
+def break_the_manifest(path):
+    rewrite(path, lambda name, data: b"{" if name == MANIFEST else data)
+
+
+def drop_the_manifest(path):
+    rewrite(path, lambda name, data: None if name == MANIFEST else data)
+
+
+def of_tomorrow(path):
+    rewrite(path, lambda name, data: data.replace(b'"format": 1', b'"format": 2') if name == MANIFEST else data)
+
+
+def rewrite(path, change):
+    with zipfile.ZipFile(path) as archive:
+        entries = [(name, archive.read(name)) for name in archive.namelist()]
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in entries:
+            if (changed := change(name, data)) is not None:
+                archive.writestr(name, changed)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (truncate, "not a whole bundle"),
+        (empty, "not a whole bundle"),
+        (text, "not a whole bundle"),
+        (flip_a_byte, "damaged|not a whole bundle"),
+        (drop_a_part, "not a whole bundle"),
+        (swap_a_part, "part encoder.onnx is damaged"),
+        (break_the_manifest, "manifest cannot be read"),
+        (drop_the_manifest, "not a whole bundle"),
+        (of_tomorrow, "bundle format 2; this version reads 1"),
+    ],
+)
+def test_damage_is_one_clear_line(random_bundle, tmp_path, damage, said):
+    path = tmp_path / "copy.zip"
+    shutil.copyfile(random_bundle.path, path)
+    damage(path)
+    with pytest.raises(BundleError, match=said) as error:
+        Bundle.open(path)
+    assert "\n" not in str(error.value)
+
+
+def without_nodes(part):
+    model = onnx.load_from_string(part)
+    del model.graph.node[:]
+    return model.SerializeToString()
+
+
+@pytest.mark.parametrize("name", [ENCODER, DECODER, POLICY, DREAM_GRAPH, LINEAR_CONTROLLER])
+@pytest.mark.parametrize(
+    "change", [lambda part: b"", without_nodes, lambda part: onnx.ModelProto().SerializeToString()]
+)
+def test_an_empty_graph_is_refused_by_its_name(random_bundle, tmp_path, name, change):
+    parts = parts_of(random_bundle)
+    with pytest.raises(BundleError, match=rf"b\.zip: {name} is an empty graph; .*build it again"):
+        write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, name: change(parts[name])})
+
+
+def test_a_bundle_says_how_many_recorded_states_it_has(random_bundle, tmp_path):
+    assert random_bundle.recorded_count == 0
+    with pytest.raises(BundleError, match="holds no recorded states"):
+        random_bundle.read_recorded()
+    kept = states(7)
+    some = write_random_bundle(tmp_path / "some.zip", recorded=kept)
+    assert some.recorded_count == 7
+    assert np.array_equal(some.read_recorded(), kept)
+
+
+def test_a_missing_bundle_names_those_that_ship(tmp_path):
+    with pytest.raises(BundleError, match=r"no bundle 'huge'.*tiny"):
+        find_bundle("huge")
+    with pytest.raises(BundleError, match="no bundle at"):
+        Bundle.open(tmp_path / "absent.zip")
+
+
+def test_the_store_finds_what_ships_and_what_was_downloaded(random_bundle, tmp_path):
+    store = BundleStore(tmp_path)
+    shipped = find_bundle("tiny")
+    assert store.find(shipped.sha256).path == shipped.path
+    assert store.find(random_bundle.sha256) is None
+    with store.lock_download(random_bundle.sha256) as partial:
+        shutil.copyfile(random_bundle.path, partial)
+        assert store.finish_download(random_bundle.sha256).sha256 == random_bundle.sha256
+    assert store.find(random_bundle.sha256) is not None
+
+
+def test_a_damaged_download_is_refused_and_removed(random_bundle, tmp_path):
+    store = BundleStore(tmp_path)
+    with store.lock_download(random_bundle.sha256) as partial:
+        partial.write_bytes(b"something else")
+        with pytest.raises(BundleError, match="arrived damaged"):
+            store.finish_download(random_bundle.sha256)
+        assert not partial.exists()
+
+
+def test_a_damaged_cached_copy_is_fetched_again(random_bundle, tmp_path):
+    store = BundleStore(tmp_path)
+    with store.lock_download(random_bundle.sha256) as partial:
+        shutil.copyfile(random_bundle.path, partial)
+        flip_a_byte(store.finish_download(random_bundle.sha256).path)
+    assert store.find(random_bundle.sha256) is None
+
+
+def test_other_weights_are_another_bundle(random_bundle, tmp_path):
+    assert write_random_bundle(tmp_path / "other.zip", seed=1).sha256 != random_bundle.sha256
+
+
+@pytest.mark.parametrize("name", ["", "abc", "../" * 20 + "etc0", "AB" * 32, "ab" * 31 + "/x"])
+def test_what_is_no_hash_is_never_part_of_a_path(tmp_path, name):
+    store = BundleStore(tmp_path)
+    with pytest.raises(BundleError, match="no hash of a bundle"):
+        store.find(name)
+    with pytest.raises(BundleError, match="no hash of a bundle"), store.lock_download(name):
+        pass
+    assert not list(tmp_path.iterdir())

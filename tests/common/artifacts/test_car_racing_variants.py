@@ -1,0 +1,127 @@
+import json
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.actions import STEERING_AND_HALVES, STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.car_racing_variants import DEFAULT_VARIANT, OPTION_HELP, Variant
+from dreamfleet.common.errors import UsageError
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        '{"pedals": "one"}',
+        '{"pedals": "half"}',
+        '{"actions": "discrete"}',
+        '{"actions": "discrete", "decide_every": 4}',
+        '{"pedal_shift": 0.25, "pedals": "one"}',
+        '{"decide_every": 4}',
+        '{"feedback": "last"}',
+        '{"time_cost": 0.5}',
+        '{"offroad_cost": 2.0}',
+        '{"decide_every": 2, "feedback": "last", "pedals": "one", "time_cost": 1.0}',
+    ],
+)
+def test_a_variant_is_its_options_and_back(options):
+    variant = Variant.from_json(options)
+    assert variant.options == options
+    assert Variant.from_json(variant.options) == variant
+    assert (variant.is_default, variant.version) == (False, 3 if variant.without_costs.is_default else 2)
+
+
+def test_the_plain_way_is_named_by_nothing():
+    assert (
+        Variant.from_json("")
+        == Variant.from_values({"pedals": "two", "decide_every": 1, "time_cost": 0})
+        == DEFAULT_VARIANT
+    )
+    assert (
+        DEFAULT_VARIANT.options,
+        DEFAULT_VARIANT.is_default,
+        DEFAULT_VARIANT.version,
+        DEFAULT_VARIANT.extra_features,
+    ) == ("", True, 1, 0)
+    assert DEFAULT_VARIANT.controls == STEERING_GAS_BRAKE
+
+
+def test_with_half_pedals_gas_and_brake_are_half_down_at_nothing():
+    assert Variant(pedals="half").controls == STEERING_AND_HALVES
+    outputs = np.array([[0, 0, 0], [9, 9, 9], [-9, -9, -9]], np.float32)
+    assert Variant(pedals="half").controls.to_action(outputs).round(4).tolist() == [
+        [0, 0.5, 0.5],
+        [1, 1, 1],
+        [-1, 0, 0],
+    ]
+    assert Variant(pedals="half", feedback="last").extra_features == 6
+
+
+def test_a_whole_number_is_written_as_the_number_that_it_means():
+    assert (
+        Variant.from_values({"time_cost": 2}).options
+        == '{"time_cost": 2.0}'
+        == Variant.from_json('{"time_cost": 2}').options
+    )
+
+
+def test_a_variant_can_be_said_as_a_run_is_told_it():
+    assert Variant(pedals="one", decide_every=4, time_cost=0.25).option_texts == (
+        "pedals=one", "decide_every=4", "time_cost=0.25",
+    )  # fmt: skip
+    assert DEFAULT_VARIANT.option_texts == ()
+
+
+def test_what_candidates_pay_is_no_part_of_how_they_drive():
+    assert Variant(time_cost=0.5, offroad_cost=2.0).without_costs == DEFAULT_VARIANT
+    assert Variant(pedals="one", time_cost=0.5).without_costs == Variant(pedals="one")
+
+
+def test_each_output_of_a_controller_is_seen_twice():
+    assert Variant(feedback="last").extra_features == 6
+    assert Variant(feedback="last", pedals="one").extra_features == 4
+    assert Variant(feedback="last", actions="discrete").extra_features == 10
+
+
+def test_an_unknown_option_names_those_that_there_are():
+    with pytest.raises(
+        UsageError, match="car-racing knows no option gears, pedal: known are actions, pedals, pedal_shift, "
+    ) as told:
+        Variant.from_json('{"pedal": "one", "gears": 5}')
+    assert all(name in str(told.value) for name in OPTION_HELP)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("actions", ["five", 1, None]),
+        ("pedals", ["three", 1, ["one"], None]),
+        ("pedal_shift", [0.5, "0", True]),  # of two pedals
+        ("decide_every", [0, 51, 2.0, True, "4"]),
+        ("feedback", ["first", False]),
+        ("time_cost", [-0.1, 101, float("nan"), "1", True]),
+        ("offroad_cost", [-0.1, 101, float("inf"), "1", False]),
+    ],
+)
+def test_a_value_out_of_its_range_is_refused_with_what_it_must_be(name, values):
+    for value in values:
+        with pytest.raises(UsageError) as told:
+            Variant.from_json(json.dumps({name: value}))
+        assert f"car-racing's {name} must be {OPTION_HELP[name]}, not {value!r}" == str(told.value)
+
+
+@pytest.mark.parametrize("options", ["{", "[1]", "7", '"one"'])
+def test_options_that_are_no_object_are_refused(options):
+    with pytest.raises(UsageError, match="must be a JSON object"):
+        Variant.from_json(options)
+
+
+def test_a_shift_that_leaves_no_pedal_is_refused():
+    assert Variant(pedals="one", pedal_shift=-1).controls.shift == (0, -1, 1)
+    for pedals in ("one", "half"):
+        with pytest.raises(UsageError, match="discrete with pedals=two"):
+            Variant(actions="discrete", pedals=pedals)
+    with pytest.raises(UsageError, match="0 unless pedals=one"):
+        Variant(pedals="half", pedal_shift=0.5)
+    with pytest.raises(UsageError, match="from -1 to 1"):
+        Variant(pedals="one", pedal_shift=1.5)

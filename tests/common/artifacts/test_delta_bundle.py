@@ -1,0 +1,83 @@
+"""A bundle that ships without the parts that another one has, and is put together where it is wanted."""
+
+import pytest
+
+from dreamfleet.common.artifacts import bundle_store
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, Bundle, write_bundle
+from dreamfleet.common.artifacts.bundle_store import BundleStore, find_bundle, write_shipped_delta
+from dreamfleet.common.errors import BundleError
+from tests.support.bundles import states, write_random_bundle
+
+
+@pytest.fixture
+def shelf(tmp_path, monkeypatch):
+    """A folder of what ships: `base` whole, and `able` without what is equal there."""
+    folder = tmp_path / "ships"
+    folder.mkdir()
+    monkeypatch.setattr(bundle_store, "pretrained_folder", lambda: folder)
+    monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "cache"))
+    base = write_random_bundle(folder / "base.zip")
+    other = write_random_bundle(tmp_path / "other.zip", recorded=states(5))
+    shared = {name: base.read(name) for name in base.manifest.parts}
+    own = {name: other.read(name) for name in other.manifest.parts.keys() - shared.keys()}
+    whole = write_bundle(tmp_path / "whole.zip", other.manifest, {**shared, **own})
+    write_shipped_delta(whole, "base", folder / "able.lean")
+    return folder, whole
+
+
+def test_it_is_the_bundle_that_was_frozen_to_the_byte(shelf):
+    folder, whole = shelf
+    assert (folder / "able.lean").stat().st_size < whole.path.stat().st_size / 3
+    found = find_bundle("able")
+    assert found.sha256 == whole.sha256
+    assert found.path.read_bytes() == whole.path.read_bytes()
+    assert found.read(DREAM_GRAPH) == whole.read(DREAM_GRAPH)
+    assert find_bundle("able").path == found.path, "it was put together once"
+    assert BundleStore(bundle_store.default_cache()).find(whole.sha256).path == found.path
+
+
+def test_a_controller_finds_its_world_model_by_the_hash(shelf):
+    _, whole = shelf
+    assert BundleStore(bundle_store.default_cache()).find(whole.sha256).sha256 == whole.sha256
+
+
+def test_a_damaged_copy_in_the_cache_is_put_together_again(shelf):
+    _, whole = shelf
+    path = find_bundle("able").path
+    path.write_bytes(b"damaged")
+    assert find_bundle("able").sha256 == whole.sha256
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda folder: (folder / "able.lean").write_bytes(b""),
+        lambda folder: (folder / "able.lean").write_bytes((folder / "able.lean").read_bytes()[:-100]),
+        lambda folder: (folder / "base.zip").unlink(),
+        lambda folder: (folder / "base.zip").write_bytes(b"no zip"),
+        lambda folder: write_random_bundle(folder / "base.zip", seed=9),
+    ],
+)
+def test_what_is_damaged_or_lacks_the_other_one_is_said(shelf, harm):
+    folder, _ = shelf
+    harm(folder)
+    with pytest.raises(BundleError) as raised:
+        find_bundle("able")
+    assert "\n" not in str(raised.value)
+
+
+def test_names_of_all_that_ship_are_told(shelf):
+    with pytest.raises(BundleError, match="one that ships: base, able"):
+        find_bundle("nobody")
+
+
+def test_a_cache_that_takes_nothing_is_said(shelf, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "file"))
+    with pytest.raises(BundleError, match="cannot write in"):
+        find_bundle("able")
+
+
+def test_what_ships_lean_is_whole():
+    for name in bundle_store.shipped_names():
+        assert isinstance(find_bundle(name), Bundle)

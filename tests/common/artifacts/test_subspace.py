@@ -1,0 +1,107 @@
+"""A subspace: what it holds, how it is kept, and what its coordinates stand for."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.artifacts.subspace import SearchSpace, Subspace
+from dreamfleet.common.errors import UsageError
+
+SHAPES = [ControllerShape(5, 2), ControllerShape(5, 2, hidden=3)]
+
+
+@pytest.fixture
+def subspace():
+    random = np.random.default_rng(1)
+    weights, offsets = (random.normal(size=size).astype(np.float32) for size in ((3, 5), 3))
+    return Subspace(weights, offsets, ("left", "right", "reward"), "ab" * 32)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_coordinates_are_weights_of_the_features(subspace, shape):
+    random, space = np.random.default_rng(2), SearchSpace(subspace, shape)
+    origin, coordinates = random.normal(size=shape.size), random.normal(size=(4, space.dimension))
+    seen = random.normal(size=5)
+    before, lifted = shape.unpack(origin), shape.unpack(space.lift(origin, coordinates))
+    features = np.append(subspace.weights.astype(np.float64) @ seen + subspace.offsets, 1)
+    outputs = shape.layers[0][0]
+    own = coordinates[:, : 4 * outputs].reshape(4, outputs, 4)
+    first = lifted[0][0] @ seen + lifted[0][1]
+    np.testing.assert_allclose(first, before[0][0] @ seen + before[0][1] + own @ features, rtol=1e-10)
+    if shape.hidden:  # layers behind the first are all free
+        rest = coordinates[:, 4 * outputs :]
+        np.testing.assert_allclose(
+            np.concatenate([each.reshape(4, -1) for each in lifted[1]], axis=1),
+            np.concatenate([each.ravel() for each in before[1]]) + rest,
+        )
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_it_begins_where_the_search_does_and_a_row_does_not_depend_on_others(subspace, shape):
+    space, random = SearchSpace(subspace, shape), np.random.default_rng(3)
+    origin, coordinates = random.normal(size=shape.size), random.normal(size=(9, space.dimension))
+    assert (space.lift(origin, np.zeros(space.dimension)) == origin).all()
+    together = space.lift(origin, coordinates)
+    assert all((space.lift(origin, each) == row).all() for each, row in zip(coordinates, together, strict=True))
+
+
+def test_it_is_kept_whole_as_text_and_as_a_file(subspace, tmp_path):
+    path = tmp_path / "few.npz"
+    subspace.save(path, {"drives": 3})
+    for again in (Subspace.from_text(subspace.text), Subspace.load(path)):
+        assert (again.weights == subspace.weights).all()
+        assert (again.names, again.bundle, again.sha256) == (subspace.names, subspace.bundle, subspace.sha256)
+
+
+def test_another_number_is_another_subspace(subspace):
+    moved = subspace.weights.copy()
+    moved[0, 0] = np.nextafter(moved[0, 0], 9, dtype=np.float32)
+    assert Subspace(moved, subspace.offsets, subspace.names, subspace.bundle).sha256 != subspace.sha256
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"weights": np.zeros((0, 5), np.float32)}, "no features"),
+        ({"weights": np.zeros(5, np.float32)}, "no features"),
+        ({"weights": np.full((3, 5), np.nan, np.float32)}, "NaN, or numbers beyond"),
+        ({"weights": np.full((3, 5), 2e6, np.float32)}, "NaN, or numbers beyond"),
+        ({"weights": np.zeros((3, 1 << 18), np.float32)}, "786432 weights"),
+        ({"weights": np.zeros((3, 5))}, "float32"),
+        ({"offsets": np.zeros(2, np.float32)}, "as many offsets and names"),
+        ({"about": {"names": ["a", "b"]}}, "as many offsets and names"),
+        ({"about": {"names": ["a", "b", "c" * 200]}}, "short texts"),
+        ({"about": {"names": ["a", "b", 3]}}, "short texts"),
+        ({"about": {"names": 3}}, "names are no list"),
+        ({"about": {"names": "abc"}}, "names are no list"),
+        ({"about": {"bundle": ""}}, "short texts"),
+        ({"about": {"format": 2}}, "another format"),
+        ({"about": {"format": True}}, "another format"),
+        ({"about": {"format": "x" * 5000}}, "another format"),
+    ],
+)
+def test_what_is_no_subspace_is_one_line(subspace, tmp_path, changes, why):
+    about = {"format": 1, "names": ["a", "b", "c"], "bundle": "ab"} | changes.pop("about", {})
+    arrays = {"weights": subspace.weights, "offsets": subspace.offsets, **changes}
+    path = tmp_path / "bad.npz"
+    np.savez(path, **arrays, about=json.dumps(about))
+    with pytest.raises(UsageError, match=why) as raised:
+        Subspace.load(path)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"rubbish", b"PK\x03\x04"])
+def test_what_is_no_archive_is_one_line(tmp_path, content):
+    path = tmp_path / "bad.npz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UsageError, match=r"bad\.npz"):
+        Subspace.load(path)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", "nothing", '{"weights": "é"}', "[" * 100_000])
+def test_a_damaged_fact_is_told_as_such(text):
+    with pytest.raises(ValueError):  # noqa: PT011 - who keeps it says which file it is
+        Subspace.from_text(text)

@@ -1,0 +1,114 @@
+"""The command line itself: verbs found, loaded alone, and slips of the hand answered."""
+
+import re
+import subprocess
+import sys
+from importlib.metadata import EntryPoint, entry_points
+
+import pytest
+
+from dreamfleet.common.cli import command_line
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from tests.support.processes import DEADLINE
+
+BROKEN = EntryPoint("broken", "tests.no_such_module", command_line.GROUP)
+
+
+def points(*more):
+    return {point.name: point for point in (*entry_points(group=command_line.GROUP), *more)}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("coordinator", "--populaton", "8"), "unrecognized arguments: --populaton 8; did you mean --population?"),
+        (("coordinator", "--evaluate-evry=3"), "did you mean --evaluate-every?"),
+        (("worker", "--conect", "tcp/a:1"), "did you mean --connect?"),
+        (("train", "vae", "--data", "x", "--updats", "3"), "did you mean --updates?"),
+        (("status", "--xyzzy"), "unrecognized arguments: --xyzzy\n"),
+    ],
+)
+def test_an_unknown_flag_names_the_near_one(words, said, capsys):
+    with pytest.raises(SystemExit) as left:
+        command_line.main(words)
+    assert left.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("wokrer",), "unknown verb 'wokrer': did you mean 'worker'?"),
+        (("runs", "lits"), "unknown verb 'runs lits': did you mean 'runs list'?"),
+        (("xyzzy",), "unknown verb 'xyzzy'; `dreamfleet --help` lists them"),
+    ],
+)
+def test_an_unknown_verb_names_the_near_one(words, said, capsys):
+    assert command_line.main(words) == UsageError.exit_code
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [(), ("runs",)])
+def test_no_verb_is_an_error_that_says_so(words, capsys):
+    with pytest.raises(SystemExit) as left:
+        command_line.main(words)
+    assert left.value.code == 2
+    assert "name a verb" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [("--help",), ("runs", "--help"), ("worker", "--help"), ("train", "vae", "--help")])
+def test_help_tells_the_exit_codes(words, capsys):
+    with pytest.raises(SystemExit) as left:
+        command_line.main(words)
+    assert left.value.code == 0
+    assert "130 it was interrupted" in " ".join(capsys.readouterr().out.split())
+
+
+def test_every_verb_offers_the_file_and_what_is_logged():
+    for name, point in points().items():
+        text = command_line.build_parser(name, point.load()).format_help()
+        assert "--config" in text, name
+        assert "--log-level" in text, name
+
+
+SILENT = {"dashboard", "demo", "router", "worker"}  # these work for a person who watches, or for nobody
+
+
+def test_every_verb_that_answers_can_do_so_in_json():
+    verbs = {name: command_line.build_parser(name, point.load()).format_help() for name, point in points().items()}
+    assert {name for name, text in verbs.items() if "--json" not in text} <= SILENT
+
+
+def test_a_verb_that_cannot_be_loaded_breaks_no_other(capsys, tmp_path):
+    assert command_line.run_verb(points(BROKEN), ["runs", "list", "--runs-dir", str(tmp_path)]) == 0
+    with pytest.raises(SystemExit):
+        command_line.run_verb(points(BROKEN), ["--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"broken BROKEN: the verb 'broken' cannot be loaded from tests\.no_such_module", told)
+    assert "score candidates for a run" in told
+    with pytest.raises(DreamfleetError, match=r"'broken' cannot be loaded .*ModuleNotFoundError"):
+        command_line.run_verb(points(BROKEN), ["broken"])
+
+
+def test_the_module_and_the_version():
+    command = [sys.executable, "-m", "dreamfleet", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=DEADLINE)
+    assert re.fullmatch(r"dreamfleet \d+\.\d+\.\d+\S*\n", done.stdout)
+
+
+def test_the_help_of_a_fork_names_no_default_that_it_does_not_have(capsys):
+    with pytest.raises(SystemExit):
+        command_line.main(["fork", "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "candidates a generation (default RUN's own)" in told
+    assert "(default 32)" not in told
+
+
+def test_closed_streams_end_no_verb_and_give_no_file_their_numbers(tmp_path):
+    program = (
+        "import os, sys; from dreamfleet.common.cli.command_line import main; assert sys.stdout is None; "
+        "main(['runs', 'list']); raise SystemExit(os.open('journal', os.O_CREAT | os.O_WRONLY))"
+    )
+    command = ["bash", "-c", '"$@" <&- >&- 2>&-', "-", sys.executable, "-c", program]
+    number = subprocess.run(command, cwd=tmp_path, check=False, timeout=DEADLINE).returncode
+    assert number > command_line.LAST_STREAM

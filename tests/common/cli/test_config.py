@@ -1,0 +1,107 @@
+from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
+from typing import Literal
+
+import pytest
+
+from dreamfleet.common.cli.config import add_flags, load, option, read_toml
+from dreamfleet.common.errors import UsageError
+
+
+@dataclass(frozen=True)
+class ThingConfig:
+    count: int = option(3, "how many")
+    rate: float = option(0.5, "how fast")
+    colour: Literal["red", "blue"] = option("red", "which")
+    names: tuple[str, ...] = option((), "whose")
+    loud: bool = option(False, "or not")
+    limit: float | None = option(None, "at most")
+    preset: str | None = option(None, "what to begin with")
+
+
+def flags(*arguments):
+    parser = ArgumentParser()
+    add_flags(parser, ThingConfig)
+    return parser.parse_args(arguments)
+
+
+def test_defaults_stand_alone():
+    assert load(ThingConfig, "thing") == ThingConfig()
+
+
+def test_the_nearer_source_wins():
+    sources = {
+        "base": {"count": 4, "rate": 4.0, "colour": "blue", "names": ("p",)},
+        "file": {"thing": {"count": 5, "rate": 5, "names": ["f"]}},
+        "environment": {"DREAMFLEET_THING_COUNT": "6", "DREAMFLEET_THING_RATE": "6", "HOME": "/"},
+        "flags": flags("--count", "7"),
+    }
+    assert load(ThingConfig, "thing", **sources) == ThingConfig(7, 6.0, "blue", ("f",))
+
+
+def test_flags_of_every_type():
+    given = flags("--rate", "2", "--colour", "blue", "--names", "a", "b", "--loud", "--limit", "9")
+    assert load(ThingConfig, "thing", flags=given) == ThingConfig(3, 2.0, "blue", ("a", "b"), True, 9.0)
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ({"file": {"thing": {"cuont": 1}}}, r"unknown key 'cuont' in \[thing\]: did you mean 'count'"),
+        ({"file": {"thing": {"count": "many"}}}, "count in .* must be a whole number, not 'many'"),
+        ({"file": {"thing": {"count": True}}}, "must be a whole number"),
+        ({"file": {"thing": {"colour": "green"}}}, "must be one of red, blue"),
+        ({"file": {"thing": {"names": [1]}}}, "must be a list of texts"),
+        ({"environment": {"DREAMFLEET_THING_CUONT": "1"}}, "unknown environment variable DREAMFLEET_THING_CUONT"),
+        ({"environment": {"DREAMFLEET_THING_COUNT": "x"}}, "DREAMFLEET_THING_COUNT must be a whole number, not 'x'"),
+        ({"environment": {"DREAMFLEET_THING_LOUD": "yes"}}, "must be true or false"),
+    ],
+)
+def test_what_nobody_knows_is_refused(source, said):
+    with pytest.raises(UsageError, match=said):
+        load(ThingConfig, "thing", **source)
+
+
+def test_a_flag_that_was_not_given_leaves_no_trace():
+    assert vars(flags()) == {}
+    assert load(ThingConfig, "thing", flags=Namespace(other=1)) == ThingConfig()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("[thign]\n", "unknown table"), ("thing = 3\n", "must be a table"), ("[thing\n", "cannot be read as TOML")],
+)
+def test_a_wrong_file_is_refused(tmp_path, text, said):
+    path = tmp_path / "run.toml"
+    path.write_text(text)
+    with pytest.raises(UsageError, match=said):
+        read_toml(path, ["thing"])
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(UsageError, match="no configuration file"):
+        read_toml(tmp_path / "absent.toml", ["thing"])
+
+
+def test_a_preset_can_be_named_in_the_file_and_is_weaker_than_everything_but_its_base(tmp_path):
+    sizes = {"large": {"count": 90, "rate": 9.0}}
+    sources = {"file": {"thing": {"preset": "large", "rate": 5}}, "base": {"count": 2, "colour": "blue"}}
+    loaded = load(ThingConfig, "thing", preset=sizes.__getitem__, **sources)
+    assert loaded == ThingConfig(90, 5.0, "blue", preset="large")
+    with pytest.raises(KeyError):
+        load(ThingConfig, "thing", preset=sizes.__getitem__, environment={"DREAMFLEET_THING_PRESET": "tiny"})
+
+
+def test_the_section_without_a_name_is_the_top_of_the_file(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text("count = 5\n[other]\nkey = 1\n")
+    file = read_toml(path, ["other"], top=["count"])
+    environment = {"DREAMFLEET_RATE": "2", "DREAMFLEET_OTHER_KEY": "3"}
+    assert load(ThingConfig, "", file=file, environment=environment) == ThingConfig(5, 2.0)
+
+
+def test_flags_can_be_some_of_a_section():
+    parser = ArgumentParser()
+    add_flags(parser, ThingConfig, only=["count"], texts={"count": "so many"})
+    assert "so many" in parser.format_help()
+    assert "--rate" not in parser.format_help()

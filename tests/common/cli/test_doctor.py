@@ -1,0 +1,84 @@
+"""`doctor` in an installation that has no more than a coordinator needs, put together from links."""
+
+import json
+import os
+import subprocess
+import sys
+from importlib.metadata import distribution
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.cli.health import missing_for_role, run_checks
+from tests.support.processes import DEADLINE, ROOT, environment
+
+COORDINATOR = ("cma", "eclipse-zenoh", "msgpack", "numpy", "rich", "pygments", "markdown-it-py", "mdurl", "dreamfleet")
+
+
+def top_of(name):
+    found = distribution(name)
+    files = found.files or []
+    tops = {file.parts[0] for file in files if ".." not in file.parts and not file.parts[0].startswith("__")}
+    return [found.locate_file(top) for top in tops]
+
+
+@pytest.fixture
+def bare(tmp_path):
+    """A folder of links to the coordinator's packages alone."""
+    site = tmp_path / "site"
+    site.mkdir()
+    for name in COORDINATOR:
+        for path in top_of(name):
+            (site / path.name).symlink_to(path)
+    return site
+
+
+def call(bare, tmp_path, *words, module=("-m", "dreamfleet")):
+    seen = {**environment(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join([str(bare), str(ROOT)])}
+    command = [sys.executable, "-S", "-P", *module, *words]
+    return subprocess.run(command, env=seen, capture_output=True, text=True, check=False, timeout=DEADLINE)
+
+
+def doctor(bare, tmp_path, *words):
+    done = call(bare, tmp_path, "doctor", *words)
+    assert not done.stderr, done.stderr
+    return done.returncode, done.stdout
+
+
+def test_it_says_of_each_role_whether_it_can_be_played_and_the_whole_remedy(bare, tmp_path):
+    code, out = doctor(bare, tmp_path)
+    assert code == 0
+    assert "coordinator\tcan be played" in out
+    assert "worker\tcannot be played: gymnasium, pygame-ce, box2d, onnxruntime missing" in out
+    assert "pip install 'dreamfleet[worker]'" in out
+
+
+@pytest.mark.parametrize(
+    ("role", "code"),
+    [("coordinator", 0), ("worker", 1), ("views", 1), ("train", 1), ("dashboard", 1), ("export", 1)],
+)
+def test_its_exit_code_is_of_the_role_that_is_asked_about(bare, tmp_path, role, code):
+    left, out = doctor(bare, tmp_path, "--role", role, "--json")
+    report = json.loads(out)
+    assert left == code
+    assert report["ok"] is (code == 0)
+    assert report["roles"]["coordinator"]
+    assert not report["roles"]["worker"]
+
+
+def test_a_run_that_needs_a_workers_packages_to_begin_says_which_extra_has_them(bare, tmp_path):
+    done = call(bare, tmp_path, "coordinator", "--task", "gym:LunarLander-v3", "--runs-dir", str(tmp_path / "runs"))
+    assert done.returncode == 2
+    assert "no module 'gymnasium' here; pip install 'dreamfleet[worker]'" in done.stderr
+
+
+def test_the_search_says_nothing_of_pictures_that_nobody_asked_for(bare, tmp_path):
+    done = call(bare, tmp_path, module=("-c", "import dreamfleet.coordinator.optimisers.pycma"))
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_worker_needs_no_folder_for_runs():
+    """Its root may be read-only but for the cache."""
+    findings = run_checks(Path("/dev/null/runs"))
+    assert missing_for_role("worker", findings) == []
+    assert [each.name for each in missing_for_role("coordinator", findings)] == ["runs folder"]

@@ -1,0 +1,104 @@
+"""What every verb knows of its surroundings: from the top of a file, the environment and flags, in this order."""
+
+from argparse import ArgumentParser
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.cli.global_config import add_common_flags, add_global_flags, complete_arguments, resolve_network
+from dreamfleet.common.errors import UsageError
+
+FILE = """
+connect = ["tcp/file:1"]
+listen = ["tcp/0.0.0.0:1"]
+runs_dir = "/from/file"
+log_level = "error"
+
+[run]
+preset = "dream"
+
+[worker]
+slots = 3
+"""
+
+
+def settled(*words, environment=None):
+    parser = ArgumentParser()
+    add_global_flags(parser, "connect", "runs_dir")
+    add_common_flags(parser)
+    args = parser.parse_args(words)
+    complete_arguments(args, environment or {})
+    return args
+
+
+def test_defaults_stand_alone():
+    args = settled()
+    assert (resolve_network(args).connect, args.listen, str(args.runs_dir)) == (("tcp/127.0.0.1:7447",), (), "runs")
+    assert args.given == {"config"}
+
+
+def test_file_environment_and_flags_in_this_order(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text(FILE)
+    environment = {"DREAMFLEET_CONNECT": "tcp/environment:1,tcp/other:2", "DREAMFLEET_RUNS_DIR": "/from/environment"}
+    flags = ("--config", path, "--runs-dir", "/from/flag")
+    args = settled(*map(str, flags), environment=environment)
+    assert args.global_config.connect == ("tcp/environment:1", "tcp/other:2")
+    assert args.listen == ("tcp/0.0.0.0:1",)
+    assert str(args.runs_dir) == "/from/flag"
+    assert args.log_level == "error"
+    assert {"runs_dir"} <= args.given
+    assert args.sources["file"]["worker"] == {"slots": 3}
+
+
+def test_an_empty_variable_takes_back_the_join_file_that_the_file_names(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text('join = "lab.join"\n')
+    assert settled("--config", str(path)).global_config.join == Path("lab.join")
+    assert settled("--config", str(path), environment={"DREAMFLEET_JOIN": ""}).global_config.join is None
+
+
+def test_the_file_can_be_named_in_the_environment(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text(FILE)
+    assert settled(environment={"DREAMFLEET_CONFIG": str(path)}).global_config.connect == ("tcp/file:1",)
+
+
+def test_quiet_logs_warnings_alone():
+    assert settled("-q").log_level == "warning"
+    assert settled("--log-level", "debug").log_level == "debug"
+
+
+@pytest.mark.parametrize(
+    ("environment", "said"),
+    [
+        ({"DREAMFLEET_CONECT": "tcp/a:1"}, "unknown environment variable DREAMFLEET_CONECT: did you mean DREAMFLEET_C"),
+        ({"DREAMFLEET_RUN_DIR": "x", "DREAMFLEET_RUNSDIR": "x"}, "did you mean DREAMFLEET_RUNS_DIR"),
+        ({"DREAMFLEET_CONNECT": "nowhere"}, "write it as tcp/HOST:PORT"),
+        ({"DREAMFLEET_LOG_LEVEL": "loud"}, "must be one of debug, info, warning, error"),
+        ({"DREAMFLEET_CONFIG": "absent.toml"}, "no configuration file at absent.toml"),
+    ],
+)
+def test_a_wrong_environment_is_refused(environment, said):
+    with pytest.raises(UsageError, match=said):
+        settled(environment=environment)
+
+
+def test_variables_of_others_are_none_of_our_business():
+    settled(environment={"DREAMFLEET_CACHE": "x", "DREAMFLEET_TEST_STEPS": "y", "DREAMFLEET_WORKER_SLOTS": "1"})
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('conect = ["tcp/a:1"]\n', "unknown key 'conect': did you mean 'connect'"),
+        ("connect = 3\n", "connect must be a list of texts, not 3"),
+        ("[wokrer]\n", r"unknown table \[wokrer\]: did you mean 'worker'"),
+        ("[connect]\n", "connect must be a list of texts"),
+    ],
+)
+def test_a_wrong_file_is_refused(tmp_path, text, said):
+    path = tmp_path / "fleet.toml"
+    path.write_text(text)
+    with pytest.raises(UsageError, match=said):
+        settled("--config", str(path))

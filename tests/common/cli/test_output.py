@@ -1,0 +1,66 @@
+"""Answers: whole tables in a terminal, tab-separated lines in a pipe, JSON where it is asked for."""
+
+import fcntl
+import json
+import os
+import pty
+import struct
+import subprocess
+import sys
+import termios
+from argparse import Namespace
+
+from dreamfleet.common.cli.output import print_answer, print_rows
+from tests.support.processes import DEADLINE
+
+LONG = "a-run-whose-name-is-longer-than-any-column-of-a-narrow-terminal-would-be"
+ROWS = [{"run": LONG, "state": "said [bold]so[/] and [worker]", "generations": 12}] * 2
+SHOW = f"from dreamfleet.common.cli.output import print_rows; print_rows({ROWS!r}, right=['generations'])"
+
+
+def in_terminal(code, columns):
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    seen = {**os.environ, "TERM": "xterm"}
+    seen.pop("COLUMNS", None)
+    with subprocess.Popen([sys.executable, "-c", code], stdout=theirs, stdin=theirs, env=seen) as child:
+        os.close(theirs)
+        told = b""
+        try:
+            while part := os.read(ours, 4096):
+                told += part
+        except OSError:  # the other end is closed
+            pass
+        assert child.wait(DEADLINE) == 0
+    os.close(ours)
+    return told.decode()
+
+
+def test_a_narrow_terminal_cuts_nothing_and_brackets_stay():
+    told = in_terminal(SHOW, 40)
+    assert LONG in told
+    assert "said [bold]so[/] and [worker]" in told
+    assert "…" not in told
+
+
+def test_a_pipe_gets_tab_separated_lines(capsys):
+    print_rows([{"a": "x y", "b": 1}, {"a": "line\nbreak\ttab", "b": None}])
+    assert capsys.readouterr().out == "a\tb\nx y\t1\nline break tab\t-\n"
+
+
+def test_an_answer_is_a_sentence_or_json(capsys, tmp_path):
+    print_answer(Namespace(json=False), "archived", archived=tmp_path)
+    print_answer(Namespace(json=True), "archived", archived=tmp_path)
+    first, second = capsys.readouterr().out.splitlines()
+    assert first == "archived"
+    assert json.loads(second) == {"archived": str(tmp_path)}
+
+
+def test_no_word_of_others_is_an_order_to_a_terminal():
+    rows = [{"run": "night\x1b[2J", "state": "ended: \x1b]0;owned\x07\u202e"}]
+    show = f"from dreamfleet.common.cli.output import print_rows; print_rows({rows!r})"
+    told = in_terminal(show, 80)
+    piped = subprocess.run([sys.executable, "-c", show], check=True, capture_output=True, text=True).stdout
+    for text in (told, piped):
+        assert "night\\x1b[2J" in text
+        assert "owned\\x07\\u202e" in text

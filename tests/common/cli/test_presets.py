@@ -1,0 +1,59 @@
+"""Kinds of presets share some names: every message says which kind it speaks of. Help and docs tell their values."""
+
+import argparse
+import re
+import shlex
+
+import pytest
+
+from dreamfleet.common.cli.command_line import build_parser
+from dreamfleet.common.cli.presets import NAMES, check_preset
+from dreamfleet.common.errors import UsageError
+from dreamfleet.coordinator.settings import presets as runs
+from dreamfleet.coordinator.verbs import coordinator
+from dreamfleet.worker.baselines import presets as baselines
+from dreamfleet.worker.training import presets
+from dreamfleet.worker.training.config_flags import add_training_flags
+from dreamfleet.worker.verbs import baseline_train
+from tests.support.processes import ROOT
+
+
+def test_the_names_are_those_that_each_side_has_settings_for():
+    assert set(NAMES["run"]) == set(runs.PRESETS)
+    assert set(NAMES["training"]) == set(presets.PRESETS)
+    assert set(NAMES["baseline"]) == set(baselines.PRESETS)
+
+
+def test_a_name_of_the_other_kind_is_told_apart():
+    with pytest.raises(UsageError, match=r"unknown run preset 'attentive'.*'attentive' is a preset of training"):
+        check_preset("run", "attentive")
+    with pytest.raises(UsageError, match=r"unknown training preset 'dream'.*'dream' is a preset of run"):
+        presets.find_preset("dream")
+    with pytest.raises(UsageError, match=r"unknown baseline preset 'tiny'.*'tiny' is a preset of training"):
+        baselines.find_preset("tiny")
+
+
+def test_help_tells_each_presets_values():
+    training, learning = argparse.ArgumentParser(), argparse.ArgumentParser()
+    add_training_flags(training, "vae")
+    baseline_train.configure(learning)
+    told = " ".join(training.format_help().split())
+    assert "(default 1500; notebook 30000; article 60000; attentive 19200; paper 1000000)" in told
+    assert "0: never (default 0; attentive, paper 10)" in told
+    assert "else what leads to the picture's size (notebook 5 5 6 6)" in told
+    assert "else the encoder's from behind --" in told
+    assert "(default 2000; notebook 500)" in " ".join(learning.format_help().split())
+
+
+def test_docs_tell_what_each_preset_of_a_run_is():
+    page = (ROOT / "docs" / "operations.md").read_text()
+    told = dict(re.findall(r"^\| `(\w+)` \| `(--[^`]+)`", page, re.MULTILINE))
+    assert told.keys() == runs.PRESETS.keys()
+    for name, flags in told.items():
+        said = vars(build_parser("coordinator", coordinator).parse_all(shlex.split(flags)))
+        settings = {key: value for key, value in runs.PRESETS[name].items() if key not in ("stages", "preset_variant")}
+        if variant := runs.PRESETS[name].get("preset_variant"):
+            settings["variant"] = variant
+        heard = {key: tuple(said[key]) if isinstance(said[key], list) else said[key] for key in settings}
+        assert heard == settings
+        assert flags.count("--") == len(settings)

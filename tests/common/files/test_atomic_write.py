@@ -1,0 +1,57 @@
+"""What `--out` names is looked at before the work, and is whole or not there."""
+
+import os
+from contextlib import suppress
+
+import pytest
+
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.files.atomic_write import check_output_path, open_output
+
+
+def test_a_folder_is_made_and_a_file_is_whole(tmp_path):
+    path = tmp_path / "results" / "tiny.json"
+    check_output_path(path)
+    with open_output(path) as file:
+        file.write(b"all of it")
+    assert path.read_bytes() == b"all of it"
+
+
+def test_where_no_file_can_be_is_said_before_the_work(tmp_path):
+    with pytest.raises(UsageError, match="is a folder"):
+        check_output_path(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="cannot be made"):
+        check_output_path(tmp_path / "file" / "tiny.json")
+
+
+def test_a_device_or_pipe_stays_what_it_is(tmp_path):
+    pipe, link = tmp_path / "pipe", tmp_path / "link"
+    os.mkfifo(pipe)
+    link.symlink_to(pipe)
+    for path in (pipe, link):
+        with pytest.raises(UsageError, match="it is no regular file: name another"):
+            check_output_path(path)
+        with pytest.raises(DreamfleetError, match="cannot write"), open_output(path):
+            pass
+    assert pipe.is_fifo()
+    assert link.is_symlink()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_nobody_may_write_in_is_said_before_the_work(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(UsageError, match="cannot be written in"):
+        check_output_path(tmp_path / "tiny.json")
+
+
+def test_what_fails_half_way_leaves_what_was_there(tmp_path):
+    path = tmp_path / "tiny.json"
+    path.write_text("before")
+    with suppress(RuntimeError), open_output(path) as file:
+        file.write(b"half")
+        raise RuntimeError
+    assert [each.name for each in tmp_path.iterdir()] == ["tiny.json"]
+    assert path.read_text() == "before"
+    with pytest.raises(DreamfleetError, match="cannot write"), open_output(tmp_path / ("n" * 300)):
+        pass

@@ -1,0 +1,85 @@
+"""Streams whose reader sleeps, over real pipes."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from dreamfleet.common.host.nonblocking_io import MAX_WAITING_CHARS, NonblockingStream
+from tests.support.processes import DEADLINE, environment
+
+
+@pytest.fixture
+def pipe():
+    """What reads, and a stream that writes."""
+    read, write = os.pipe()
+    with os.fdopen(write, "w") as stream, os.fdopen(read, "rb") as reader:
+        yield reader, stream
+
+
+def read_in_background(reader, until):
+    got = bytearray()
+
+    def run():
+        while until not in got:
+            got.extend(os.read(reader.fileno(), 65536))
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return got, thread
+
+
+def test_what_is_written_arrives_in_order(pipe):
+    reader, stream = pipe
+    unblocked = NonblockingStream(stream)
+    for number in range(100):
+        print("line", number, file=unblocked)
+    print("and a half", end="", file=unblocked, flush=True)
+    got, thread = read_in_background(reader, b"half")
+    thread.join(DEADLINE)
+    assert got.decode() == "".join(f"line {number}\n" for number in range(100)) + "and a half"
+
+
+def test_nothing_waits_for_a_reader_that_sleeps_and_what_was_dropped_is_said(pipe):
+    reader, stream = pipe
+    unblocked = NonblockingStream(stream)
+    line = "x" * 999 + "\n"
+    count = 3 * MAX_WAITING_CHARS // len(line)
+    for _ in range(count):
+        unblocked.write(line)
+    unblocked.finish(0.1)
+    got, thread = read_in_background(reader, b"dropped here")
+    thread.join(DEADLINE)
+    arrived = got.count(line.encode())
+    dropped = int(got.split(b" lines were dropped")[0].rsplit(b"\n", 1)[-1])
+    assert arrived + dropped == count
+    assert dropped > count // 3
+
+
+def test_a_reader_that_is_gone_ends_nothing(pipe):
+    reader, stream = pipe
+    unblocked = NonblockingStream(stream)
+    reader.close()
+    unblocked.write("to nobody\n")
+    unblocked.finish(10)
+
+
+def test_a_process_ends_although_nobody_reads_its_last_words():
+    program = (
+        "import os, sys, logging\n"
+        "from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking\n"
+        "os.set_blocking(2, False)\n"
+        "try:\n"
+        "    while True: os.write(2, bytes(4096))\n"
+        "except BlockingIOError: os.set_blocking(2, True)\n"
+        "logging.basicConfig()\n"
+        "make_stderr_nonblocking()\n"
+        "for n in range(1000): logging.warning('nobody reads this')\n"
+        "raise SystemExit(7)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stderr=subprocess.PIPE, env=environment("/nowhere")
+    ) as popen:
+        assert popen.wait(DEADLINE) == 7

@@ -1,0 +1,43 @@
+import os
+import signal
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from dreamfleet.common.host.stop_signals import never_stop, signals_deferred, stop_on_signals
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_is_told_and_the_second_interrupts(number):
+    with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:  # noqa: PT012
+        assert not stop()
+        os.kill(os.getpid(), number)
+        assert stop()
+        os.kill(os.getpid(), number)
+
+
+def test_afterwards_signals_do_what_they_did_before():
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with stop_on_signals():
+        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] != before
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+    assert not never_stop()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_is_undisturbed_is_finished_before_a_signal_counts(number):
+    finished = []
+    with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:  # noqa: PT012
+        with signals_deferred():
+            signal.raise_signal(number)
+            finished.append(stop())
+        assert stop()
+        with signals_deferred():
+            signal.raise_signal(number)
+            finished.append(True)
+    assert finished == [False, True]
+
+
+def test_a_thread_that_hears_no_signals_needs_no_peace():
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(lambda: [signals_deferred().__enter__()]).result() == [None]

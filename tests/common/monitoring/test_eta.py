@@ -1,0 +1,159 @@
+"""What a run's status tells of its end, and its state as a sentence."""
+
+import dataclasses
+
+import pytest
+
+from dreamfleet.common.monitoring.eta import describe_state, estimate_eta, format_duration
+from dreamfleet.common.monitoring.status import EpisodeProgress, GenerationStatus, Throughput, WorkerCount
+from tests.support.samples import BEST, CLOSED, STATUS
+
+
+def status(limits=(), seconds=None, gone=0.0, **changes):
+    recent = tuple(dataclasses.replace(CLOSED, seconds=each) for each in changes.pop("paces", (4.5, 4.6, 900.0)))
+    return dataclasses.replace(
+        STATUS, limits={"generations": 0, "steps": 0, "minutes": 0.0, "target": None, "parted": 0, **dict(limits)},
+        recent=recent, throughput=Throughput(1000.0, changes.pop("steps", 448_000), seconds),
+        generation=GenerationStatus(7, 3, 8, gone, 0.09, None), **changes,
+    )  # fmt: skip
+
+
+def test_minutes_are_told_with_the_pace_and_what_is_left():
+    eta = estimate_eta(status({"minutes": 30.0}, seconds=18 * 60))
+    assert eta.description == "18 of 30 minutes, 4.6 s a generation, about 12 min to go"
+    assert eta.bounds[0].share == pytest.approx(0.6)
+    assert eta.seconds == pytest.approx(12 * 60)
+
+
+def test_one_generation_that_was_paused_for_long_does_not_set_the_pace():
+    assert estimate_eta(status()).pace == 4.6
+
+
+def test_the_open_generation_counts_for_what_it_has_taken():
+    assert estimate_eta(status({"generations": 9}, gone=1.6)).seconds == pytest.approx(3.0 + 4.6)
+    assert estimate_eta(status({"generations": 8}, gone=99.0)).seconds == 0
+
+
+def test_steps_are_foretold_by_the_rate_of_closed_generations():
+    eta = estimate_eta(status({"steps": 576_000}, paces=(10.0, 10.0)))  # each of 64,000 steps
+    assert eta.description.startswith("448k of 576k steps")
+    assert eta.seconds == pytest.approx(20.0)
+
+
+def test_of_several_limits_the_nearest_stands_first_and_counts():
+    eta = estimate_eta(status({"generations": 1000, "minutes": 30.0}, seconds=18 * 60))
+    assert [each.name for each in eta.bounds] == ["minutes", "generations"]
+    assert eta.seconds == eta.bounds[0].seconds
+
+
+def with_speed(told, candidates=None, evaluations=None):
+    throughput = dataclasses.replace(
+        told.throughput, episodes_per_second=candidates, evaluation_episodes_per_second=evaluations
+    )
+    return dataclasses.replace(told, throughput=throughput)
+
+
+@pytest.mark.parametrize(("rate", "then"), [(None, "then 90 episodes of evaluation"), (0.5, "about 3 min to go")])
+def test_evaluations_and_confirmation_after_the_limit_count(rate, then):
+    ending = status({"minutes": 1.0}, seconds=66.0, gone=40.0, state="evaluating", ending=True, closing=90)
+    eta = estimate_eta(with_speed(ending, evaluations=rate))
+    assert eta.description == f"1.1 of 1 minute, 4.6 s a generation, {then}"
+    before = status({"minutes": 2.0}, seconds=60.0, closing=90)
+    eta = estimate_eta(with_speed(before, evaluations=rate))
+    assert (eta.limit, eta.seconds) == (60.0, None if rate is None else 240.0)
+    assert ("about 1 min to its limit, then 90" in eta.description) == (rate is None)
+
+
+def test_a_limit_that_an_evaluation_reached_is_over_too():
+    eta = estimate_eta(
+        with_speed(status({"target": 900.0}, state="evaluating", ending=True, closing=90), evaluations=9.0)
+    )
+    assert eta.seconds == 10.0
+
+
+def test_a_coordinator_from_before_says_what_is_in_progress():
+    eta = estimate_eta(status({"minutes": 1.0}, seconds=66.0, state="evaluating", confirming=EpisodeProgress(3, 16)))
+    assert eta.description.endswith("then 13 episodes of evaluation")
+    assert estimate_eta(status({"minutes": 1.0}, seconds=66.0)).description.endswith("about to end")
+
+
+def test_where_workers_were_lost_generations_are_foretold_by_the_speed_of_those_that_are_left():
+    slowed = with_speed(status({"generations": 10}, gone=99.0), candidates=0.5)  # 5 of 8 episodes are left
+    assert estimate_eta(slowed).seconds == 10 + 16 + 16
+    steps = with_speed(status({"steps": 576_000}, paces=(8.0, 8.0)), candidates=0.5)
+    assert estimate_eta(steps).seconds == pytest.approx(2 * 16.0)
+    first = with_speed(status({"generations": 8}, paces=()), candidates=0.5)
+    assert estimate_eta(first).seconds == 10.0
+
+
+def test_a_target_is_told_and_not_foretold():
+    eta = estimate_eta(status({"target": 900.0, "parted": 3}, best=BEST))
+    assert eta.description == (
+        "until an evaluation reaches 900 (best 120), until 3 evaluations in a row fall behind, 4.6 s a generation"
+    )
+    assert eta.seconds is None
+
+
+def test_without_limits_or_generations_nothing_is_made_up():
+    assert estimate_eta(status(paces=())).description == "no limit: it runs until it is stopped"
+    assert estimate_eta(status({"generations": 9}, paces=())).seconds is None
+    assert estimate_eta(status({"minutes": 30.0})).bounds == ()  # an earlier coordinator does not say how long
+
+
+@pytest.mark.parametrize("state", ["paused", "waiting for workers", "ended", "left"])
+def test_while_nobody_works_there_is_no_time_to_go(state):
+    assert estimate_eta(status({"minutes": 30.0}, seconds=60.0, state=state)).seconds is None
+
+
+@pytest.mark.parametrize("strange", ["many", None, [1], float("nan"), -3])
+def test_limits_of_another_version_are_passed_over(strange):
+    eta = estimate_eta(
+        status(dict.fromkeys(("generations", "steps", "minutes", "target", "parted"), strange), seconds=1.0)
+    )
+    assert eta.bounds == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "generation 7: 3 of 8 episodes"),
+        ({"state": "paused", "why": "asked for"}, "paused: asked for"),
+        ({"state": "evaluating", "evaluating": EpisodeProgress(3, 16)}, "waiting for an evaluation: 3 of 16 episodes"),
+        (
+            {"state": "evaluating", "confirming": EpisodeProgress(3, 1600)},
+            "confirming what it will report: 3 of 1,600 episodes",
+        ),
+        ({"state": "waiting for workers"}, "waiting for workers: none of 1 is there"),
+        (
+            {"state": "waiting for workers", "workers": WorkerCount(0, 0), "steps": 0},
+            "waiting for workers: none has come yet",
+        ),
+        ({"state": "waiting for workers", "workers": WorkerCount(0, 0)}, "waiting for workers: none is there"),
+        (
+            {"state": "waiting for workers", "refused": {"old-host": "no AVX2"}},
+            "waiting for workers; old-host cannot join: no AVX2",
+        ),
+        (
+            {"state": "left"},
+            "its coordinator left; `dreamfleet coordinator --resume night` goes on (its log has the whole command)",
+        ),
+        (
+            {"state": "ended", "why": "30 minutes", "best": None},
+            "ended: 30 minutes; the last mean; it was not evaluated",
+        ),
+        ({"state": "of a later version"}, "of a later version"),
+    ],
+)
+def test_a_state_is_a_sentence(changes, said):
+    assert describe_state(status(**changes)) == said
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (0.0, "0 s"), (0.25, "0.25 s"), (4.6, "4.6 s"), (48.2, "48 s"), (59.7, "1 min"), (720, "12 min"),
+        (3599, "1 h"), (12_000, "3 h 20 min"), (439_200, "5 d 2 h"), (86_400 * 3, "3 d"), (float("inf"), "very long"),
+    ],
+)  # fmt: skip
+def test_durations_are_said_as_people_say_them(seconds, said):
+    assert format_duration(seconds) == said

@@ -1,0 +1,220 @@
+"""The panel in a terminal of any width."""
+
+import dataclasses
+import io
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.cells import cell_len
+from rich.console import Console
+
+from dreamfleet.common.monitoring.status import Population, StageStatus, WorkerCount
+from dreamfleet.common.monitoring.status_panel import Block, RunPanel, allocate_lines, panel_lines
+from dreamfleet.common.monitoring.terminal_charts import bar_chart, candidate_grid
+from dreamfleet.common.monitoring.worker_table import WorkerTable, find_slowest
+from tests.support.samples import STATUS
+
+LONG = "a-host-with-quite-a-long-name.example.org/0a1b2c3d"
+WORKER = dataclasses.replace(
+    STATUS.worker_list[0], worker=LONG, steps_per_second=12345.6, finished=123456, load=12.25, drawn_by="gymnasium"
+)
+
+
+def drawn(status, width, *flags):
+    console = Console(file=io.StringIO(), width=width)
+    console.print(RunPanel(status, *flags))
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_a_workers_name_is_whole_in_a_terminal_of_any_width(width):
+    text = drawn(dataclasses.replace(STATUS, worker_list=(WORKER,)), width)
+    assert LONG in text
+    assert "…" not in text
+
+
+def test_what_matters_least_is_left_out_first():
+    status = dataclasses.replace(STATUS, worker_list=(WORKER,))
+    narrow, wide = drawn(status, 80), drawn(status, 160)
+    assert all(column in wide for column in ("slots", "leases", "finished", "load", "picture", "round trip", "resent"))
+    assert "state" in narrow
+    assert "picture" not in narrow
+
+
+FLEET = tuple(
+    dataclasses.replace(
+        STATUS.worker_list[0], worker=f"a-host-of-thirty-letters-x{number:04d}/0a1b2c3d", job_seconds=1.2,
+        round_trip=0.05, resent=3,
+    )
+    for number in range(40)
+)  # fmt: skip
+RECENT = tuple(dataclasses.replace(STATUS.recent[0], number=number, mean=float(number)) for number in range(60))
+LARGE = dataclasses.replace(
+    STATUS, worker_list=FLEET, workers=WorkerCount(40, 40), recent=RECENT,
+    population=Population(7, 0, 64, (16,) * 30 + (4,) * 10 + (0,) * 24, (16,) * 64, (5.0,) * 40 + (None,) * 24),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (60, 10), (200, 60), (20, 5)])
+def test_a_picture_that_is_drawn_again_and_again_fits_the_terminal(width, height):
+    console = Console(file=io.StringIO(), width=width, height=height)
+    console.print(RunPanel(LARGE, fitted=True))
+    lines = console.file.getvalue().splitlines()
+    assert len(lines) <= height - 1
+    assert max(map(cell_len, lines)) <= width
+
+
+def test_at_80_columns_and_24_lines_every_part_is_there_and_names_are_whole():
+    lines = [line.plain for line in panel_lines(LARGE, 76, 21)]
+    text = "\n".join(lines)
+    assert len(lines) == 21
+    for part in ("episodes", "a generation", "last generation", "reported", "mean fitness by generation", "worker"):
+        assert part in text
+    rows = [line for line in lines if line.startswith("a-host")]
+    assert len(rows) >= 3
+    assert {line.split()[0] for line in rows} <= {each.worker for each in FLEET}
+    assert f"and {40 - len(rows)} more" in lines[-1]
+
+
+def test_whoever_is_lost_or_slow_is_among_the_few_that_have_room():
+    odd = {17: {"state": "silent"}, 31: {"job_seconds": 4.6}}
+    fleet = [dataclasses.replace(each, **odd.get(number, {})) for number, each in enumerate(FLEET)]
+    lines = [line.plain for line in WorkerTable(fleet, 41).lines(76, 5)]
+    assert [line.split("  ")[0] for line in lines[1:4]] == [fleet[number].worker for number in (0, 17, 31)]
+    assert "slowest" in lines[3]
+    assert "4.6 s" in lines[3]
+    assert lines[4] == "and 38 more"
+    assert find_slowest(FLEET) is None
+
+
+def test_a_name_longer_than_the_terminal_goes_on_in_the_next_line():
+    lines = [line.plain for line in WorkerTable([WORKER], 1).lines(30, 10)]
+    assert "".join(lines[1:]) == LONG
+    assert WorkerTable([WORKER], 1).height(30) == len(lines)
+
+
+def test_lines_go_to_the_blocks_that_are_needed_first():
+    blocks = [Block(1, 2, 4, 9, list), Block(0, 1, 1, 1, list), Block(2, 3, 5, 5, list)]
+    assert allocate_lines(blocks, None) == [9, 1, 5]
+    assert allocate_lines(blocks, 0) == [0, 0, 0]
+    assert allocate_lines(blocks, 2) == [0, 1, 0]
+    assert allocate_lines(blocks, 5) == [4, 1, 0]
+    assert allocate_lines(blocks, 7) == [3, 1, 3]
+    assert allocate_lines(blocks, 99) == [9, 1, 5]
+
+
+SIZES = st.tuples(st.integers(0, 9), st.integers(1, 5), st.integers(0, 5), st.integers(0, 5))
+
+
+@given(st.lists(SIZES), st.integers(0, 40))
+def test_no_more_lines_are_allotted_than_there_are(parts, lines):
+    blocks = [Block(need, least, least + wish, least + wish + most, list) for need, least, wish, most in parts]
+    given_lines = allocate_lines(blocks, lines)
+    assert sum(given_lines) <= lines
+    assert all(found == 0 or each.least <= found <= each.most for found, each in zip(given_lines, blocks, strict=True))
+
+
+def test_candidates_are_cells_that_fill_in_and_the_best_is_marked():
+    population = Population(7, 0, 5, (4, 2, 1, 0, 4), (4, 4, 4, 4, 4), (1.0, 2.0, 3.0, None, 4.0))
+    (line,) = candidate_grid(population, 80, 1)
+    assert line.plain == "█▄▂·█"
+    assert line.spans[-1].style == "bold yellow"
+    many = Population(7, 0, 300, (4,) * 150 + (0,) * 150, (4,) * 300, (None,) * 300)
+    assert [len(each) for each in candidate_grid(many, 76, 2)] == [76, 74]
+
+
+def test_a_curve_is_as_high_as_it_may_be():
+    assert bar_chart([0.0, 7.0], 1) == ["▁█"]
+    assert bar_chart([0.0, 15.0], 2) == [" █", "▁█"]
+    assert bar_chart([3.0, 3.0], 2) == ["  ", "▁▁"]
+
+
+def test_an_ended_run_shows_its_last_generations_candidates():
+    text = drawn(dataclasses.replace(STATUS, state="ended", why="7 generations"), 100)
+    assert "ended: 7 generations" in text
+    assert "generation 6     8/8 episodes, so far -12 to 140" in text
+
+
+def test_workers_beyond_the_head_are_counted():
+    known = dataclasses.replace(STATUS.workers, known=31)
+    assert "and 30 more" in drawn(dataclasses.replace(STATUS, workers=known), 80)
+
+
+def test_a_run_without_workers_says_how_to_start_one():
+    gone = dataclasses.replace(STATUS, worker_list=())
+    told = drawn(gone, 80, "--connect tcp/lab:7448")
+    assert "no worker is there; start one with" in told
+    assert "dreamfleet worker --run night --connect tcp/lab:7448" in told
+    new = dataclasses.replace(gone, throughput=dataclasses.replace(gone.throughput, environment_steps=0))
+    assert "no workers yet; start one with" in drawn(new, 80)
+
+
+HOSTILE = "[/bold][red]\x1b[2J\x1b]0;owned\x07\u202e\ud800[link=x]\n2026"
+
+
+def hostile(value):
+    """The same document with every text replaced by one that a terminal or a table would obey."""
+    if isinstance(value, str):
+        return HOSTILE
+    if isinstance(value, dict):
+        return {hostile(key): hostile(each) for key, each in value.items()}
+    if isinstance(value, (tuple, list)):
+        return tuple(map(hostile, value))
+    if dataclasses.is_dataclass(value):
+        told = {each.name: hostile(getattr(value, each.name)) for each in dataclasses.fields(value)}
+        return dataclasses.replace(value, **told)
+    return value
+
+
+def obeyed(text):
+    return [each for each in text if each != "\n" and not each.isprintable()]
+
+
+@pytest.mark.parametrize("workers", [STATUS.worker_list, ()])
+@pytest.mark.parametrize("why", ["", HOSTILE])
+def test_no_text_of_others_is_markup_or_an_order_to_a_terminal(workers, why):
+    status = dataclasses.replace(hostile(dataclasses.replace(STATUS, worker_list=workers)), why=why)
+    text = drawn(status, 100)
+    assert not obeyed(text)
+    assert "[red]" in text
+
+
+@pytest.mark.parametrize("means", [(-1.7e308, 1.7e308), (0.0, 5e-324), (3.0, 3.0)])
+def test_a_sparkline_of_any_numbers(means):
+    recent = tuple(dataclasses.replace(STATUS.recent[0], mean=mean) for mean in means)
+    assert "mean fitness by generation" in drawn(dataclasses.replace(STATUS, recent=recent), 100)
+
+
+def test_a_failure_that_names_no_worker_is_shown():
+    failure = dataclasses.replace(STATUS.failures[0], errors={})
+    assert "no reason was given" in drawn(dataclasses.replace(STATUS, why="", failures=(failure,)), 100)
+
+
+@pytest.mark.parametrize("columns", [60, 80])
+def test_the_whole_run_is_in_the_curve_however_long_it_is(columns):
+    history = [dataclasses.replace(STATUS.recent[0], number=number, mean=float(number)) for number in range(4000)]
+    rows = drawn(dataclasses.replace(STATUS, recent=tuple(history)), columns).splitlines()
+    (caption,) = (row for row, text in enumerate(rows) if "mean fitness by generation, 0 to 3999" in text)
+    lowest = rows[caption + 7].strip("│ ").split()[-1]  # the line at the bottom: risen to its height in the first bars
+    assert lowest.startswith("▁")
+    assert lowest.endswith("█")
+    assert columns - 15 < len(lowest) < columns
+
+
+def test_a_driven_stage_of_a_dream_is_told_so_and_what_was_before_it_is_no_part_of_its_curve():
+    task = dataclasses.replace(STATUS.settings.task, task="dream")
+    history = tuple(dataclasses.replace(STATUS.recent[0], number=number) for number in range(7))
+    generation = dataclasses.replace(
+        STATUS.generation, temperature=1.5, stage=StageStatus(2, 2, 5, 1000, 100, 24, 4, racing=False, driven=1.0)
+    )
+    status = dataclasses.replace(
+        STATUS, settings=dataclasses.replace(STATUS.settings, task=task), recent=history, generation=generation
+    )
+    text = drawn(status, 100)
+    assert "dream, 1000 driven steps" in text
+    assert "temperature" not in text
+    assert "0 to 6, stage 2 since 5" in text
+    mixed = dataclasses.replace(generation.stage, driven=0.5)
+    text = drawn(dataclasses.replace(status, generation=dataclasses.replace(generation, stage=mixed)), 100)
+    assert "dream, 1000 steps, 50% driven, temperature 1.5" in text

@@ -1,0 +1,68 @@
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.protocol.frame_pictures import pack_picture, unpack_picture
+from dreamfleet.common.protocol.messages import MAX_PART, MAX_PICTURE_SIDE, ViewFrame
+from dreamfleet.common.serialization.validation import MalformedError
+from tests.support.samples import HEAD
+
+
+def frame(height, width, picture, packed=True):
+    return ViewFrame(**HEAD, slot=0, tag=b"ABCDEFGH", step=0, reward=0.0, height=height, width=width, picture=picture,
+                     packed=packed)  # fmt: skip
+
+
+def random(*shape):
+    return np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
+
+
+@pytest.mark.parametrize("side", [64, 96])
+def test_what_a_model_sees_arrives_as_it_is_whatever_it_shows(side):
+    picture = random(side, side)
+    assert (unpack_picture(frame(*pack_picture(picture))) == picture).all()
+
+
+def test_a_large_picture_is_the_mean_of_its_pixels():
+    picture = np.zeros((400, 600, 3), np.uint8)
+    picture[:, ::3] = 90
+    height, width, data = pack_picture(picture)
+    assert (height, width) == (133, 200)
+    assert (unpack_picture(frame(height, width, data)) == 30).all()
+
+
+@pytest.mark.parametrize("shape", [(2000, 3000), (1, 5000), (5000, 1), (257, 257)])
+def test_every_picture_becomes_small_enough(shape):
+    height, width, data = pack_picture(random(*shape))
+    assert max(height, width) <= MAX_PICTURE_SIDE
+    assert len(data) <= MAX_PART
+    assert unpack_picture(frame(height, width, data)).shape == (height, width, 3)
+
+
+@pytest.mark.parametrize(
+    ("sent", "reason"),
+    [
+        (frame(2, 2, b"x", packed=False), "wrong length"),
+        (frame(2, 2, b"not deflated"), "not deflated"),
+        (frame(2, 2, zlib.compress(bytes(13))), "wrong length"),
+        (frame(2, 2, zlib.compress(bytes(11))), "wrong length"),
+    ],
+)
+def test_bytes_that_are_no_such_picture_are_malformed(sent, reason):
+    with pytest.raises(MalformedError, match=reason):
+        unpack_picture(sent)
+
+
+def test_a_bomb_takes_no_more_memory_than_the_picture_that_it_says_to_be():
+    bomb = zlib.compress(bytes(30 << 20), 9)
+    tracemalloc.start()
+    with pytest.raises(MalformedError, match="wrong length"):
+        unpack_picture(frame(MAX_PICTURE_SIDE, MAX_PICTURE_SIDE, bomb))
+    assert tracemalloc.get_traced_memory()[1] < 3 * MAX_PICTURE_SIDE**2 * 3
+    tracemalloc.stop()
+
+
+def test_no_picture_is_none():
+    assert unpack_picture(frame(1, 1, b"", packed=False)) is None

@@ -1,0 +1,164 @@
+"""Journals that people pass around, damaged: what can be read is told, what cannot is one line."""
+
+import os
+import random
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.runs.schema import APPLICATION_ID, VERSION, check_schema, migrate
+from tests.support.mutations import mutate
+
+RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
+VALUES = [None, "x", b"x", -1, 2**62, 1e308, "1e5", "[" * 3000, "9" * 5000, "\ud7ff"]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return shutil.copytree(RUNS / "dream", tmp_path / "night")
+
+
+def look(folder):
+    """Everything that a journal tells."""
+    with RunFolder(folder) as run:
+        assert run.settings.population > 1
+        run.history(), run.evaluations(), run.rollouts(), run.strategy_state(), run.result_count()
+        run.candidates(), run.scores(1), run.scores(1, confirming=True)
+        run.uid, run.created, run.ended, run.fingerprint  # noqa: B018
+        run.candidate(0, 0), run.fitness(0, 0), run.results(0, 0), run.classes.description
+
+
+def test_what_a_killed_coordinator_had_begun_to_write_is_undone(folder, tmp_path):
+    """Before a journal turns to its log it has a rollback journal, which a reader must not roll back."""
+    path = folder / "journal.sqlite"
+    with sqlite3.connect(path, isolation_level=None) as writer:
+        writer.execute("PRAGMA journal_mode = DELETE")
+        writer.execute("PRAGMA cache_size = 1")  # so that pages are written before the commit
+        writer.execute("BEGIN")
+        writer.execute("CREATE TABLE more (content BLOB)")
+        for _ in range(100):
+            writer.execute("INSERT INTO more VALUES (zeroblob(4000))")
+        writer.execute("UPDATE run SET value = 'x'")
+        killed = shutil.copytree(folder, tmp_path / "killed")
+        writer.execute("ROLLBACK")
+    writer.close()
+    assert (killed / "journal.sqlite-journal").exists()
+    with pytest.raises(sqlite3.OperationalError, match="readonly"):
+        sqlite3.connect(f"file:{killed / 'journal.sqlite'}?mode=ro", uri=True).execute("SELECT * FROM run")
+    look(killed)
+    with RunFolder(killed) as run, RunFolder(folder) as own:
+        assert (run.uid, run.settings) == (own.uid, own.settings)
+
+
+def test_damaged_pages(folder, watched):
+    path = folder / "journal.sqlite"
+    whole, source, read = path.read_bytes(), random.Random(5), 0
+    for _ in range(1000):
+        path.write_bytes(mutate(source, whole, [whole]))
+        read += watched.read(JournalError, look, folder)
+    assert 0 < read < 1000
+
+
+def loose(path):
+    """The same rows in tables that take anything, as another program might have written them."""
+    with sqlite3.connect(path) as old:
+        migrate(old, check_schema(old, path))
+        names = [name for (name,) in old.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        tables = {name: [each[1] for each in old.execute(f"PRAGMA table_info({name})")] for name in names}
+        rows = {name: old.execute(f"SELECT * FROM {name}").fetchall() for name in names}
+    old.close()
+    path.unlink()
+    new = sqlite3.connect(path)
+    for name, columns in tables.items():
+        new.execute(f"CREATE TABLE {name} ({', '.join(columns)})")
+        new.executemany(f"INSERT INTO {name} VALUES ({', '.join('?' * len(columns))})", rows[name])
+    new.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    new.execute(f"PRAGMA user_version = {VERSION}")
+    new.commit()
+    new.close()
+    return tables
+
+
+def test_values_of_other_types(folder, watched):
+    path = folder / "journal.sqlite"
+    tables = loose(path)
+    look(folder)
+    whole = path.read_bytes()
+    for table, columns in tables.items():
+        for column in columns:
+            for value in VALUES:
+                path.write_bytes(whole)
+                connection = sqlite3.connect(path)
+                connection.execute(f"UPDATE {table} SET {column} = ?", (value,))
+                connection.commit()
+                connection.close()
+                watched.read(JournalError, look, folder)
+
+
+@pytest.mark.parametrize("table", ["run", "generation", "candidate", "evaluation", "result", "strategy"])
+def test_missing_tables(folder, watched, table):
+    connection = sqlite3.connect(folder / "journal.sqlite")
+    connection.execute(f"DROP TABLE {table}")
+    connection.commit()
+    connection.close()
+    assert not watched.read(JournalError, look, folder)
+
+
+def test_a_query_that_never_ends_is_not_run(folder):
+    connection = sqlite3.connect(folder / "journal.sqlite")
+    connection.executescript(
+        "DROP TABLE run; CREATE VIEW run AS WITH RECURSIVE n(key, value) AS "
+        "(SELECT 1, 1 UNION ALL SELECT key + 1, 2 FROM n) SELECT * FROM n;"
+    )
+    connection.close()
+    with pytest.raises(JournalError, match="holds views"):
+        look(folder)
+
+
+def test_a_journal_that_is_no_file_is_one_line(tmp_path, watched):
+    folder = tmp_path / "night"
+    folder.mkdir()
+    journal = folder / "journal.sqlite"
+    os.mkfifo(journal)
+    assert not watched.read(JournalError, open_run, tmp_path, "night")
+    journal.unlink()
+    journal.mkdir()
+    assert not watched.read(JournalError, open_run, tmp_path, "night")
+    journal.rmdir()
+    journal.symlink_to("/dev/zero")
+    assert not watched.read(JournalError, open_run, tmp_path, "night")
+    assert not watched.read(JournalError, open_run, tmp_path / ("x" * 5000), "night")
+
+
+def test_a_folder_whose_name_is_part_of_an_address_is_read(folder):
+    strange = folder.rename(folder.with_name("50%20 #1 ?mode=rwc"))
+    look(strange)
+
+
+def test_a_confirmed_score_of_no_drives_is_damaged(folder):
+    with sqlite3.connect(folder / "journal.sqlite") as journal:
+        told = '{"generation": 1, "episodes": 0, "mean": 1.0, "std": 1.0, "closed": 9}'
+        journal.execute("INSERT OR REPLACE INTO run VALUES ('confirmed', ?)", (told,))
+    journal.close()
+    with RunFolder(folder) as run, pytest.raises(JournalError, match="confirmed score is damaged"):
+        run.confirmation()
+
+
+def test_a_journal_that_another_program_keeps_locked_is_not_called_damaged(folder, monkeypatch):
+    other = sqlite3.connect(folder / "journal.sqlite", isolation_level=None)
+    other.execute("PRAGMA journal_mode = delete")
+    other.execute("BEGIN EXCLUSIVE")
+    connect = sqlite3.connect
+    monkeypatch.setattr(sqlite3, "connect", lambda *args, **more: connect(*args, timeout=0, **more))
+    with pytest.raises(JournalError, match="end the program that keeps it locked"):
+        RunFolder(folder)
+    other.execute("ROLLBACK")
+    with RunFolder(folder) as run:
+        other.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(JournalError, match="end the program that keeps it locked"):
+            run.history()
+    other.close()

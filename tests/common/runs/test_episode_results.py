@@ -1,0 +1,201 @@
+"""Drives of a controller: their figures, the document they are told in, and whether another's are better."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.cli import command_line
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
+from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
+from dreamfleet.common.runs.paired_difference import PairedDifference
+from dreamfleet.common.runs.reproduction import Reproduction
+
+DRIVES = (
+    EpisodeResult(10_000, 850.0, 1000, False, 50.0, 0.0),
+    EpisodeResult(10_001, 910.0, 500, True, 80.0, 0.3),
+    EpisodeResult(10_002, 250.0, 500, False, 60.0, 0.1),
+)
+JUDGEMENT = EvaluationReport("tiny", "cd" * 32, "dream", "car-racing", "ab" * 32, "x86_64 avx2", "0.1.0", 12.5, DRIVES)
+
+
+def scored(*scores, first=10_000, **others):
+    """A report of a world that tells nothing but scores."""
+    drives = tuple(EpisodeResult(seed, float(score), 10) for seed, score in enumerate(scores, first))
+    return replace(JUDGEMENT, drives=drives, **others)
+
+
+def test_figures_are_of_all_drives_and_a_long_one_counts_for_more():
+    found = EpisodeResults.of(reversed(DRIVES))
+    assert found.seeds == (10_000, 10_001, 10_002)
+    assert (found.mean, found.median, found.least, found.most) == (670.0, 850.0, 250.0, 910.0)
+    assert found.std == pytest.approx(np.std(found.scores))
+    assert found.error == pytest.approx(np.std(found.scores, ddof=1) / np.sqrt(3))
+    assert (found.above(800), found.above(910), found.steps, found.finished) == (2 / 3, 0.0, 2000, 1)
+    assert (found.speed, found.braking) == (pytest.approx(60.0), pytest.approx(0.1))
+
+
+def test_one_drive_has_no_spread():
+    assert scored(839.0).description.startswith("839.0 on one seed; judged by")
+
+
+def test_a_world_that_tells_nothing_leaves_its_figures_out():
+    found = scored(1.0).results
+    assert (found.finished, found.speed, found.braking, found.error) == (None, None, None, None)
+    assert "laps" not in scored(1.0).description
+    assert "standard error" not in scored(1.0).description
+
+
+def test_people_are_told_how_it_drove_and_what_with():
+    score, manner, origin = JUDGEMENT.description.splitlines()
+    assert score.startswith("670.0 ± 210.7 (standard error) on 3 seeds, 250 to 910, median 850")
+    assert manner == (
+        "above 800: 67%, above 900: 33%, laps finished: 1 of 3, mean speed 60.0, brake on in 10% of the steps"
+    )
+    assert origin.startswith(f"2,000 environment steps in 12 s; controller {'cd' * 6}, world model {'ab' * 6}; ")
+
+
+@pytest.mark.parametrize(
+    ("mean", "count", "says"),
+    [
+        (900, 100, "solved: gymnasium's threshold is a mean of 900"),
+        (896, 100, "4.0 below gymnasium's threshold of 900"),
+        (905, 99, "5.0 above gymnasium's threshold of 900, on fewer than 100 seeds"),
+        (800, 2, "100.0 below gymnasium's threshold of 900, on fewer than 100 seeds"),
+    ],
+)
+def test_people_are_told_whether_the_world_is_solved(mean, count, says):
+    assert scored(*[mean] * count, threshold=900.0).description.splitlines()[1] == says
+    assert "threshold" not in scored(*[mean] * count).description, "where gymnasium names none"
+
+
+def test_a_report_is_read_as_it_was_written_and_tells_its_figures(tmp_path):
+    path = tmp_path / "report.json"
+    path.write_text(JUDGEMENT.to_json())
+    plain = json.loads(path.read_text())
+    assert read_evaluation_report(path) == JUDGEMENT
+    assert {"mean", "std", "scores", "seeds", "task", "bundle", "judge"} < plain.keys(), "as ever"
+    assert (plain["n"], plain["above_900"], plain["finished"], plain["controller"]) == (3, 1 / 3, 1, "cd" * 32)
+    assert plain["drives"][1]["steps"] == 500
+
+
+def test_a_report_that_was_written_before_a_field_existed_is_read(tmp_path):
+    plain = json.loads(JUDGEMENT.to_json())
+    del plain["threshold"]
+    path = tmp_path / "older.json"
+    path.write_text(json.dumps(plain))
+    assert read_evaluation_report(path) == JUDGEMENT
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"drives": []}', JUDGEMENT.to_json().replace("910.0", '"910"')])
+def test_what_is_no_report_is_refused_in_one_line(tmp_path, text):
+    path = tmp_path / "report.json"
+    path.write_text(text)
+    with pytest.raises(UsageError, match="write it again"):
+        read_evaluation_report(path)
+    with pytest.raises(UsageError, match="no report at"):
+        read_evaluation_report(tmp_path / "nowhere.json")
+
+
+def test_a_difference_is_of_equal_seeds_and_what_tracks_have_in_common_falls_out():
+    found = PairedDifference.between(scored(100, 500, 900).results, scored(110, 512, 908, 0).results)
+    assert (found.seeds, found.mean) == (3, 10.0)
+    assert found.error == pytest.approx(np.std([10, 12, 8], ddof=1) / np.sqrt(3))
+    assert found.is_significant
+    assert found.description.endswith("on 3 equal seeds: better")
+
+
+def test_a_difference_under_two_standard_errors_is_none():
+    found = PairedDifference.between(scored(100, 500, 900).results, scored(200, 400, 930).results)
+    assert not found.is_significant
+    assert found.description.endswith("none, for a difference under 4.4 standard errors of so few seeds is none")
+    assert PairedDifference(30, 1.0, 0.6).description.endswith(
+        "none, for a difference under two standard errors is none"
+    )
+    bounds = [round(PairedDifference(seeds, 0, 1).critical_value, 2) for seeds in (4, 8, 16)]
+    assert bounds == [3.28, 2.43, 2.18]  # t itself: 3.31, 2.43, 2.18
+    assert (
+        PairedDifference.between(*[JUDGEMENT.results] * 2).description
+        == "the same scores, to the bit, on 3 equal seeds"
+    )
+    with pytest.raises(UsageError, match="1 seeds are in both"):
+        PairedDifference.between(scored(1, 2).results, scored(1, 2, first=10_001).results)
+
+
+def test_the_verb_compares_each_report_with_the_first(tmp_path, capsys):
+    paths = [tmp_path / f"{name}.json" for name in "abc"]
+    for path, scores in zip(paths, [(100, 500, 900), (110, 512, 908), (100, 500, 900)], strict=True):
+        path.write_text(scored(*scores).to_json())
+    assert command_line.main(["compare", *map(str, paths)]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 5
+    assert said[2].endswith("better")
+    assert "to the bit" in said[4]
+    assert command_line.main(["compare", *map(str, paths), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["differences"]
+    assert [(each["mean"], each["clear"]) for each in rows] == [(10.0, True), (0.0, False)]
+    assert command_line.main(["compare", str(paths[0])]) == UsageError.exit_code
+
+
+@pytest.mark.parametrize("scores", [(1e308, 2, 3), (float("nan"), 2, 3)])
+def test_scores_that_nothing_can_be_computed_from_are_no_report(tmp_path, scores):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps({**json.loads(scored(1, 2, 3).to_json()), "drives": [
+        {"seed": seed, "score": score, "steps": 9} for seed, score in enumerate(scores)
+    ]}))  # fmt: skip
+    with pytest.raises(UsageError, match="no report"):
+        read_evaluation_report(path)
+
+
+def test_a_seed_that_stands_twice_is_no_report(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text(scored(1, 2).to_json().replace("10001", "10000"))
+    with pytest.raises(UsageError, match="a seed stands there twice"):
+        read_evaluation_report(path)
+
+
+def test_what_else_differs_than_the_controllers_is_noted(tmp_path, capsys):
+    for name, changes in {"a": {}, "b": {"task": "car-racing"}, "c": {"fingerprint": "arm"}}.items():
+        (tmp_path / f"{name}.json").write_text(scored(1, 2, **changes).to_json())
+    assert command_line.main(["compare", *(str(tmp_path / f"{name}.json") for name in "abc")]) == 0
+    notes = capsys.readouterr().err.splitlines()
+    assert len(notes) == 1, "a dream's controllers are driven in reality too"
+    assert "of different fingerprints" in notes[0]
+
+
+ELSEWHERE = {"fingerprint": "aarch64"}
+
+
+def test_one_seed_of_other_bits_is_not_reproduced_and_no_difference_is_asked_of_it():
+    found = Reproduction(scored(100, 500), scored(110, **ELSEWHERE))
+    assert not found.is_reproduced
+    assert "NOT reproduced: 110.0 instead of 100.0 on one seed" in found.description
+
+
+@pytest.mark.parametrize("words", [("--episodes", "99999999999"), ("--first-seed", "9223372036854775807")])
+@pytest.mark.parametrize("verb", [("evaluate", "--controller", "tiny"), ("baseline", "evaluate", "random")])
+def test_seeds_that_no_report_could_tell_of_are_refused_before_anybody_drives(verb, words, capsys):
+    assert command_line.main([*verb, *words]) == 2
+    assert "--episodes must be at most 100000, and seeds below" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("scores", "changes", "holds", "says"),
+    [
+        ((100, 500, 900), {}, True, "reproduced: the same 3 scores to the bit"),
+        ((100, 500, 900), ELSEWHERE, True, "though this host is of another fingerprint"),
+        ((100, 500, 900.0001), {}, False, "NOT reproduced: 1 of 3 drives differ (seeds 10002)"),
+        ((110, 480, 900), ELSEWHERE, True, "reproduced: mean 496.7"),
+        ((110, 511, 909), ELSEWHERE, False, "NOT reproduced: mean 510.0"),
+        ((100, 500), {}, True, "the same 2 scores"),
+    ],
+)
+def test_a_record_holds_to_the_bit_on_an_equal_host_and_within_two_standard_errors_elsewhere(
+    scores, changes, holds, says
+):
+    found = Reproduction(scored(100, 500, 900), scored(*scores, **changes))
+    assert found.is_reproduced == holds
+    assert says in found.description
+    assert found.description.startswith("tiny: ")

@@ -1,0 +1,98 @@
+import dataclasses
+import itertools
+
+import pytest
+
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.protocol.messages import MAX_TEMPERATURE
+from dreamfleet.common.runs.records import RunSettings, StoredEvaluation
+from dreamfleet.common.runs.scoring_params import scoring_params_at
+from dreamfleet.common.runs.temperature_schedule import TemperatureSchedule
+from tests.support.samples import SPEC
+
+EVERY = 5
+SETTINGS = RunSettings(
+    dataclasses.replace(SPEC, temperature=1.0), ControllerShape(1), 2, 1, 0.1, "diagonal", 1,
+    evaluate_every=EVERY, evaluation_episodes=16, heat=1.5,
+)  # fmt: skip
+
+
+def checks(*means):
+    """After generations 4, 9, ...; of standard error 10."""
+    return [StoredEvaluation(EVERY * (index + 1) - 1, 16, mean, 40.0) for index, mean in enumerate(means)]
+
+
+def temperature(generation, evaluations, settings=SETTINGS):
+    return scoring_params_at(generation, settings, (), evaluations).spec.temperature
+
+
+def raised(means, settings=SETTINGS):
+    """Of the first generation that all of the checks decide upon."""
+    found = temperature(EVERY * (len(means) + 1), checks(*means), settings)
+    return None if found == settings.task.temperature else found
+
+
+@pytest.mark.parametrize(
+    ("means", "expected"),
+    [
+        ((), None),
+        ((500.0,), None),
+        ((100.0, 300.0, 500.0), None),
+        ((500.0, 480.0, 475.0), None),  # behind, and not clearly
+        ((500.0, 400.0), 1.5),
+        ((100.0, 500.0, 480.0, 400.0), 1.5),
+        ((500.0, 400.0, 300.0), 1.5),  # the first one after a raise is compared with none
+        ((500.0, 400.0, 300.0, 310.0), 1.5),
+        ((500.0, 400.0, 450.0, 300.0), 2.25),
+        ((500.0, 400.0, 300.0, 200.0, 300.0, 200.0), 3.375),
+    ],
+)
+def test_a_check_that_falls_clearly_raises_the_temperature_and_begins_the_comparison_anew(means, expected):
+    assert raised(means) == expected
+
+
+def test_a_generation_is_decided_by_checks_that_are_a_whole_block_old():
+    found = [temperature(generation, checks(500.0, 400.0, 390.0)) for generation in range(20)]
+    found = [None if each == SETTINGS.task.temperature else each for each in found]
+    assert found == [None] * 15 + [1.5] * 5
+    assert [TemperatureSchedule(SETTINGS).required_evaluation(generation) for generation in (0, 9, 10, 14, 15)] == [
+        -6,
+        -1,
+        4,
+        4,
+        9,
+    ]
+
+
+def test_later_checks_and_those_off_the_schedule_and_the_order_of_arrival_change_nothing():
+    known = checks(500.0, 450.0, 500.0)
+    stray = [StoredEvaluation(7, 16, 900.0, 40.0), *checks(0.0, 0.0, 0.0, 0.0, 0.0)[3:]]
+    for order in itertools.permutations([*known, *stray]):
+        assert temperature(20, order) == temperature(20, known) == 1.5
+
+
+def test_the_temperature_stays_within_what_a_message_may_carry():
+    hottest = dataclasses.replace(SETTINGS, heat=1e300)
+    assert raised((500.0, 400.0, 300.0, 200.0), hottest) == MAX_TEMPERATURE
+
+
+def test_without_heat_nothing_is_raised_or_waited_for():
+    cold = dataclasses.replace(SETTINGS, heat=1.0)
+    assert raised((500.0, 400.0, 300.0, 200.0), cold) is None
+    never = dataclasses.replace(cold, evaluate_every=0)
+    assert [TemperatureSchedule(each).required_evaluation(50) for each in (cold, never)] == [-1, -1]
+
+
+def test_settings_and_digests_without_heat_are_what_they_were():
+    cold = dataclasses.replace(SETTINGS, heat=1.0)
+    assert '"heat"' not in cold.to_json()
+    assert RunSettings.from_json(cold.to_json()) == cold
+    assert RunSettings.from_json(SETTINGS.to_json()) == SETTINGS
+    written = "32b5b1f8a6bee0b22ed62a5034cdf1657709a3c7b15707ad38a792110c7c9de4"  # by the version before heat
+    assert SPEC.digest("score", b"x" * 32, (1,)).hex() == written
+    assert SPEC.with_overrides(None).digest("score", b"x" * 32, (1,)).hex() == written
+
+
+def test_a_dream_that_nobody_evaluates_stays_as_warm_as_it_is():
+    settings = dataclasses.replace(SETTINGS, heat=1.0, evaluate_every=0)
+    assert temperature(5, [], settings) == settings.task.temperature

@@ -1,0 +1,61 @@
+"""A secured router's port, and strangers who connect to it and prove nothing."""
+
+import logging
+import socket
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+
+import pytest
+
+from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.security.authority import Authority
+from dreamfleet.common.security.connection_limiter import MAX_UNAUTHENTICATED
+from dreamfleet.common.security.credentials import read_join_file
+from dreamfleet.common.transport.session import Network, open_session
+from tests.support.access import until
+from tests.support.processes import DEADLINE, free_port
+
+
+def knock(port, count):
+    for _ in range(count):
+        with socket.socket() as link:
+            link.setblocking(False)
+            link.connect_ex(("127.0.0.1", port))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a filter of Linux's kernel")
+def test_a_crowd_of_strangers_keeps_newcomers_out_for_seconds_and_nobody_else(tmp_path, caplog):
+    authority, port = Authority.create(tmp_path / "access"), free_port()
+    authority.issue("coordinator", "home", tmp_path / "home.join")
+    authority.issue("viewer", "eye", tmp_path / "eye.join", connect=["tls/127.0.0.1:7447"])
+    endpoint = f"tls/127.0.0.1:{port}"
+    viewer = Network(connect=(endpoint,), credentials=read_join_file(tmp_path / "eye.join"))
+    caplog.set_level(logging.WARNING, "dreamfleet.router")
+    with open_session(Network(listen=(endpoint,), credentials=read_join_file(tmp_path / "home.join"))) as router:
+        with open_session(viewer):
+            inside = router.info.transports()
+            knock(port, 2 * MAX_UNAUTHENTICATED)
+            until(lambda: "prove nothing" in caplog.text, "a crowd goes unnoticed")
+            assert [each.zid for each in router.info.transports()] == [each.zid for each in inside]
+        until(lambda: joined(viewer), "a newcomer is not let in")
+        with (
+            ExitStack() as fleet,
+            ThreadPoolExecutor(2 * MAX_UNAUTHENTICATED) as threads,
+        ):  # who proves something is no crowd
+            for session in threads.map(
+                lambda _: open_session(viewer, timeout=DEADLINE), range(2 * MAX_UNAUTHENTICATED)
+            ):
+                fleet.enter_context(session)
+            assert joined(viewer)
+    open_session(
+        Network(listen=(endpoint,), credentials=read_join_file(tmp_path / "home.join"))
+    ).close()  # its port is free
+
+
+def joined(network):
+    try:
+        open_session(network).close()
+    except ConnectionFailedError:
+        return False
+    return True

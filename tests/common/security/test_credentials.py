@@ -1,0 +1,236 @@
+"""Join files: made by an authority, read strictly, and of use to nobody but their owner."""
+
+import errno
+import os
+import shutil
+import socket
+import stat
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.errors import AccessError, UsageError
+from dreamfleet.common.security import authority
+from dreamfleet.common.security.authority import Authority
+from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, RevocationWatcher
+from dreamfleet.common.security.credentials import MAX_BYTES, add_seat_to_name, read_join_file, worker_seat_identity
+from dreamfleet.common.security.handshake import diagnose_connection
+
+HERE = ["tls/127.0.0.1:7447"]
+
+
+@pytest.fixture(scope="module")
+def access(tmp_path_factory):
+    before = os.umask(0)  # whatever it is, nothing that is secret is anybody else's
+    try:
+        authority = Authority.create(tmp_path_factory.mktemp("keys") / "access")
+        authority.issue("worker", "box", authority._folder / "box.join", connect=HERE)
+    finally:
+        os.umask(before)
+    return authority
+
+
+@pytest.fixture
+def join(access, tmp_path):
+    path = tmp_path / "box.join"
+    path.write_bytes((access._folder / "box.join").read_bytes())
+    path.chmod(0o600)
+    return path
+
+
+def test_what_an_authority_writes_is_its_owners_alone(access):
+    assert stat.S_IMODE(access._folder.stat().st_mode) == 0o700
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in access._folder.iterdir() if path.name != "lock"}
+    assert modes == dict.fromkeys(("ca.pem", "ca.key", "issued.json", "box.join"), 0o600)
+
+
+def test_a_join_file_says_who_its_holder_is_and_shows_no_secret(join):
+    found = read_join_file(join)
+    assert (found.role, found.name, found.connect, found.identity) == ("worker", "box", tuple(HERE), "worker.1")
+    assert "PRIVATE KEY" in found.key
+    assert "BEGIN" not in repr(found)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda text: "", "no join file of this version"),
+        (lambda text: "not = [toml", "no TOML"),
+        (lambda text: text + "#" * MAX_BYTES, "larger than"),
+        (lambda text: text.replace("version = 1", "version = 2"), "of this version"),
+        (lambda text: text.replace('role = "worker"', 'role = "king"'), "means nothing here"),
+        (lambda text: text.replace("seat = 1", "seat = 0"), "means nothing here"),
+        (lambda text: text.replace("seat = 1", 'seat = "1"'), "'seat' is not of its kind"),
+        (lambda text: text.replace("Z\nconnect", "\nconnect"), "means nothing here"),
+        (lambda text: text.replace("name =", "nom ="), "'name' is missing"),
+        (lambda text: text + 'more = "x"\n', "'more' is unknown"),
+        (lambda text: text.replace('["tls/127.0.0.1:7447"]', "[1]"), "'connect' is not of its kind"),
+        (lambda text: text.partition("certificate =")[0], "what proves its role is missing"),
+    ],
+)  # fmt: skip
+def test_what_is_no_join_file_is_refused_in_a_line(join, damage, says):
+    join.write_text(damage(join.read_text()))
+    with pytest.raises(AccessError, match=says) as refused:
+        read_join_file(join)
+    assert "BEGIN" not in str(refused.value)
+
+
+def test_a_join_file_that_others_may_read_has_expired_or_is_none_is_refused(join, tmp_path):
+    with pytest.raises(AccessError, match="expired on"):
+        read_join_file(join, datetime.now(UTC) + timedelta(days=31))
+    with pytest.raises(AccessError, match="no join file at"):
+        read_join_file(tmp_path / "nowhere")
+    with pytest.raises(AccessError, match="Is a directory"):
+        read_join_file(tmp_path)
+    for mode in (0o640, 0o604):
+        join.chmod(mode)
+        with pytest.raises(AccessError, match="chmod 600"):
+            read_join_file(join)
+
+
+def test_a_workers_name_ends_in_its_seat(join):
+    assert add_seat_to_name("gpu", read_join_file(join)) == "gpu.1"
+    assert add_seat_to_name("x" * 63, read_join_file(join)) == "x" * 61 + ".1"
+    assert worker_seat_identity("gpu.1/0badc0de") == "worker.1"
+
+
+def test_a_seat_is_its_names_until_it_is_revoked_and_then_nobodys(access, tmp_path):
+    seats = [access.issue("viewer", "anna", tmp_path / f"{number}", connect=HERE).seat for number in range(2)]
+    access.revoke("anna")
+    seats.append(access.issue("viewer", "anna", tmp_path / "2", connect=HERE).seat)
+    seats.append(access.issue("viewer", "ben", tmp_path / "3", connect=HERE).seat)
+    assert seats == [1, 1, 2, 3]
+    with pytest.raises(UsageError, match="exists"):
+        access.issue("viewer", "ben", tmp_path / "3", connect=HERE)
+    with pytest.raises(UsageError, match="nothing is issued to 'carl'"):
+        access.revoke("carl")
+
+
+def test_what_is_revoked_is_seen_while_it_is_watched_and_what_is_damaged_takes_nothing_back(access, join, tmp_path):
+    folder = tmp_path / "carried"
+    folder.mkdir()
+    watched = RevocationWatcher(folder, read_join_file(join))
+    assert not watched.revoked_seats
+    ledger = CertificateLedger.load(access._folder / LEDGER_FILE)
+    ledger.with_revoked([each for each in ledger.issued if each.name == "box"], 1.0).save(folder / LEDGER_FILE)
+    watched.reload_if_changed(10.0)
+    assert "worker.1" in watched.revoked_seats
+    (folder / LEDGER_FILE).write_text("{")
+    watched.reload_if_changed(20.0)
+    assert "worker.1" in watched.revoked_seats
+    with pytest.raises(AccessError, match="damaged"):  # who begins with it would let everybody in
+        RevocationWatcher(folder, read_join_file(join))
+    replace(ledger, authority="0" * 64).save(folder / LEDGER_FILE)
+    with pytest.raises(AccessError, match="another authority"):
+        RevocationWatcher(folder, read_join_file(join))
+
+
+def test_the_verbs_make_list_and_take_back(tmp_path, capsys):
+    folder = ("--access-dir", str(tmp_path / "access"))
+    out = tmp_path / "w.join"
+    assert main(["access", "init", *folder]) == 0
+    assert main(["access", "issue", "worker", "w1", *folder, "--connect", *HERE, "--out", str(out)]) == 0
+    assert read_join_file(out).name == "w1"
+    assert main(["access", "revoke", "w1", *folder]) == 0
+    assert main(["access", "list", *folder]) == 0
+    listed = capsys.readouterr().out
+    assert "revoked" in listed
+    assert listed.count("*.1") == 2  # as it was issued, and in the list
+    assert "BEGIN" not in listed
+    assert main(["access", "init", *folder]) == 2
+    assert main(["access", "issue", "worker", "w2", *folder, "--connect", "tcp/h:1", "--out", f"{out}2"]) == 2
+    assert main(["access", "issue", "coordinator", "c", *folder, "--out", f"{out}2"]) == 2
+    assert main(["pause", "--join", str(out)]) == 1
+    assert "this needs one whose role is operator or coordinator" in capsys.readouterr().err
+
+
+def test_who_listens_is_issued_a_file_by_its_names_alone(tmp_path, capsys):
+    """The first of the five commands in docs/security.md."""
+    folder, out = ("--access-dir", str(tmp_path / "access")), tmp_path / "home.join"
+    assert main(["access", "init", *folder]) == 0
+    assert main(["access", "issue", "coordinator", "home", *folder, "--host", "h.example", "--out", str(out)]) == 0
+    assert (read_join_file(out).role, read_join_file(out).connect) == ("coordinator", ())
+    for wrong in ("h.example:7447", "tls/h.example", "", "a b", "a..b"):
+        assert main(["access", "issue", "coordinator", "c", *folder, "--host", wrong, "--out", f"{out}2"]) == 2
+        assert "is no host" in capsys.readouterr().err
+    assert main(["access", "issue", "worker", "w", *folder, "--connect", "tls/[::1]:1", "--out", f"{out}2"]) == 2
+    assert "give a name" in capsys.readouterr().err
+
+
+def test_a_disk_without_room_says_that_nothing_is_taken_back(access, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    before = (access._folder / LEDGER_FILE).read_bytes()
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(AccessError, match=r"cannot be written: No space left on device; nothing is changed"):
+        access.revoke("box")
+    assert (access._folder / LEDGER_FILE).read_bytes() == before
+
+
+def test_an_authority_whose_parts_are_not_its_own_issues_nothing(tmp_path):
+    def made(name):
+        return Authority.create(tmp_path / name, passwords=True)._folder
+
+    whole, other = made("whole"), made("other")
+    for part, text, why in (
+        ("ca.key", (other / "ca.key").read_text(), "key of another certificate"),
+        (LEDGER_FILE, (other / LEDGER_FILE).read_text(), "of another authority"),
+        ("secret", "no hex", "damaged"),
+        ("secret", None, "secret is missing"),
+    ):
+        folder = tmp_path / "mixed"
+        shutil.copytree(whole, folder)
+        (folder / part).unlink()
+        if text is not None:
+            (folder / part).write_text(text)
+        with pytest.raises(AccessError, match=why):
+            Authority(folder).issue("worker", "box", tmp_path / "box", connect=HERE)
+        assert not (tmp_path / "box").exists()
+        shutil.rmtree(folder)
+    with (whole / "secret").open("a") as file:
+        file.write("\n")  # as an editor leaves it
+    Authority(whole).issue("coordinator", "home", tmp_path / "home", hosts=["h.example"])
+    assert read_join_file(tmp_path / "home").secret == (whole / "secret").read_text().strip()
+
+
+def test_a_folder_that_may_not_be_looked_into_is_told(access, join, tmp_path, monkeypatch):
+    credentials = read_join_file(join)
+
+    def refused(self, **_):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+
+    monkeypatch.setattr(Path, "stat", refused)
+    for looked in (
+        lambda: Authority(tmp_path),
+        lambda: Authority.create(tmp_path),
+        lambda: RevocationWatcher(tmp_path, credentials),
+    ):
+        with pytest.raises(AccessError, match="cannot be read: Permission denied"):
+            looked()
+
+
+def test_an_authority_that_is_made_already_is_left_alone_also_by_who_began_before(tmp_path, monkeypatch):
+    folder = tmp_path / "access"
+    begun = authority._certificate_builder
+
+    def late(*args, **more):
+        monkeypatch.setattr(authority, "_certificate_builder", begun)
+        Authority.create(folder)
+        return begun(*args, **more)
+
+    monkeypatch.setattr(authority, "_certificate_builder", late)
+    with pytest.raises(UsageError, match="holds an authority already"):
+        Authority.create(folder)
+    Authority(folder)
+
+
+@pytest.mark.parametrize(("ca", "host"), [("garbage", "127.0.0.1"), ("gärbage", "127.0.0.1"), ("", "a" * 70)])
+def test_what_is_damaged_is_told_and_no_traceback(join, ca, host):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = f"tls/{host}:{server.getsockname()[1]}"
+        said = diagnose_connection([endpoint], replace(read_join_file(join), ca=ca))
+    assert said is None if host != "127.0.0.1" else "this join file is damaged" in str(said)

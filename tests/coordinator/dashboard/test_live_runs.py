@@ -1,0 +1,32 @@
+"""What the page remembers of live runs."""
+
+import json
+import time
+from types import SimpleNamespace
+
+from dreamfleet.common.transport.network import Network
+from dreamfleet.coordinator.dashboard import live_runs
+from dreamfleet.coordinator.dashboard.lanes import STRETCH, UNKNOWN
+from tests.support.processes import free_port
+from tests.support.served import serving, snapshot
+
+
+def test_what_workers_did_is_remembered_while_nobody_looks(tmp_path, monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr(live_runs, "time", SimpleNamespace(time=lambda: now[0], monotonic=time.monotonic))
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    watcher = live_runs.Watcher(Network(connect=(endpoint,)), None, tmp_path)
+
+    def lane():
+        while (shown := watcher.poll().find("night")) is None:
+            pass  # a busy host may answer late
+        _, data = shown.page_state.decode().split("data: ")
+        return json.loads(data)["workers"]["lane"][0]
+
+    with serving(endpoint, snapshot(4, workers=1)):
+        seen = lane()[-1]
+        for _ in range(2):
+            watcher.suspend()
+        now[0] += 3 * STRETCH
+        assert lane()[-4:] == seen + 2 * UNKNOWN + seen
+        watcher.suspend()

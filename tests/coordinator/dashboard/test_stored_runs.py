@@ -1,0 +1,39 @@
+"""What is read of a journal for the page."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.coordinator.dashboard import stored_runs
+
+RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
+
+
+@pytest.fixture
+def run(tmp_path):
+    shutil.copytree(RUNS / "dream", tmp_path / "dream")
+    with open_run(tmp_path, "dream") as stored:
+        yield stored
+
+
+def test_quartiles_are_those_of_the_candidates_of_every_generation_that_is_drawn(run):
+    found = stored_runs.read_quartiles(run, run.settings, run.history())
+    assert found.keys() == {each.number for each in run.history()}
+    for each in run.history():
+        low, high = found[each.number]
+        fitness = sorted(run.fitness(each.number, number) for number in range(run.settings.population))
+        assert each.worst <= low <= high <= each.best
+        assert (
+            sum(value <= low for value in fitness) == sum(value >= high for value in fitness) == round(len(fitness) / 4)
+        )
+
+
+def test_a_run_whose_candidates_are_too_much_to_read_has_none(run, monkeypatch):
+    monkeypatch.setattr(stored_runs, "MOST_READ", 10)
+    assert stored_runs.read_quartiles(run, run.settings, run.history()) is None
+
+
+def test_an_open_generation_has_no_quartiles(run):
+    assert run.quartiles([len(run.history()), -1, 2**62]) == {}

@@ -1,0 +1,82 @@
+"""What is told of workers and jobs: the ring alone, and what a fleet writes into it."""
+
+import pytest
+
+from dreamfleet.common.monitoring.prometheus import exposition
+from dreamfleet.common.monitoring.status import WorkerCount, read_status
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.coordinator.dispatch.event_log import BLOCK, BLOCKS, EventLog
+from dreamfleet.coordinator.dispatch.fleet import DEPARTURE_GRACE, SILENT_BEATS
+from tests.coordinator.run.test_run import A, B, Bench
+from tests.coordinator.service.test_status import SCORED, answered, score, snapshot_of
+
+
+@pytest.fixture
+def bench(tmp_path, random_bundle):
+    made = Bench(tmp_path / "night", random_bundle.path, SCORED, generations=3)
+    yield made
+    made.journal.close()
+
+
+def told(bench, **asked):
+    return [
+        (each["what"], each["worker"], each["job"]) for each in answered(snapshot_of(bench), "story", **asked)["story"]
+    ]
+
+
+def test_the_ring_is_bounded_and_a_view_does_not_change():
+    event_log = EventLog()
+    for number in range(BLOCK * BLOCKS + 10):
+        event_log.add(float(number), "back", "a/0")
+    view = event_log.view()
+    kept = list(view.latest())
+    assert BLOCK * (BLOCKS - 1) < len(kept) <= BLOCK * BLOCKS
+    assert kept[0].at == BLOCK * BLOCKS + 9
+    event_log.add(0.0, "left", "a/0")
+    assert list(view.latest()) == kept
+
+
+def test_a_jobs_story_goes_from_given_to_accepted(bench):
+    score(bench, 1)
+    (given,) = [each for each in told(bench, job="0/0") if each[0] == "accepted"]
+    name = given[2]
+    assert name.startswith("score 0/0/")
+    event_log = [each for each in told(bench, job="0/0") if each[2] == name]
+    assert [what for what, _, _ in event_log] == ["given", "accepted"]
+    assert {job.split()[1].rpartition("/")[0] for _, _, job in told(bench, job="0/1")} == {"0/1"}
+
+
+def test_jobs_of_a_silent_worker_are_told_as_given_out_again(bench):
+    sends = bench.run.worker_protocol.dispatch(bench.now)
+    held = sum(len(send.content.work) for send in sends if send.identity == A)
+    bench.handle_heartbeat(A)
+    bench.now += SILENT_BEATS + 0.1
+    bench.handle_heartbeat(B)
+    bench.run.worker_protocol.tick(bench.now)
+    whats = [what for what, _, _ in told(bench, worker=A)]
+    assert whats[:1] == ["joined"]
+    assert whats.count("given") == whats.count("seen") == whats.count("reissued") == held > 0
+    assert "silent" in whats
+    bench.handle_heartbeat(A)
+    assert told(bench, worker="a")[-1][:2] == ("back", A)
+
+
+def test_a_worker_that_vanishes_is_told_and_a_stranger_is_not(bench):
+    bench.run.worker_protocol.handle_departure(B, bench.now)
+    bench.now += 2 * DEPARTURE_GRACE
+    bench.run.worker_protocol.tick(bench.now)
+    assert ("lost", B, "") in told(bench)
+    status = read_status(answered(snapshot_of(bench)))
+    assert (status.workers, status.worker_list[-1].worker) == (WorkerCount(1, 2, 1), B)
+    assert (status.worker_list[-1].state, status.worker_list[-1].leases) == ("lost", 0)
+    assert 'dreamfleet_workers{run="night",which="lost"} 1.0' in exposition(status)
+    assert [what for what, _, _ in told(bench, what="lost,joined")] == ["joined", "joined", "lost"]
+    before = len(told(bench))
+    bench.deliver("stranger/00000009", Result(b"x" * 32, 1.0, 10, 0.1, None, None))
+    assert len(told(bench)) == before
+
+
+@pytest.mark.parametrize("asked", [{"worker": "nobody"}, {"job": "9/9"}, {"job": "x/y"}, {"job": "7"}])
+def test_what_is_not_known_has_no_story_and_no_number_means_all(bench, asked):
+    bench.run.worker_protocol.dispatch(bench.now)
+    assert bool(told(bench, **asked)) == (asked == {"job": "7"})

@@ -1,0 +1,705 @@
+import tracemalloc
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.protocol.messages import TAG_BYTES, Heartbeat, Result, RunningJob
+from dreamfleet.coordinator.dispatch.fleet import (
+    DEPARTURE_GRACE,
+    FORGET_AFTER,
+    GUEST_TIMEOUT,
+    LOST_TIMEOUT,
+    MAX_SLOTS,
+    MOST_GUESTS,
+    MOST_LOST,
+    SILENT_BEATS,
+)
+from dreamfleet.coordinator.dispatch.fleet import Fleet as _Fleet
+from dreamfleet.coordinator.dispatch.speculative_execution import LONGEST_HELD, LONGEST_HELD_TIMES, UPLOAD_SECONDS
+from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
+from tests.support.samples import HEAD, SPEC
+
+
+class Fleet(_Fleet):
+    """Beats are of the numbering that their worker was welcomed with, if they name no other."""
+
+    def handle_heartbeat(self, identity, beat, now):
+        member = self.members.get(identity)
+        super().handle_heartbeat(
+            identity, replace(beat, numbering=beat.numbering or (member.numbering if member else 0)), now
+        )
+
+
+A, B = "a/00000001", "b/00000002"
+BEAT = 1.0
+
+
+def work(count, kind="score", generation=0):
+    vector = vector_bytes(np.arange(4.0) + generation)
+    return make_work(SPEC, kind, generation, 0, vector, range(1000, 1000 + count))
+
+
+def beat(capacity=1, seen=0, numbering=0, queued=(), running=(), unacked=(), rate=0.0, steps=5):
+    return Heartbeat(
+        **HEAD, nonce="n", numbering=numbering, seen=seen, capacity=capacity, slots=capacity, load=0.0,
+        steps_per_second=rate, drawn_by="-",
+        queued=tuple(digest[:TAG_BYTES] for digest in queued),
+        running=tuple(RunningJob(digest[:TAG_BYTES], steps) for digest in running),
+        unacked=tuple(digest[:TAG_BYTES] for digest in unacked),
+    )  # fmt: skip
+
+
+def result(digest, fitness=1.0, error=None):
+    return Result(digest, None if error else fitness, 10, 0.1, error, None)
+
+
+def fleet_of(*names, capacity=1, jobs=10):
+    fleet = Fleet(BEAT)
+    fleet.jobs.offer(work(jobs))
+    for name in names:
+        fleet.add_worker(name, capacity, "f", 0.0)
+        fleet.handle_heartbeat(name, beat(capacity), 0.0)
+    return fleet
+
+
+def digests(sends, name):
+    return [each.job.digest for send in sends if send.identity == name for each in send.content.work]
+
+
+def numbered(sends):
+    """Without those that only say that a worker is known."""
+    return [send for send in sends if send.number]
+
+
+def cancelled(sends, name):
+    return [digest for send in sends if send.identity == name for digest in send.content.cancels]
+
+
+def test_no_work_before_the_first_beat():
+    fleet = Fleet(BEAT)
+    fleet.jobs.offer(work(3))
+    fleet.add_worker(A, 2, "f", 0.0)
+    assert fleet.dispatch(0.0) == []
+
+
+def test_credit_is_twice_the_capacity_and_a_result_returns_it():
+    fleet = fleet_of(A, capacity=2)
+    given = digests(fleet.dispatch(0.0), A)
+    assert len(given) == 4
+    assert fleet.dispatch(0.1) == []
+    fleet.handle_result(A, result(given[0]), 0.2)
+    (send,) = fleet.dispatch(0.2)
+    assert len(send.content.work) == 1
+    assert [(verdict.digest, verdict.verdict) for verdict in send.content.verdicts] == [(given[0], "accepted")]
+
+
+def test_while_jobs_are_done_alone_a_wide_workers_capacity_is_its_slots():
+    fleet = fleet_of(A, jobs=50)
+    wide = replace(beat(capacity=200), slots=2, seen=1)
+    for alone, capacity in ((False, 200), (True, 2)):
+        fleet.single_job = alone
+        fleet.handle_heartbeat(A, wide, 1.0)
+        assert fleet.members[A].capacity == capacity
+        assert len(digests(fleet.dispatch(1.0), A)) == (50 if capacity == 200 else 0)
+
+
+def test_batches_count_without_a_gap():
+    fleet = fleet_of(A)
+    numbers = []
+    for step in range(5):
+        for send in fleet.dispatch(step / 100):
+            numbers.append(send.number)
+            for each in send.content.work:
+                fleet.handle_result(A, result(each.job.digest), step / 100)
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_work_is_spread_over_workers():
+    fleet = fleet_of(A, B, jobs=2)
+    sends = fleet.dispatch(0.0)
+    assert len(digests(sends, A)) == len(digests(sends, B)) == 1
+
+
+def test_the_first_wanted_result_wins_and_the_others_copy_is_cancelled():
+    fleet = fleet_of(A, B, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.handle_departure(A, 0.1)
+    fleet.tick(0.2)
+    assert digests(fleet.dispatch(0.2), B) == [digest]
+    fleet.add_worker(A, 1, "f", 0.3)
+    assert fleet.handle_result(A, result(digest), 0.3)[0] == "accepted"
+    assert [send.content.cancels for send in fleet.dispatch(0.3) if send.identity == B] == [[digest]]
+    assert fleet.handle_result(B, result(digest), 0.4)[0] == "duplicate"
+
+
+def test_a_result_nobody_wants_is_obsolete():
+    assert fleet_of(A).handle_result(A, result(b"x" * 32), 0.0)[0] == "obsolete"
+
+
+def test_a_departed_workers_jobs_are_issued_again_after_the_grace():
+    fleet = fleet_of(A, B, jobs=2)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.handle_departure(A, 1.0)
+    fleet.tick(1.0 + DEPARTURE_GRACE / 2)
+    assert fleet.dispatch(1.0) == []
+    fleet.tick(1.0 + DEPARTURE_GRACE)
+    assert digests(fleet.dispatch(1.1), B) == [digest]
+    assert A not in fleet.members
+
+
+def test_who_vanishes_without_a_word_is_told_as_lost_until_he_is_back_or_for_minutes():
+    fleet = fleet_of(A, B)
+
+    def vanish(name, now):
+        fleet.handle_departure(name, now)
+        fleet.tick(now + 2 * DEPARTURE_GRACE)
+
+    vanish(A, 1.0)
+    fleet.handle_heartbeat(B, beat(0), 2.0)  # drained: it says that it leaves
+    vanish(B, 2.0)
+    assert list(fleet.lost) == [A]
+    assert [each.what for each in fleet.event_log.view().latest()][:2] == ["left", "lost"]
+    fleet.add_worker(A, 1, "f", 3.0)
+    assert list(fleet.lost) == [A]  # anybody may say hello
+    fleet.handle_heartbeat(A, beat(), 3.0)
+    assert (fleet.lost, next(fleet.event_log.view().latest()).what) == ({}, "back")
+    vanish(A, 4.0)
+    another_life = "a/00000009"
+    fleet.add_worker(another_life, 1, "f", 5.0)
+    fleet.handle_heartbeat(another_life, beat(), 5.0)
+    assert not fleet.lost
+    vanish(another_life, 6.0)
+    fleet.tick(6.0 + LOST_TIMEOUT)
+    assert not fleet.lost
+
+
+def test_so_many_lost_workers_are_told_and_no_more():
+    fleet = fleet_of(*(f"h{number}/0" for number in range(MOST_LOST + 3)))
+    for name in list(fleet.members):
+        fleet.handle_departure(name, 1.0)
+    fleet.tick(1.0 + 2 * DEPARTURE_GRACE)
+    assert len(fleet.lost) == MOST_LOST
+    assert "h0/0" not in fleet.lost
+
+
+def test_a_silent_workers_jobs_are_issued_again_and_its_voice_brings_it_back():
+    fleet = fleet_of(A, B, jobs=2)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    late = SILENT_BEATS * BEAT + 0.1
+    for step in range(1, 6):
+        fleet.handle_heartbeat(B, beat(seen=1, running=digests([], B)), float(step))
+        fleet.tick(float(step))
+    fleet.handle_heartbeat(B, beat(seen=1), late)
+    fleet.tick(late)
+    assert fleet.members[A].silent
+    assert digest in digests(fleet.dispatch(late), B)
+    fleet.handle_heartbeat(A, beat(seen=1, running=[digest]), late + 1)
+    assert not fleet.members[A].silent
+    assert digest in fleet.members[A].leases
+
+
+def test_a_suspended_host_is_not_taken_for_silence():
+    fleet = fleet_of(A)
+    fleet.dispatch(0.0)
+    fleet.tick(0.1)
+    fleet.tick(1000.0)
+    assert not fleet.members[A].silent
+
+
+def test_a_job_that_two_beats_do_not_show_is_issued_again():
+    fleet = fleet_of(A, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.handle_heartbeat(A, beat(seen=1), 1.0)
+    assert fleet.dispatch(1.0) == []
+    fleet.handle_heartbeat(A, beat(seen=1), 2.0)
+    assert digests(fleet.dispatch(2.0), A) == [digest]
+
+
+def test_a_batch_that_was_not_seen_is_sent_again_under_its_number():
+    fleet = fleet_of(A, jobs=1)
+    (first,) = fleet.dispatch(0.0)
+    fleet.handle_heartbeat(A, beat(seen=0), 1.0)
+    fleet.handle_heartbeat(A, beat(seen=0), 2.0)
+    (again,) = fleet.dispatch(2.1)
+    assert (again.number, again.content) == (first.number, first.content)
+    fleet.handle_heartbeat(A, beat(seen=1, running=digests([first], A)), 3.0)
+    assert numbered(fleet.dispatch(9.0)) == []
+
+
+def test_an_error_is_no_fitness_and_another_worker_tries():
+    fleet = fleet_of(A, B, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    assert fleet.handle_result(A, result(digest, error="boom"), 0.1) == ("refused", None)
+    assert digests(fleet.dispatch(0.1), B) == [digest]
+    assert fleet.jobs.find_poison_job() is None
+    fleet.handle_result(B, result(digest, error="boom"), 0.2)
+    errors = fleet.jobs.find_poison_job().errors
+    assert errors == {A: "boom", B: "boom"}
+
+
+def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
+    fleet = fleet_of(A, jobs=1)
+    for attempt in range(3):
+        assert fleet.jobs.find_poison_job() is None
+        (digest,) = digests(fleet.dispatch(attempt), A)
+        fleet.handle_result(A, result(digest, error="boom"), attempt)
+    assert fleet.jobs.find_poison_job().errors == {A: "boom"}
+
+
+def test_a_failed_job_waits_for_another_worker_that_is_busy():
+    fleet = fleet_of(A, B, jobs=4)
+    first, *_ = digests(fleet.dispatch(0.0), A)
+    fleet.handle_result(A, result(first, error="boom"), 0.1)
+    assert digests(fleet.dispatch(0.2), A) == []
+    assert [failure.errors for failure in fleet.jobs.failures] == [{A: "boom"}]
+
+
+@pytest.mark.parametrize(
+    ("share", "kinds"), [(0.25, ["evaluate", *["score"] * 3]), (0.0, [*["score"] * 3, "evaluate"])]
+)
+def test_evaluations_fill_a_quarter_of_the_idle_slots_and_lead_where_they_have_a_share(share, kinds):
+    fleet = Fleet(BEAT, share)
+    fleet.add_worker(A, 4, "f", 0.0)
+    fleet.handle_heartbeat(A, beat(4), 0.0)
+    fleet.jobs.offer(work(3) + work(5, "evaluate"))
+    assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work] == kinds
+    fleet.drain_background = True
+    assert len(digests(fleet.dispatch(0.1), A)) == 4
+
+
+def test_evaluations_and_collected_drives_share_the_quarter():
+    fleet = fleet_of(A, capacity=8, jobs=0)
+    fleet.jobs.offer(work(1, "evaluate") + work(5, "collect"))
+    kinds = [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work]
+    assert kinds == ["evaluate", "collect"]
+
+
+def uploading():
+    """A's only job is done, and its drive is on its way; B is idle."""
+    fleet = fleet_of(A, jobs=0)
+    fleet.jobs.offer(work(2, "collect"))
+    fleet.drain_background = True
+    first, second = digests(fleet.dispatch(0.0), A)
+    fleet.add_worker(B, 1, "f", 0.0)
+    fleet.defer_verdict(A, first, 1.0)
+    fleet.defer_verdict(A, second, 1.0)
+    fleet.handle_heartbeat(A, beat(seen=1, unacked=[first, second]), 1.0)
+    fleet.handle_heartbeat(B, beat(), 1.0)
+    return fleet, first, second
+
+
+def test_a_job_whose_upload_is_on_its_way_is_not_taken_away():
+    fleet, first, second = uploading()
+    assert fleet.dispatch(1.0) == []
+    assert A in fleet.jobs[first].holders
+    assert fleet.handle_result(A, result(first), 2.0)[0] == "accepted"
+    assert fleet.handle_result(A, result(second), 2.0)[0] == "accepted"
+
+
+def test_an_upload_that_never_comes_is_a_straggler():
+    fleet, *_ = uploading()
+    late = 1.1 + UPLOAD_SECONDS
+    fleet.handle_heartbeat(A, beat(seen=1, unacked=fleet.members[A].leases), late)
+    fleet.handle_heartbeat(B, beat(), late)
+    assert len(digests(fleet.dispatch(late), B)) == 1
+    assert fleet.counts["copied"] == 1
+
+
+def test_a_paused_fleet_gives_nothing_and_still_judges():
+    fleet = fleet_of(A)
+    given = digests(fleet.dispatch(0.0), A)
+    fleet.paused = True
+    fleet.handle_result(A, result(given[0]), 0.1)
+    (send,) = fleet.dispatch(0.1)
+    assert not send.content.work
+    assert len(send.content.verdicts) == 1
+
+
+def test_a_newcomer_takes_over_what_another_worker_has_waiting():
+    fleet = fleet_of(A, capacity=2, jobs=4)
+    given = digests(fleet.dispatch(0.0), A)
+    fleet.add_worker(B, 1, "f", 0.1)
+    fleet.handle_heartbeat(B, beat(1), 0.1)
+    sends = fleet.dispatch(0.2)
+    assert digests(sends, B) == [given[-1]], "what was given last begins last"
+    assert cancelled(sends, A) == [given[-1]]
+    assert given[-1] not in fleet.members[A].leases
+    assert fleet.counts["recalled"] == 1
+
+
+def test_what_runs_is_not_recalled():
+    fleet = fleet_of(A, capacity=1, jobs=1)
+    fleet.dispatch(0.0)
+    fleet.add_worker(B, 1, "f", 0.1)
+    fleet.handle_heartbeat(B, beat(1), 0.1)
+    assert fleet.dispatch(0.2) == []
+
+
+def tail_of_two(pace_a, pace_b, steps_a):
+    """A runs the only job left and has made `steps_a` of a typical 1000 steps; B is idle."""
+    fleet = fleet_of(A, B, jobs=3)
+    for digest in digests(fleet.dispatch(0.0), B):
+        fleet.handle_heartbeat(B, beat(seen=1, running=[digest], rate=pace_b), 0.5)
+        fleet.handle_result(B, Result(digest, 1.0, 1000, 0.1, None, None), 1.0)
+    first = next(iter(fleet.members[A].leases))
+    for digest in list(fleet.members[A].leases)[1:]:
+        fleet.handle_result(A, Result(digest, 1.0, 1000, 0.1, None, None), 1.0)
+    fleet.handle_heartbeat(A, beat(seen=1, running=[first], rate=pace_a, steps=steps_a), 1.0)
+    return fleet, first
+
+
+def test_a_straggler_on_a_slow_host_is_copied_once_and_the_loser_cancelled():
+    fleet, job = tail_of_two(pace_a=10.0, pace_b=1000.0, steps_a=100)
+    assert digests(fleet.dispatch(1.0), B) == [job]
+    assert digests(fleet.dispatch(1.1), B) == []
+    assert fleet.handle_result(B, result(job), 2.0)[0] == "accepted"
+    assert cancelled(fleet.dispatch(2.0), A) == [job]
+    assert fleet.counts["copied"] == 1
+    assert fleet.counts["discarded_steps"] == 100
+
+
+def test_a_job_that_is_nearly_done_is_not_copied():
+    fleet, _ = tail_of_two(pace_a=1000.0, pace_b=1000.0, steps_a=100)
+    assert digests(fleet.dispatch(1.0), B) == []
+
+
+def test_the_job_of_a_worker_that_has_gone_quiet_is_copied_before_it_counts_as_lost():
+    fleet, job = tail_of_two(pace_a=1000.0, pace_b=1000.0, steps_a=100)
+    fleet.handle_heartbeat(B, beat(seen=9), 3.1)
+    assert digests(fleet.dispatch(3.1), B) == [job]
+    assert not fleet.members[A].silent
+
+
+@pytest.mark.parametrize("count", [3000])
+def test_memory_of_results_is_bounded(count):
+    fleet = fleet_of(A, capacity=4, jobs=0)
+    for generation in range(count):
+        fleet.jobs.begin_generation(generation)
+        fleet.jobs.offer(work(1, generation=generation))
+        now = generation / 100
+        fleet.handle_heartbeat(A, beat(4, seen=fleet.members[A].number), now)
+        for digest in digests(fleet.dispatch(now), A):
+            fleet.handle_result(A, result(digest), now)
+    assert len(fleet.jobs._accepted) <= 2
+    assert not fleet.jobs
+    assert len(fleet.jobs._tags) == len(fleet.jobs._queue) == 0
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_memory_stays_flat_through_a_hundred_thousand_generations_of_churn():
+    fleet = fleet_of(A, capacity=4, jobs=0)
+    random = np.random.default_rng(1)
+    tracemalloc.start()
+    held = []
+    for generation in range(100_000):
+        now = generation / 10
+        fleet.jobs.begin_generation(generation)
+        fleet.jobs.offer(work(2, generation=generation))
+        name = f"w/{random.integers(2**32):08x}"
+        fleet.add_worker(name, 2, "f", now)
+        fleet.handle_heartbeat(A, beat(4, seen=fleet.members[A].number), now)
+        fleet.handle_heartbeat(name, beat(2, seen=fleet.members[name].number), now)
+        while fleet.jobs:
+            for who in (A, name):
+                for digest in digests(fleet.dispatch(now), who):
+                    if random.random() < 0.8:
+                        fleet.handle_result(who, result(digest), now)
+            now += 0.001
+            fleet.handle_heartbeat(A, beat(4, seen=fleet.members[A].number), now)
+            fleet.handle_heartbeat(name, beat(2, seen=fleet.members[name].number), now)
+        fleet.handle_departure(name, now)
+        fleet.tick(now + 0.06)
+        fleet.notes.clear()
+        if generation in (10_000, 99_999):  # by the first the story is as long as it becomes
+            held.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    assert held[1] - held[0] < 200_000
+    assert set(fleet.members) == {A}
+
+
+def test_who_says_hello_and_never_beats_is_one_of_a_few_and_soon_forgotten():
+    fleet = fleet_of(A)
+    for number in range(20_000):
+        fleet.add_worker(f"stranger/{number:08x}", 2**62, "f", 1.0)
+    assert len(fleet.members) == 1 + MOST_GUESTS
+    assert max(member.slots for member in fleet.members.values()) == MAX_SLOTS
+    for now in range(1, int(GUEST_TIMEOUT) + 3):
+        fleet.handle_heartbeat(A, beat(), float(now))
+        fleet.tick(float(now))
+    assert set(fleet.members) == {A}
+    assert not fleet.notes, "no log grows with what strangers call themselves"
+
+
+def test_a_worker_that_beats_is_forgotten_only_after_a_long_silence():
+    fleet = fleet_of(A)
+    given = digests(fleet.dispatch(0.0), A)
+    for now in range(int(FORGET_AFTER)):
+        fleet.tick(float(now))
+    assert fleet.members[A].silent
+    for now in range(int(FORGET_AFTER), int(FORGET_AFTER) + 10):
+        fleet.tick(float(now))
+    assert not fleet.members
+    assert fleet.handle_result(A, result(given[0]), 100.0)[0] == "accepted", "its results still count"
+
+
+def test_a_stranger_who_only_said_hello_keeps_no_failing_job_from_being_tried_again():
+    fleet = fleet_of(A, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.add_worker(B, 4, "f", 0.0)
+    fleet.handle_result(A, result(digest, error="killed"), 0.1)
+    assert digests(fleet.dispatch(0.2), A) == [digest]
+
+
+def known(fleet, name, seconds=0.1, at=0.0):
+    """Have a worker bring all that it is given back after so long."""
+    while given := digests(fleet.dispatch(at), name):
+        at += seconds
+        for digest in given:
+            fleet.handle_result(name, result(digest), at)
+    return at
+
+
+def test_an_idle_worker_hears_that_it_is_known_and_no_more_often_than_that():
+    fleet = fleet_of(A, jobs=0)
+    heard = []
+    for tenth in range(100):
+        if tenth % 10 == 0:
+            fleet.handle_heartbeat(A, beat(), tenth / 10)
+        heard += [(tenth / 10, send.number) for send in fleet.dispatch(tenth / 10)]
+    assert {number for _, number in heard} == {0}
+    assert 2 <= len(heard) <= 5
+    assert max(late - early for (early, _), (late, _) in pairwise(heard)) < SILENT_BEATS * BEAT
+
+
+def test_a_worker_that_says_nothing_is_told_nothing():
+    fleet = fleet_of(A, jobs=0)
+    fleet.dispatch(3.0)
+    assert fleet.dispatch(9.0) == []
+
+
+def heavy(count):
+    vector = vector_bytes(np.arange(90_000.0))
+    return make_work(SPEC, "score", 0, 0, vector, range(1000, 1000 + count))
+
+
+def test_a_large_batch_has_the_time_that_its_link_takes():
+    fleet = fleet_of(A, jobs=0)
+    fleet.jobs.offer(heavy(1))
+    parts = fleet.dispatch(0.0)
+    for second in range(1, 8):  # 360 kB at 50 kB a second
+        fleet.handle_heartbeat(A, beat(seen=second), float(second))
+        assert numbered(fleet.dispatch(second + 0.5)) == []
+    assert len(parts) > 7
+    assert fleet.members[A].host_stats.bandwidth > 35_000
+
+
+def test_what_a_later_batch_has_overtaken_was_lost_and_is_sent_again_at_once():
+    fleet = fleet_of(A, jobs=2)
+    (first,) = fleet.dispatch(0.0)
+    fleet.jobs.offer(work(3, generation=1))
+    done = first.content.work[0].job.digest
+    fleet.handle_result(A, result(done), 0.1)
+    (second,) = fleet.dispatch(0.1)
+    fleet.handle_heartbeat(A, beat(seen=0, queued=digests([second], A)), 0.2)
+    assert [send.number for send in fleet.dispatch(0.2)] == [first.number]
+
+
+def test_a_worker_that_did_not_hear_the_answer_to_its_hello_is_given_work_at_once():
+    fleet = fleet_of(A, jobs=4)
+    for _ in range(3):
+        for digest in digests(fleet.dispatch(0.0), A)[:1]:
+            fleet.handle_result(A, result(digest), 0.0)
+    first = fleet.members[A].numbering
+    fleet.handle_departure(A, 0.9)
+    second = fleet.add_worker(A, 1, "f", 1.0)
+    fleet.handle_heartbeat(A, beat(seen=7, numbering=first), 1.1)
+    (send,) = [send for send in fleet.dispatch(1.1) if send.content.work]
+    assert (send.numbering, send.number) == (second, 1)
+    assert second > first
+    fleet.handle_heartbeat(A, beat(seen=1, numbering=second), 1.2)
+    assert not fleet.members[A].unseen
+
+
+def test_a_hello_in_the_name_of_a_worker_that_beats_takes_nothing_from_it():
+    fleet = fleet_of(A, jobs=4)
+    (lost,) = fleet.dispatch(0.0)
+    held, numbering = dict(fleet.members[A].leases), fleet.members[A].numbering
+    assert fleet.add_worker(A, 1000, "of somebody else", 1.0) == numbering
+    assert fleet.members[A].leases == held
+    assert (fleet.members[A].slots, fleet.members[A].fingerprint) == (1, "f")
+    (again,) = fleet.dispatch(1.1)
+    assert (again.numbering, again.number) == (numbering, lost.number), "if it was itself, it may have missed this"
+    fleet.add_worker(A, 1, "f", 1.2)
+    assert not numbered(fleet.dispatch(1.2)), "which is sent once, however often somebody greets"
+
+
+def test_a_worker_that_said_nothing_for_a_while_is_welcomed_anew():
+    fleet = fleet_of(A, jobs=4)
+    fleet.dispatch(0.0)
+    before = fleet.members[A].numbering
+    assert fleet.add_worker(A, 1, "f", 2.5) > before
+    assert not fleet.members[A].leases
+
+
+def test_a_result_counts_from_the_life_that_was_given_its_job_and_from_nobody_else():
+    fleet = fleet_of(A, B, jobs=2)
+    sends = fleet.dispatch(0.0)
+    (of_a,), (of_b,) = digests(sends, A), digests(sends, B)
+    for stranger in ("x/0badc0de", "a/0badc0de"):
+        assert fleet.handle_result(stranger, result(of_a, fitness=1e9), 0.1) == ("refused", None)
+    assert fleet.handle_result(B, result(of_a, fitness=1e9), 0.1) == ("refused", None)
+    fleet.handle_heartbeat(B, beat(seen=1, running=[of_b], unacked=[of_a]), 0.2)
+    assert list(fleet.members[B].leases) == [of_b], "nor is it taken up because somebody shows it"
+    assert fleet.handle_result(A, result(of_a), 0.3)[0] == "accepted"
+    (told,) = [each for send in fleet.dispatch(0.3) if send.identity == B for each in send.content.verdicts]
+    assert (told.digest, told.verdict) == (of_a, "refused")
+    assert fleet.dropped == {"result of a stranger": 2, "result of a job that was not given": 1}
+    assert fleet.counts["discarded_steps"] == 10, "a stranger's steps are not the fleet's"
+
+
+def test_what_an_earlier_life_gave_counts_once_its_worker_beats():
+    fleet = Fleet(BEAT)
+    fleet.jobs.previous_epoch_until = 1
+    fleet.jobs.offer([*work(1), *work(1, generation=2)])
+    before, since = fleet.jobs
+    assert fleet.handle_result(A, result(before), 0.0)[0] == "refused", "nobody has welcomed it yet"
+    fleet.add_worker(A, 1, "f", 0.0)
+    assert fleet.handle_result(A, result(before), 0.1)[0] == "refused"
+    fleet.handle_heartbeat(A, beat(unacked=[before, since]), 0.2)
+    assert list(fleet.members[A].leases) == [before]
+    assert fleet.handle_result(A, result(since), 0.3)[0] == "refused", "it cannot have been given"
+    assert fleet.handle_result(A, result(before), 0.3)[0] == "accepted"
+
+
+def test_an_error_of_a_job_that_its_worker_does_not_hold_is_no_failure():
+    fleet = fleet_of(A, B, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    for name in (B, "x/0badc0de", "y/0badc0de"):
+        fleet.handle_result(name, result(digest, error="boom"), 0.1)
+    assert not fleet.jobs.failures
+    assert digest in fleet.members[A].leases
+
+
+def test_a_job_with_more_steps_than_it_can_have_goes_to_others_and_its_late_result_still_counts():
+    fleet = fleet_of(A, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.add_worker(B, 1, "f", 0.1)
+    fleet.handle_heartbeat(B, beat(), 0.1)
+    fleet.handle_heartbeat(A, beat(seen=1, running=[digest], steps=10**12), 1.0)
+    fleet.overrun(A, digest)
+    sends = fleet.dispatch(1.0)
+    assert digests(sends, B) == [digest]
+    assert cancelled(sends, A) == [digest]
+    fleet.handle_heartbeat(A, beat(seen=2, running=[digest], steps=10**13), 2.0)
+    assert not fleet.members[A].leases, "however often it shows it"
+    assert not fleet.jobs.failures
+    assert fleet.handle_result(A, result(digest), 3.0)[0] == "accepted"
+
+
+@pytest.mark.parametrize("kind", ["score", "evaluate"])
+def test_a_job_that_is_held_by_growing_steps_is_copied_once_it_was_away_for_long(kind):
+    fleet = fleet_of(A, B, jobs=0)
+    fleet.drain_background = True
+    fleet.jobs.offer(work(2, kind))
+    sends = fleet.dispatch(0.0)
+    (held,), (other,) = digests(sends, A), digests(sends, B)
+    fleet.handle_result(B, result(other), 1.0)
+    copied = {}
+    for second in range(1, 100):
+        fleet.handle_heartbeat(A, beat(seen=1, running=[held], rate=1e6, steps=2 * second), float(second))
+        fleet.handle_heartbeat(B, beat(seen=fleet.members[B].number), float(second))
+        fleet.tick(float(second))
+        for digest in digests(fleet.dispatch(float(second)), B):
+            copied.setdefault(digest, second)
+    assert copied.keys() == {held}
+    assert LONGEST_HELD < copied[held] < LONGEST_HELD + 2 * LONGEST_HELD_TIMES
+
+
+def test_a_beat_that_has_seen_batches_that_nobody_sent_makes_them_count_anew():
+    fleet = fleet_of(A, jobs=2)
+    (first,) = fleet.dispatch(0.0)
+    given = digests([first], A)
+    fleet.handle_heartbeat(A, beat(seen=1000, running=given[:1]), 1.0)
+    assert list(fleet.members[A].leases) == given[:1]
+    (send,) = numbered(fleet.dispatch(1.0))
+    assert send.numbering > first.numbering
+    assert (send.number, digests([send], A)) == (1, given[1:])
+
+
+def test_a_worker_that_was_silent_is_not_waited_for_to_see_what_is_not_sent_again():
+    fleet = fleet_of(A, jobs=4)
+    lost = fleet.dispatch(0.0)[0]
+    fleet.tick(0.5)
+    for now in np.arange(1.0, SILENT_BEATS * BEAT + 1.5):
+        fleet.tick(now)
+    assert fleet.members[A].silent
+    fleet.handle_heartbeat(A, beat(numbering=lost.numbering), 7.0)
+    (send,) = [send for send in fleet.dispatch(7.0) if send.content.work]
+    assert send.numbering > lost.numbering
+    assert send.number == 1
+
+
+def test_a_late_beat_from_before_a_hello_says_nothing_of_the_batches_since():
+    fleet = fleet_of(A, jobs=4)
+    first = fleet.members[A].numbering
+    fleet.handle_departure(A, 0.9)
+    fleet.add_worker(A, 1, "f", 1.0)
+    fleet.handle_heartbeat(A, beat(), 1.1)
+    given = digests(fleet.dispatch(1.1), A)
+    fleet.handle_heartbeat(A, beat(seen=7, numbering=first), 1.2)
+    assert list(fleet.members[A].unseen) == [1]
+    for now in (1.3, 1.4):
+        fleet.handle_heartbeat(A, beat(seen=7, numbering=first), now)
+    assert list(fleet.members[A].leases) == given, "they are not missed in what cannot show them"
+
+
+def test_what_a_host_is_known_for_outlives_its_hello_and_its_worker():
+    fleet = fleet_of(A, jobs=3)
+    known(fleet, A, seconds=0.5)
+    host_stats = fleet.members[A].host_stats
+    assert host_stats.expected_seconds(2) >= 0.5
+    fleet.add_worker(A, 1, "f", 5.0)
+    assert fleet.members[A].host_stats is host_stats
+    fleet.handle_departure(A, 6.0)
+    fleet.tick(7.0)
+    fleet.add_worker("a/00000009", 1, "f", 8.0)
+    assert fleet.members["a/00000009"].host_stats == host_stats
+
+
+def test_a_newcomer_beside_a_known_worker_gets_a_copy_for_which_nobody_waits():
+    fleet = fleet_of(A, jobs=3)
+    now = known(fleet, A)
+    fleet.add_worker(B, 1, "f", now)
+    fleet.handle_heartbeat(B, beat(), now)
+    fleet.jobs.offer(work(6, generation=1))
+    held = digests(fleet.dispatch(now), A)
+    (copied,) = digests(fleet.dispatch(now), B)
+    assert copied == held[-1], "of what begins last where it is"
+    for digest in held:
+        assert fleet.handle_result(A, result(digest), now + 0.2)[0] == "accepted"
+    assert cancelled(fleet.dispatch(now + 0.2), B) == [], "it shows how soon it is, late or not"
+    assert fleet.handle_result(B, result(copied), now + 3.0)[0] == "duplicate"
+    fleet.dispatch(now + 3.0)
+    assert fleet.members[B].host_stats.expected_seconds(1) == pytest.approx(3.0)
+
+
+def test_a_host_that_dies_again_and_again_is_given_what_it_brings_back_in_time():
+    fleet = fleet_of(A, jobs=3)
+    now = known(fleet, A, seconds=1.0)
+    for life in range(3):
+        name = f"b/{life:08x}"
+        fleet.add_worker(name, 1, "f", now)
+        fleet.handle_heartbeat(name, beat(), now)
+        fleet.jobs.offer(work(4, generation=life + 1))
+        fleet.dispatch(now)
+        fleet.dispatch(now)
+        fleet.handle_departure(name, now + 1.5)
+        fleet.tick(now + 1.6)
+        now += 2.0
+    assert fleet._host_stats["b"].deaths == 3
+    fleet._host_stats["b"].learn(1, 1.0, now)
+    assert fleet._host_stats["b"].is_likely_lost(1, age=0.0)
+    assert not fleet._host_stats["b"].is_likely_lost(1, age=60.0)

@@ -1,0 +1,34 @@
+"""Who scores a round's run, and which of its means drive for the next."""
+
+import pytest
+
+from dreamfleet.common.runs.records import StoredEvaluation
+from dreamfleet.coordinator.experiments.iteration.phases import other_means
+from dreamfleet.coordinator.experiments.local_run import LocalFleet
+
+
+def test_without_an_address_this_host_scores_alone_with_a_slot_a_core():
+    crew = LocalFleet.of((), None, (), ())
+    assert crew.listen[0].startswith("tcp/127.0.0.1:")
+    assert crew.slots > 0
+    assert LocalFleet.of((), 3, (), ()).slots == 3
+
+
+@pytest.mark.parametrize(
+    ("listen", "near"),
+    [("tcp/0.0.0.0:7447", "tcp/127.0.0.1:7447"), ("tcp/[::]:7447", "tcp/127.0.0.1:7447"), ("tcp/host:1", "tcp/host:1")],
+)
+def test_where_workers_come_from_anywhere_this_host_scores_only_if_asked(listen, near):
+    assert LocalFleet.of((listen,), None, (), ()).slots == 0
+    crew = LocalFleet.of((listen,), 2, (), ())
+    assert (crew.listen, crew.local_endpoint, crew.slots) == ((listen,), near, 2)
+
+
+def test_the_last_mean_and_the_best_evaluated_ones_drive_beside_the_reported_one():
+    seen = [
+        StoredEvaluation(generation, 4, mean, 1.0) for generation, mean in ((4, 4.0), (9, 5.0), (14, 3.0), (19, 1.0))
+    ]
+    assert other_means(seen, 9, 2) == [19, 4]
+    assert other_means(seen, 19, 2) == [9, 4]
+    assert other_means(seen, None, 9) == [19, 9, 4, 14]
+    assert other_means(seen, 4, 0) == other_means([], None, 3) == []

@@ -1,0 +1,247 @@
+"""What a run reports as it ends: chosen on further tracks, scored on tracks that chose nothing."""
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.runs.records import StoredEvaluation
+from dreamfleet.common.runs.run_folder import CONTROLLER, RunFolder
+from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, VALIDATION
+from dreamfleet.coordinator.jobs.confirmation import FINALISTS, Confirmation, Finalist, total_episodes
+from dreamfleet.coordinator.settings.config import LimitsConfig
+from tests.coordinator.run.test_run import SETTINGS, Bench
+from tests.support.samples import SPEC
+
+JUDGED = replace(
+    SETTINGS, collect_every=0, evaluate_every=1, evaluation_episodes=4, population=4, confirm_episodes=8
+)  # fmt: skip
+GENERATIONS = 6
+
+
+def number_of(data):
+    """Between 0 and 1, as if by chance."""
+    return int.from_bytes(hashlib.sha256(data).digest()[:6], "little") / 2**48
+
+
+def drive(job):
+    """A course whose outcome is nothing but luck."""
+    return 1000 * number_of(job.vector + bytes(str(job.seeds), "ascii"))
+
+
+class Judging(Bench):
+    """Every job is driven as soon as it is given; each one that judges is kept, with the incarnation that gave it."""
+
+    judged: list
+
+    def begin(self):
+        self.held = []
+        super().begin()
+
+    def step(self):
+        for send in self.run.worker_protocol.dispatch(self.now):
+            self.held += [work.job for work in send.content.work]
+        job = self.held.pop(0)
+        fitness = drive(job) if job.kind == "evaluate" else float(job.digest[0])
+        if job.kind == "evaluate":
+            self.judged.append(job)
+        self.answer(Result(job.digest, fitness, 10, 0.1, None, None))
+
+    def end(self):
+        while self.run.ended is None:
+            self.step()
+
+    @property
+    def tracks(self):
+        """The validation tracks that each generation's mean was driven on."""
+        found = {}
+        for job in self.judged:  # one may be given twice, to a worker that shows so how soon it is
+            found.setdefault(job.generation, set()).add(job.seeds[0] - VALIDATION.start)
+        return found
+
+    def outcome(self):
+        with RunFolder(self.path) as stored:
+            return stored.confirmation(), Controller.load(self.path / CONTROLLER), stored.evaluations()
+
+
+@pytest.fixture
+def make(tmp_path, random_bundle):
+    made = []
+
+    def begin(settings=JUDGED, generations=GENERATIONS):
+        Judging.judged = []
+        made.append(Judging(tmp_path / "runs" / f"night-{len(made)}", random_bundle.path, settings, generations))
+        return made[-1]
+
+    yield begin
+    for each in made:
+        each.journal.close()
+
+
+def test_what_is_reported_was_driven_on_tracks_that_chose_nothing(make):
+    bench = make()
+    bench.end()
+    confirmed, controller, evaluations = bench.outcome()
+    chosen = [track for tracks in bench.tracks.values() for track in tracks if track < CONFIRMING_OFFSET]
+    fresh = [job for job in bench.judged if job.seeds[0] - VALIDATION.start >= CONFIRMING_OFFSET]
+    fresh.sort(key=lambda job: job.seeds)
+    assert {job.generation for job in fresh} == {confirmed.generation}
+    assert [job.seeds[0] - VALIDATION.start for job in fresh] == list(range(CONFIRMING_OFFSET, CONFIRMING_OFFSET + 8))
+    assert not set(chosen) & {job.seeds[0] - VALIDATION.start for job in fresh}
+    scores = [drive(job) for job in fresh]
+    assert (confirmed.mean, confirmed.error) == (np.mean(scores), np.std(scores, ddof=1) / np.sqrt(8))
+    told = controller.provenance
+    assert (told["confirmed"], told["generation"]) == (True, confirmed.generation)
+    assert (told["validation_mean"], told["validation_error"]) == (confirmed.mean, confirmed.error)
+    assert told["validation_episodes"] == 8
+    assert len(evaluations) == GENERATIONS, "the evaluations stay what they were"
+
+
+def test_the_best_few_drive_on_and_half_of_them_further(make):
+    bench = make()
+    bench.end()
+    confirmed, _, evaluations = bench.outcome()
+    ranked = sorted(evaluations, key=lambda each: -each.mean)
+    rounds = {each.generation: [t for t in bench.tracks[each.generation] if t >= CHOOSING_OFFSET] for each in ranked}
+    lengths = sorted((len([t for t in tracks if t < CONFIRMING_OFFSET]) for tracks in rounds.values()), reverse=True)
+    assert lengths == [6, 6, 2, 2, 0, 0], "four drive 2 tracks, two drive 4 more"
+    assert {generation for generation, tracks in rounds.items() if tracks} == {e.generation for e in ranked[:FINALISTS]}
+    assert sorted(rounds[confirmed.generation])[:6] == list(range(CHOOSING_OFFSET, CHOOSING_OFFSET + 6))
+
+
+def test_the_episodes_that_the_end_takes_are_foretold(make):
+    night = make()
+    while not night.run.ending:
+        night.step()
+    foretold, before = night.run.background_jobs.episodes_until_end(ending=True), {job.digest for job in night.judged}
+    night.end()
+    assert len({job.digest for job in night.judged} - before) == foretold > 3 * JUDGED.confirm_episodes - 1
+    assert night.run.background_jobs.episodes_until_end(ending=True) == 0
+    assert [total_episodes(finalists, 16) for finalists in range(5)] == [0, 16, 32, 47, 48]
+
+
+def test_the_luckiest_evaluation_is_found_out():
+    """Ten means worth 500 each, and one worth 600 that had bad luck: confirmed is a fair score, not the luckiest."""
+    rng = np.random.default_rng(3)
+    told, worth = [], []
+    for _ in range(400):
+        means = [500.0] * 10 + [600.0]
+        seen = [float(np.mean(mean + 200 * rng.standard_normal(8))) for mean in means]
+        best = sorted(range(11), key=lambda each: -seen[each])[:FINALISTS]
+        finalists = [Finalist(each, bytes([each]) * 16, 8, seen[each]) for each in best]
+        confirmation = Confirmation(SPEC, 16, finalists, 11)
+        while work := confirmation.advance(lambda _digests: {}):
+            for each in work:
+                confirmation.record(each.job.digest, means[each.job.generation] + 200 * rng.standard_normal())
+        told.append(confirmation.outcome.mean - means[confirmation.outcome.generation])
+        worth.append(max(seen) - means[best[0]])
+    assert abs(np.mean(told)) < 3 * np.std(told) / 20, "no bias"
+    assert np.mean(worth) > 50, "which the best evaluation has"
+
+
+@settings(max_examples=60, deadline=None)
+@given(count=st.integers(1, FINALISTS), episodes=st.integers(2, 40), seed=st.integers(0, 99), known=st.floats(0.0, 1.0))
+def test_in_any_order_and_whatever_is_known_already_the_outcome_is_the_same(count, episodes, seed, known):
+    finalists = [Finalist(each, bytes([each]) * 16, 4, 500.0 + each) for each in range(count)]
+
+    def outcome(known, rng=None):
+        confirmation, given = Confirmation(SPEC, episodes, finalists, 9), 0
+        lucky = lambda digests: {d: 1000 * number_of(d) for d in digests if number_of(d + b"known") < known}  # noqa: E731
+        while work := confirmation.advance(lucky):
+            for place in range(len(work)) if rng is None else rng.permutation(len(work)):
+                assert confirmation.in_progress
+                confirmation.record(work[place].job.digest, 1000 * number_of(work[place].job.digest))
+            given += len(work)
+            assert not confirmation.in_progress
+        assert given <= 3 * max(episodes, FINALISTS)
+        return confirmation.outcome
+
+    assert outcome(0.0) == outcome(known, np.random.default_rng(seed)) == outcome(1.0)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory, random_bundle):
+    return lived(tmp_path_factory.mktemp("run") / "calm", random_bundle, ())
+
+
+def lived(path, bundle, kills):
+    """What a run reports that is killed after so many results, and how many there were."""
+    Judging.judged, steps = [], 0
+    bench = Judging(path, bundle.path, JUDGED, GENERATIONS)
+    while bench.run.ended is None:
+        bench.step()
+        steps += 1
+        if steps in kills:
+            bench.restart()
+    confirmed, controller, evaluations = bench.outcome()
+    told = {name: value for name, value in controller.provenance.items() if name != "run_uid"}
+    bench.journal.close()
+    return confirmed, controller.sha256, told, evaluations
+
+
+@settings(max_examples=8, deadline=None)
+@given(kills=st.sets(st.integers(40, 74), min_size=1, max_size=5))  # from the last generations to the end
+def test_killed_anywhere_it_confirms_to_the_bit(tmp_path_factory, random_bundle, undisturbed, kills):
+    assert lived(tmp_path_factory.mktemp("run") / "night", random_bundle, kills) == undisturbed
+
+
+def test_a_run_that_is_left_open_reports_a_provisional_score(make):
+    bench = make()
+    while len(bench.run.background_jobs.evaluations) < 4:
+        bench.step()
+    bench.run.leave()
+    confirmed, controller, evaluations = bench.outcome()
+    best = max(evaluations, key=lambda each: each.mean)
+    told = controller.provenance
+    assert confirmed is None
+    assert (told["confirmed"], told["validation_mean"], told["validation_episodes"]) == (False, best.mean, 4)
+
+
+def test_a_run_that_ended_goes_on_and_is_confirmed_again(make):
+    bench = make(generations=3)
+    bench.end()
+    first, *_ = bench.outcome()
+    bench.restart()
+    assert bench.run.ended == "3 generations", "nothing is driven again"
+    assert bench.outcome()[0] == first
+    bench.limits = LimitsConfig(generations=9)
+    bench.restart()
+    assert bench.run.confirmed == first
+    before, Judging.judged = {job.digest for job in bench.judged}, []
+    while len(bench.run.history) < 9:
+        bench.step()
+        best = bench.run.best
+        assert (bench.run.confirmed is None) == (best.generation >= 3)
+        provenance = bench.run.background_jobs.report.current.controller().provenance
+        assert (provenance["confirmed"], provenance["generation"]) == (
+            (False, best.generation) if best.generation >= 3 else (True, first.generation)
+        )
+    bench.end()
+    second, *_ = bench.outcome()
+    assert second.closed == 9
+    assert not before & {job.digest for job in bench.judged}, "no track was driven twice"
+
+
+@pytest.mark.parametrize("changes", [{"confirm_episodes": 0}, {"evaluate_every": 0}])
+def test_where_nothing_is_to_be_confirmed_a_run_ends_as_it_did(make, changes):
+    bench = make(replace(JUDGED, **changes))
+    bench.end()
+    confirmed, controller, evaluations = bench.outcome()
+    assert confirmed is None
+    assert not controller.provenance["confirmed"]
+    assert max((track for tracks in bench.tracks.values() for track in tracks), default=0) < CHOOSING_OFFSET
+    assert len(evaluations) == (GENERATIONS if changes.get("evaluate_every", 1) else 0)
+
+
+def test_one_evaluation_needs_no_choice(make):
+    bench = make(generations=1)
+    bench.end()
+    assert sorted(track for track in bench.tracks[0] if track >= CHOOSING_OFFSET) == list(
+        range(CONFIRMING_OFFSET, CONFIRMING_OFFSET + 8)
+    )
+    assert isinstance(bench.run.best, StoredEvaluation)

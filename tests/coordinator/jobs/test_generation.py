@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.coordinator.jobs.generation import Generation
+from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
+from tests.support.samples import SPEC
+
+DREAM = replace(SPEC, task="dream")
+VECTORS = [vector_bytes(np.full(5, value)) for value in (0.0, 1.0, 2.0)]
+
+
+def test_every_candidate_drives_every_seed():
+    generation = Generation(4, SPEC, VECTORS, (100, 200))
+    jobs = [work.job for work in generation.missing]
+    assert [(job.candidate, job.episode, job.seeds) for job in jobs] == [
+        (candidate, episode, (seed,)) for candidate in range(3) for episode, seed in enumerate((100, 200))
+    ]
+    assert len({job.digest for job in jobs}) == generation.total == 6
+
+
+def test_of_a_dreams_episodes_the_first_are_driven_and_say_so():
+    generation = Generation(0, DREAM, VECTORS, (100, 200, 300), driven=1)
+    jobs = [work.job for work in generation.missing]
+    assert [(job.episode, job.driven) for job in jobs] == [(0, True), (1, None), (2, None)] * 3
+    for job in jobs:
+        assert job.digest == DREAM.with_overrides(driven=job.driven).digest("score", job.vector, job.seeds)
+    assert len({job.digest for job in jobs}) == 9
+
+
+def test_fitness_is_the_mean_of_a_candidates_own_episodes():
+    generation = Generation(0, SPEC, VECTORS, (100, 200))
+    for work in reversed(generation.missing):
+        generation.record(work.job.digest, work.job.candidate * 10 + work.job.episode, steps=7)
+    assert generation.complete
+    assert generation.steps == 42
+    assert np.array_equal(generation.fitness(), [0.5, 10.5, 20.5])
+
+
+def test_equal_candidates_share_one_job():
+    generation = Generation(0, SPEC, [VECTORS[0], VECTORS[0]], (100,))
+    (work,) = generation.missing
+    generation.record(work.job.digest, 3.0, steps=1)
+    assert generation.complete
+    assert np.array_equal(generation.fitness(), [3.0, 3.0])
+
+
+def race(order, scores):
+    """A racing generation of three candidates and three episodes, its first stage answered in this order."""
+    generation = Generation(0, SPEC, VECTORS, (100, 200, 300), racing=True)
+    first = generation.missing
+    opened = [generation.record(first[i].job.digest, scores[first[i].job.candidate], steps=1) for i in order]
+    return generation, first, opened
+
+
+@pytest.mark.parametrize("order", [range(6), reversed(range(6)), (3, 0, 5, 1, 4, 2)])
+def test_the_second_half_is_driven_by_the_better_half_after_the_barrier(order):
+    generation, first, opened = race(order, [1.0, 5.0, 3.0])
+    assert [(work.job.candidate, work.job.episode) for work in first] == [(c, e) for c in range(3) for e in range(2)]
+    assert opened == [False] * 5 + [True]
+    second = generation.missing
+    assert [(work.job.candidate, work.job.episode) for work in second] == [(1, 2), (2, 2)]
+    assert not generation.complete
+    for work in second:
+        assert not generation.record(work.job.digest, 8.0, steps=1)
+    assert generation.complete
+    assert generation.done == generation.total == 8
+    assert np.array_equal(generation.fitness(), [1.0, 6.0, 14 / 3])
+
+
+def test_of_equals_the_first_go_on():
+    generation, _, _ = race(range(6), [2.0, 2.0, 2.0])
+    assert [work.job.candidate for work in generation.missing] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("kind", "vector", "seeds"),
+    [("evaluate", VECTORS[0], (1,)), ("score", VECTORS[1], (1,)), ("score", VECTORS[0], (2,))],
+)
+def test_a_digest_is_of_kind_vector_and_seeds(kind, vector, seeds):
+    (one,) = make_work(SPEC, "score", 0, 0, VECTORS[0], (1,))
+    (other,) = make_work(SPEC, kind, 0, 0, vector, seeds)
+    assert one.job.digest != other.job.digest

@@ -1,0 +1,173 @@
+"""Extreme numbers are the failure of their job, and never the end of a run; nor are those in older journals."""
+
+import json
+import sqlite3
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dreamfleet.common.protocol.codec import encode_json
+from dreamfleet.common.protocol.messages import HelloRequest, Result
+from dreamfleet.common.protocol.result_bounds import (
+    LARGEST_FITNESS,
+    MAX_COUNT,
+    MAX_SECONDS,
+    clamp_count,
+    max_steps,
+    rejection_reason,
+    to_finite,
+)
+from dreamfleet.coordinator.jobs.evaluation import Evaluation
+from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.service import status_json
+from dreamfleet.coordinator.service.status import take_snapshot
+from tests.coordinator.run.test_run import SETTINGS, A, B, Bench
+from tests.support.samples import SPEC
+
+PLAIN = replace(SETTINGS, collect_every=0, population=4, episodes=2, evaluate_every=1, evaluation_episodes=2)
+EXTREME = {
+    "an overflowing mean": (1.7e308, 10, 0.1), "an infinite deviation": (1e170, 10, 0.1),
+    "a deviation from below": (-1e170, 10, 0.1), "steps": (1.0, MAX_COUNT, 0.1),
+}  # fmt: skip
+
+
+@pytest.fixture
+def bench(tmp_path, random_bundle):
+    made = Bench(tmp_path / "night", random_bundle.path, PLAIN, generations=2)
+    yield made
+    made.journal.close()
+
+
+def deliver_all(bench, numbers, kinds=("score", "evaluate", "collect")):
+    fitness, steps, seconds = numbers
+    given = [
+        (send.identity, work.job)
+        for send in bench.run.worker_protocol.dispatch(bench.now)
+        for work in send.content.work
+    ]
+    for name, job in given:
+        if job.kind in kinds:
+            bench.deliver(name, Result(job.digest, fitness, steps, seconds, None, None))
+        else:
+            bench.deliver(name, Result(job.digest, 1.0, 10, 0.1, None, None))
+    return given
+
+
+def told(bench):
+    """Every answer that the run gives, as it would travel."""
+    snapshot = take_snapshot(bench.run, "night", {}, 1.0, bench.now)
+    return {
+        part: json.loads(status_json.answer(snapshot, part, {}))
+        for part in ("", "history", "workers", "candidates", "generation", "best")
+    }
+
+
+@pytest.mark.parametrize("numbers", EXTREME.values(), ids=EXTREME)
+@pytest.mark.parametrize("kind", ["score", "evaluate"])
+def test_an_extreme_result_is_the_jobs_failure_with_its_reason_and_the_run_can_go_on(bench, numbers, kind):
+    while bench.run.paused is None and deliver_all(bench, numbers, (kind,)):
+        told(bench)
+    assert "fitness" in bench.run.paused or "steps" in bench.run.paused
+    assert told(bench)[""]["state"] == "paused"
+    bench.restart()
+    assert bench.run.paused is None
+    while bench.run.ended is None:
+        assert deliver_all(bench, (1.0, 10, 0.1))
+        told(bench)
+    assert bench.run.ended == "2 generations"
+
+
+@pytest.mark.parametrize("numbers", EXTREME.values(), ids=EXTREME)
+def test_what_an_older_coordinator_took_in_is_asked_for_again(bench, numbers):
+    given = [
+        (send.identity, work.job)
+        for send in bench.run.worker_protocol.dispatch(bench.now)
+        for work in send.content.work
+    ]
+    for name, job in given:
+        bench.journal.add_result(job, Result(job.digest, *numbers, None, None), name, "f", 1)
+    bench.journal.commit()
+    bench.restart()
+    assert bench.run.generation.done == 0
+    while bench.run.ended is None:
+        assert deliver_all(bench, (1.0, 10, 0.1))
+        told(bench)
+
+
+def test_closed_generations_and_evaluations_of_an_older_coordinator_can_be_told(bench):
+    deliver_all(bench, (1.0, 10, 0.1))
+    while len(bench.run.history) < 1:
+        deliver_all(bench, (1.0, 10, 0.1))
+    bench.run.commit()
+    with sqlite3.connect(bench.path / "journal.sqlite") as connection:
+        connection.execute("UPDATE generation SET mean = 9e999, std = NULL, best = 9e999, worst = -9e999, steps = ?",
+                           (MAX_COUNT,))  # fmt: skip
+        connection.execute("UPDATE evaluation SET mean = 9e999, std = NULL WHERE mean IS NOT NULL")
+    connection.close()
+    bench.restart()
+    bench.now += 1
+    deliver_all(bench, (1.0, 10, 0.1))
+    told(bench)
+    while bench.run.ended is None:
+        assert deliver_all(bench, (1.0, 10, 0.1))
+    bench.run.leave()
+    told(bench)
+
+
+def test_a_pending_evaluation_of_an_older_coordinator_is_driven_again(bench):
+    evaluation = Evaluation(0, vector_bytes(np.zeros(SETTINGS.controller.size)), 2)
+    for work in evaluation.work(SPEC):
+        bench.journal.add_result(work.job, Result(work.job.digest, 1.7e308, 10, 0.1, None, None), A, "f", 1)
+    bench.journal.schedule_evaluation(evaluation)
+    bench.journal.commit()
+    bench.restart()
+    assert bench.run.background_jobs.evaluations.progress == (0, 2)
+
+
+def test_slots_and_steps_without_bound_can_be_told(bench):
+    for name in (A, B):
+        bench.run.worker_protocol.admit(HelloRequest(2, 2, "0", name, (SPEC.task,), "f", MAX_COUNT), bench.now)
+    bench.run.worker_protocol.counts["discarded_steps"] = 3 * MAX_COUNT
+    told(bench)
+
+
+def test_an_error_that_counts_too_many_steps_is_an_error(bench):
+    for _ in range(3):
+        given = [
+            (send.identity, each.job)
+            for send in bench.run.worker_protocol.dispatch(bench.now)
+            for each in send.content.work
+        ]
+        for name, job in given[:1]:
+            bench.deliver(name, Result(job.digest, None, MAX_COUNT, 0.1, "boom", None))
+        told(bench)
+
+
+@given(st.floats(), st.integers(), st.floats())
+def test_what_does_not_exceed_can_be_summed_over_the_largest_run(fitness, steps, seconds):
+    if rejection_reason(fitness, steps, seconds, 1000) is None:
+        assert abs(fitness) <= LARGEST_FITNESS
+        assert 0 <= steps <= max_steps(1000)
+        assert 0 <= seconds <= MAX_SECONDS
+        assert np.isfinite(np.float64(fitness) ** 2 * 1e9)
+
+
+@given(st.integers(), st.floats())
+def test_what_is_told_can_be_encoded(steps, value):
+    assert 0 <= clamp_count(steps) <= MAX_COUNT
+    assert np.isfinite(to_finite(value))
+    assert encode_json(replace(HelloRequest(2, 2, "0", A, (), "f", 1), slots=clamp_count(steps)))
+
+
+@pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep", "cmaes-lra"])
+def test_an_optimiser_takes_whatever_is_within_the_bounds(optimiser):
+    evolution = Evolution(EvolutionConfig(6, 8, 0.1, "diagonal", 1, optimiser))
+    for scale in (LARGEST_FITNESS, 1.0, 1e-300):
+        for _ in range(20):
+            asked = evolution.ask()
+            evolution.tell(np.clip(-(asked**2).sum(axis=1) * scale, -LARGEST_FITNESS, LARGEST_FITNESS))
+            evolution.restore(evolution.state().packed())

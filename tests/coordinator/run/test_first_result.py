@@ -1,0 +1,231 @@
+"""A run's class is that of its first accepted result; of a strict one every accepted result has it."""
+
+import sqlite3
+from dataclasses import replace
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dreamfleet.common.protocol.host_classes import class_from_fingerprint
+from dreamfleet.common.protocol.messages import HelloRequest, Result, ResultBatch
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.storage.journal import Journal
+from tests.coordinator.run.test_run import SETTINGS, A, B, Bench
+from tests.support.samples import SPEC
+
+PLAIN = replace(SETTINGS, collect_every=0, population=4)
+
+
+class Classed(Bench):
+    """Hosts of two classes."""
+
+    fingerprints = {A: "here", B: "elsewhere"}  # noqa: RUF012
+    classes = {A: "a" * 16, B: "b" * 16}  # noqa: RUF012
+    strict = True
+
+    def begin(self):
+        self.told = {A: "", B: ""}
+        super().begin()
+
+    def find_out(self, name):
+        """Its children have, and its beat says so."""
+        self.told[name] = self.classes[name]
+        self.handle_heartbeat(name, host_class=self.classes[name])
+
+    def request(self, name):
+        known = self.classes[name] and self.told[name]  # a worker finds it out after it has joined
+        return HelloRequest(2, 2, "0", name, (SPEC.task,), self.fingerprints[name], 1, host_class=known)
+
+    def hello(self, name):
+        """Why it is refused, if it is."""
+        found = self.run.worker_protocol.find_refusal(self.request(name), self.settings)
+        if found is None:
+            self.run.worker_protocol.admit(self.request(name), self.now)
+            self.handle_heartbeat(name)
+        return found
+
+    def deliver(self, name, result):
+        self.told[name] = self.classes[name]
+        batch = ResultBatch(
+            run_uid=self.run.uid, incarnation=1, fingerprint=self.fingerprints[name], results=(result,),
+            host_class=self.classes[name],
+        )  # fmt: skip
+        self.run.worker_protocol.handle_results(name, batch, self.now)
+        self.run.advance(self.now)
+        self.run.commit()
+
+    def given(self):
+        return {
+            send.identity: [work.job for work in send.content.work]
+            for send in self.run.worker_protocol.dispatch(self.now)
+        }
+
+    def stored(self):
+        with RunFolder(self.path) as folder:
+            return {each.host_class for number in range(4) for each in folder.results(0, number)}
+
+
+@pytest.fixture
+def bench(tmp_path, random_bundle):
+    made = Classed(tmp_path / "night", random_bundle.path, PLAIN)
+    yield made
+    made.journal.close()
+
+
+def done(job):
+    return Result(job.digest, 1.0, 10, 0.1, None, None)
+
+
+class FromBefore(Classed):
+    """Workers of before there were classes."""
+
+    classes = {A: None, B: None}  # noqa: RUF012
+
+
+def test_a_hello_without_a_result_fixes_nothing(bench):
+    assert bench.run.worker_protocol.host_class is None
+    bench.restart()
+    assert bench.hello(A) is bench.hello(B) is None
+
+
+@pytest.mark.parametrize("kind", [Classed, FromBefore])
+def test_the_first_accepted_result_fixes_it_and_the_other_host_must_go(tmp_path, random_bundle, kind):
+    bench = kind(tmp_path / "night", random_bundle.path, PLAIN)
+    own = kind.classes[B] or class_from_fingerprint("elsewhere")
+    jobs = bench.given()
+    bench.deliver(B, done(jobs[B][0]))
+    assert (bench.run.worker_protocol.host_class, bench.run.worker_protocol.fingerprint) == (own, "elsewhere")
+    bench.deliver(A, done(jobs[A][0]))
+    assert bench.run.generation.done == 1, "a result of another class does not count"
+    assert [member.identity for member in bench.run.worker_protocol.members] == [B]
+    why, remedy = bench.hello(A)
+    assert "classes differ" in why
+    assert "--no-strict" in remedy
+    assert any("classes differ" in note for note in bench.run.worker_protocol.take_notes())
+    assert {job.digest for job in bench.given()[B]} >= {job.digest for job in jobs[A]}, "its jobs are free again"
+    assert bench.run.worker_protocol.failures == [], "it is no failure of the job"
+    bench.restart()
+    assert bench.run.worker_protocol.host_class == own
+    assert bench.hello(B) is None
+    bench.journal.close()
+
+
+def test_who_is_of_another_class_goes_before_it_is_given_anything(bench):
+    jobs = bench.given()
+    bench.deliver(B, done(jobs[B][0]))
+    bench.run.worker_protocol.remove_worker(A)
+    assert bench.hello(A) is None, "it does not know its class yet"
+    bench.find_out(A)
+    assert [member.identity for member in bench.run.worker_protocol.members] == [B]
+    assert "classes differ" in bench.hello(A)[0]
+
+
+def test_a_worker_from_before_there_were_classes_cannot_join_a_strict_run_of_one(bench):
+    jobs = bench.given()
+    bench.deliver(B, done(jobs[B][0]))
+    bench.classes = {A: None, B: "b" * 16}
+    assert "install the same dreamfleet" in bench.hello(A)[1]
+
+
+def test_hosts_of_one_fingerprint_may_be_of_two_classes_and_of_two_fingerprints_of_one(bench):
+    bench.fingerprints = {A: "here", B: "here"}
+    bench.restart()
+    jobs = bench.given()
+    bench.deliver(B, done(jobs[B][0]))
+    bench.deliver(A, done(jobs[A][0]))
+    assert bench.run.generation.done == 1
+    bench.fingerprints, bench.classes = {A: "there", B: "here"}, {A: "b" * 16, B: "b" * 16}
+    bench.told[A] = ""
+    assert bench.hello(A) is None
+    bench.deliver(A, done(jobs[A][0]))
+    assert bench.run.generation.done == 2
+    assert bench.stored() == {"b" * 16}
+    (share,) = bench.run.worker_protocol.classes.largest
+    assert (share.results, set(share.fingerprints)) == (2, {"here", "there"})
+
+
+def test_an_error_fixes_nothing(bench):
+    jobs = bench.given()
+    bench.deliver(B, Result(jobs[B][0].digest, None, 0, 0.1, "boom", None))
+    assert bench.run.worker_protocol.host_class is None
+    bench.deliver(A, done(jobs[A][0]))
+    assert bench.run.worker_protocol.host_class == "a" * 16
+
+
+def test_a_result_of_another_life_is_judged_before_its_worker_says_hello(bench):
+    jobs = bench.given()
+    bench.deliver(A, done(jobs[A][0]))
+    bench.restart()
+    bench.deliver(B, done(jobs[B][0]))
+    assert bench.run.generation.done == 1
+
+
+@pytest.mark.parametrize("classes", [{A: "a" * 16, B: "b" * 16}, {A: None, B: "b" * 16}, {A: "a" * 16, B: None}])
+def test_a_run_that_is_not_strict_takes_all_and_tells_of_which_class_each_result_is(tmp_path, random_bundle, classes):
+    kind = type("Open", (Classed,), {"strict": False, "classes": classes})
+    bench = kind(tmp_path / "night", random_bundle.path, PLAIN)
+    jobs = bench.given()
+    for name in (A, B):
+        bench.deliver(name, done(jobs[name][0]))
+    assert bench.run.generation.done == 2
+    assert bench.hello(A) is bench.hello(B) is None
+    # Where the first to score knew nothing of classes the whole run goes by fingerprints, as do older journals.
+    told = classes if classes[A] else {A: None, B: None}
+    assert bench.stored() == {told[A] or class_from_fingerprint("here"), told[B] or class_from_fingerprint("elsewhere")}
+    assert bench.run.worker_protocol.classes.description == "mixed: 2 classes, 50.0%, 50.0% of results"
+    bench.journal.close()
+    with RunFolder(bench.path) as folder:
+        assert folder.classes == bench.run.worker_protocol.classes
+
+
+def test_a_journal_from_before_there_were_classes_goes_on_by_fingerprints(bench):
+    jobs = bench.given()
+    bench.deliver(A, done(jobs[A][0]))
+    bench.journal.close()
+    before = sqlite3.connect(bench.path / "journal.sqlite")
+    before.executescript(
+        "ALTER TABLE result DROP COLUMN host_class; DELETE FROM run WHERE key = 'host_class'; PRAGMA user_version = 2"
+    )
+    before.close()
+    with RunFolder(bench.path) as folder:
+        assert bench.stored() == {class_from_fingerprint("here")}
+        assert folder.classes.description == "one class, by its fingerprint: to the bit"
+    bench.journal = Journal(bench.path / "journal.sqlite")
+    bench.begin()
+    assert bench.run.worker_protocol.host_class == class_from_fingerprint("here")
+    assert "classes differ" in bench.hello(B)[0]
+    bench.deliver(A, done(bench.given()[A][0]))
+    assert bench.run.generation.done == 2
+    assert bench.stored() == {class_from_fingerprint("here")}
+
+
+def test_an_old_journal_that_a_hello_froze_is_free_again(bench):
+    bench.journal.set_fact("fingerprint", "a host that never scored")
+    bench.journal.commit()
+    bench.restart()
+    assert bench.run.worker_protocol.host_class is None
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    order=st.lists(
+        st.tuples(st.sampled_from(["give", "hello", "find out", "restart"]), st.sampled_from([A, B])), max_size=30
+    )
+)
+def test_in_any_order_a_strict_journal_holds_one_class(tmp_path_factory, random_bundle, order):
+    bench = Classed(tmp_path_factory.mktemp("run") / "night", random_bundle.path, PLAIN)
+    held = {A: {}, B: {}}
+    for what, name in order:
+        for who, jobs in bench.given().items():
+            held[who].update({job.digest: job for job in jobs})
+        if what == "restart":
+            bench.restart()
+        elif what == "hello":
+            bench.hello(name)
+        elif what == "find out":
+            bench.find_out(name)
+        elif held[name]:
+            bench.deliver(name, done(held[name].popitem()[1]))
+        assert len(bench.stored()) <= 1
+    bench.journal.close()

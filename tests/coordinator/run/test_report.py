@@ -1,0 +1,139 @@
+"""The reported controller: there from the first closed generation on, and what the journal holds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.errors import ControllerError
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.runs.lookup import find_controller
+from dreamfleet.common.runs.run_folder import CONTROLLER, RunFolder
+from dreamfleet.coordinator.run.report import SAVE_INTERVAL
+from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.settings.start import find_start
+from tests.coordinator.run.test_run import SETTINGS, Bench
+
+EVALUATED = replace(SETTINGS, collect_every=0, evaluate_every=2, evaluation_episodes=2, population=4)
+SCORES = {1: 10.0, 3: 5.0}  # of the mean after a generation
+
+
+class Reporting(Bench):
+    given: list
+
+    def begin(self):
+        self.given = []
+        super().begin()
+
+    def step(self):
+        """One job, whichever comes first."""
+        for send in self.run.worker_protocol.dispatch(self.now):
+            self.given += [work.job for work in send.content.work]
+        job = self.given.pop(0)
+        fitness = SCORES[job.generation] if job.kind == "evaluate" else float(job.digest[0])
+        self.answer(Result(job.digest, fitness, 10, 0.1, None, None))
+
+    def close(self, generations):
+        """Until so many generations are closed and nothing is being evaluated."""
+        while len(self.run.history) < generations or self.run.background_jobs.in_progress:
+            self.step()
+
+    def saved(self):
+        path = self.path / CONTROLLER
+        return Controller.load(path) if path.exists() else None
+
+
+@pytest.fixture
+def make(tmp_path, random_bundle):
+    made = []
+
+    def begin(settings=EVALUATED, generations=100):
+        made.append(Reporting(tmp_path / "runs" / f"night-{len(made)}", random_bundle.path, settings, generations))
+        return made[-1]
+
+    yield begin
+    for each in made:
+        each.journal.close()
+
+
+def test_a_controller_is_there_from_the_first_closed_generation_on(make):
+    bench = make(replace(EVALUATED, evaluate_every=0))
+    assert (bench.saved(), bench.run.controller_path) == (None, None)
+    bench.close(1)
+    assert bench.run.controller_path == bench.path / CONTROLLER
+    assert bench.saved().provenance["generation"] == 0
+
+
+def test_a_mean_that_was_not_evaluated_is_written_at_a_pace_and_once_more_as_the_coordinator_leaves(make):
+    bench = make(replace(EVALUATED, evaluate_every=0))
+    bench.close(3)
+    assert bench.saved().provenance["generation"] == 0
+    bench.now += SAVE_INTERVAL
+    bench.close(4)
+    assert bench.saved().provenance["generation"] == 3
+    bench.close(5)
+    bench.run.leave()
+    assert bench.saved().provenance["generation"] == 4
+
+
+def test_after_every_evaluation_the_file_holds_the_best_evaluated_mean(make):
+    bench = make()
+    bench.close(2)
+    assert (bench.saved().provenance["generation"], bench.saved().provenance["validation_mean"]) == (1, 10.0)
+    bench.now += SAVE_INTERVAL
+    bench.close(4)
+    assert bench.saved().provenance["generation"] == 1
+    bench.run.commit()
+    vector = bench.journal.evaluated_vector(1)
+    assert np.array_equal(bench.saved().parameters, np.frombuffer(vector, "<f4"))
+
+
+def test_what_is_reported_survives_a_restart(make):
+    bench = make()
+    bench.close(3)
+    bench.run.leave()
+    before = bench.saved()
+    (bench.path / CONTROLLER).unlink()
+    bench.restart()
+    bench.run.leave()
+    after = bench.saved()
+    assert (after.sha256, after.provenance) == (before.sha256, before.provenance)
+
+
+@pytest.mark.parametrize("every", [0, 2])
+def test_a_limit_that_was_passed_already_writes_the_controller_and_the_reason(make, every):
+    bench = make(replace(EVALUATED, evaluate_every=every))
+    bench.close(3)
+    (bench.path / CONTROLLER).unlink()
+    bench.limits = LimitsConfig(generations=2)
+    bench.restart()
+    assert bench.run.ended == "3 generations"
+    assert bench.run.controller_path == bench.path / CONTROLLER
+    assert bench.saved() is not None
+    with RunFolder(bench.path) as stored:
+        assert stored.ended == "3 generations"
+
+
+def test_an_open_run_has_a_controller_to_evaluate_and_record_and_says_when_it_has_none_yet(make):
+    bench = make()
+    with pytest.raises(ControllerError, match="no controller yet"):
+        find_controller(bench.path.name, bench.path.parent)
+    bench.close(1)
+    controller, beside = find_controller(bench.path.name, bench.path.parent)
+    assert controller.sha256 == bench.run.background_jobs.report.current.controller().sha256
+    assert beside is not None
+    assert beside.exists()
+
+
+def test_another_run_begins_at_the_mean_of_an_open_one_and_at_the_report_of_an_ended_one(make):
+    bench = make()
+    bench.close(3)
+    opened = find_start(bench.path.name, bench.path.parent)
+    assert opened.source.startswith("run ")
+    bench.limits = LimitsConfig(generations=1)
+    bench.restart()
+    assert bench.run.ended is not None
+    ended = find_start(bench.path.name, bench.path.parent)
+    assert np.array_equal(ended.mean, bench.saved().parameters.astype(np.float64))
+    assert not np.array_equal(opened.mean, ended.mean)

@@ -1,0 +1,348 @@
+"""A run's life against its journal, without a transport."""
+
+import hashlib
+import json
+from dataclasses import replace
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.protocol.messages import (
+    MAX_PART,
+    TAG_BYTES,
+    Heartbeat,
+    HelloRequest,
+    Result,
+    ResultBatch,
+    UploadPart,
+)
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.storage.journal import Journal
+from tests.support.samples import SPEC
+
+A, B = "a/00000001", "b/00000002"
+DRIVES = 2
+SETTINGS = RunSettings(
+    SPEC, ControllerShape(1), 2, 1, 0.1, "diagonal", 1, evaluate_every=0, evaluation_episodes=1, collect_every=1,
+    collect_episodes=DRIVES,
+)  # fmt: skip
+
+
+class Bench:
+    """A run in a folder, driven by hand; time stands still unless it is moved."""
+
+    strict = False
+    host_class = None  # of both workers; `None`: they know nothing of classes
+
+    def __init__(self, path, bundle, settings=SETTINGS, generations=1):
+        self.path, self.now = path, 0.0
+        self.settings, self.limits = settings, LimitsConfig(generations=generations)
+        path.mkdir(parents=True)
+        self.journal = Journal.create(path, settings, bundle)
+        self.begin()
+
+    def begin(self):
+        self.run = Run(self.journal, self.settings, self.limits, Fleet(1.0), self.now, strict=self.strict)
+        self.run.advance(self.now)
+        self.run.commit()
+        for name in (A, B):
+            self.run.worker_protocol.admit(self.request(name), self.now)
+            self.handle_heartbeat(name)
+
+    def request(self, name):
+        return HelloRequest(2, 2, "0", name, (SPEC.task,), "f", 1)
+
+    def restart(self):
+        """Killed: what was not committed never was."""
+        self.journal.close()
+        self.journal = Journal(self.path / "journal.sqlite")
+        self.begin()
+
+    def handle_heartbeat(self, name, unacked=(), host_class=None):
+        if (member := self.run.fleet.members.get(name)) is None:
+            return
+        head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "drawn_by": "-",
+                "numbering": member.numbering}  # fmt: skip
+        tags = tuple(digest[:TAG_BYTES] for digest in unacked)
+        self.run.worker_protocol.handle_heartbeat(
+            name,
+            Heartbeat(**head, seen=member.number, capacity=4, slots=4, queued=(), running=(), unacked=tags, load=0.0,
+                 steps_per_second=0.0, host_class=host_class),
+            self.now,
+        )  # fmt: skip
+
+    def deliver(self, name, result):
+        batch = ResultBatch(
+            run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,), host_class=self.host_class
+        )
+        self.run.worker_protocol.handle_results(name, batch, self.now)
+        self.run.advance(self.now)
+        self.run.commit()
+
+    def answer(self, result):
+        """From one of those that hold the job."""
+        wanted = self.run.fleet.jobs.get(result.digest)
+        self.deliver(min(wanted.holders, default=A) if wanted else A, result)
+
+    def upload(self, name, part):
+        self.run.worker_protocol.upload(name, part, self.now)
+
+    def parts(self, job):
+        data = drive_of(job)
+        return [
+            UploadPart(
+                run_uid=self.run.uid, incarnation=1, digest=job.digest, sha256=hashlib.sha256(data).digest(),
+                offset=offset, total=len(data), data=data[offset : offset + MAX_PART],
+            )
+            for offset in range(0, len(data), MAX_PART)
+        ]  # fmt: skip
+
+    def verdicts(self):
+        sends = self.run.fleet.dispatch(self.now)
+        return [(send.identity, each.digest, each.verdict) for send in sends for each in send.content.verdicts]
+
+    def reach_collection(self):
+        """Score the only generation; the jobs that collect, and who holds each."""
+        while not self.run.fleet.drain_background:
+            for send in self.run.fleet.dispatch(self.now):
+                for work in send.content.work:
+                    self.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
+        return self.collecting()
+
+    def collecting(self):
+        given = {}
+        for send in self.run.fleet.dispatch(self.now):
+            given.update({work.job.episode: (send.identity, work.job) for work in send.content.work})
+        return [given[episode] for episode in sorted(given)]
+
+    def kept(self):
+        with RunFolder(self.path) as folder:
+            return [path.read_bytes() for path in folder.rollouts()]
+
+
+def drive_of(job):
+    """Two parts and a bit, a pure function of the job."""
+    return hashlib.sha256(job.digest).digest() * (2 * MAX_PART // 32) + job.digest
+
+
+def result_of(job):
+    return Result(job.digest, 5.0, 10, 0.1, None, hashlib.sha256(drive_of(job)).digest())
+
+
+@pytest.fixture
+def bench(tmp_path, random_bundle):
+    made = Bench(tmp_path / "night", random_bundle.path)
+    yield made
+    made.journal.close()
+
+
+def test_a_death_between_the_jobs_and_the_commit_loses_no_bit(bench):
+    results = []
+    for send in bench.run.fleet.dispatch(bench.now):
+        for work in send.content.work:
+            results.append(Result(work.job.digest, float(work.job.candidate), 10, 0.1, None, None))
+            batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(results[-1],))
+            bench.run.worker_protocol.handle_results(send.identity, batch, bench.now)
+    assert bench.run.advance(bench.now)
+    early = bench.run.fleet.dispatch(bench.now, durable=False)
+    assert not any(send.content.verdicts for send in early)
+    opened = [work.vector for work in bench.run.generation.work]
+
+    bench.restart()
+    assert bench.run.generation.number == 0, "nothing was durable"
+    for result in results:  # without a verdict a worker says them again
+        bench.deliver(A, result)
+    assert [work.vector for work in bench.run.generation.work] == opened
+    assert {digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"} == {r.digest for r in results}
+
+
+def test_a_result_has_no_verdict_before_its_drive_is_on_disk(bench):
+    (name, job), _ = bench.reach_collection()
+    bench.verdicts()
+    bench.deliver(name, result_of(job))
+    assert bench.verdicts() == []
+    for part in bench.parts(job):
+        bench.upload(name, part)
+    assert bench.verdicts() == []
+    bench.deliver(name, result_of(job))
+    assert bench.verdicts() == [(name, job.digest, "accepted")]
+    assert bench.kept() == [drive_of(job)]
+    assert bench.run.background_jobs.rollout_collections.progress == (1, DRIVES)
+    bench.deliver(name, result_of(job))
+    assert bench.verdicts() == [(name, job.digest, "duplicate")]
+    assert len(bench.run.background_jobs.rollout_collections.uploads) == 0
+
+
+def test_the_end_waits_for_every_drive(bench):
+    jobs = bench.reach_collection()
+    for name, job in jobs:
+        assert bench.run.ended is None
+        for part in bench.parts(job):
+            bench.upload(name, part)
+        bench.deliver(name, result_of(job))
+    assert bench.run.ended == "1 generation"
+    assert bench.kept() == [drive_of(job) for _, job in jobs]
+
+
+def test_parts_of_a_job_that_nobody_gave_are_dropped_and_counted(bench):
+    (name, job), _ = bench.reach_collection()
+    part = bench.parts(job)[0]
+    for stranger, each in (("x/0badc0de", part), (name, replace(part, digest=b"x" * 32))):
+        bench.upload(stranger, each)
+    assert bench.run.worker_protocol.dropped == {"unwanted upload": 2}
+    assert len(bench.run.background_jobs.rollout_collections.uploads) == 0
+
+
+def test_a_drive_without_its_upload_is_an_error(bench):
+    (name, job), _ = bench.reach_collection()
+    bench.verdicts()
+    bench.deliver(name, replace(result_of(job), upload=None))
+    assert ("refused" in verdict for *_, verdict in bench.verdicts())
+    assert "not kept" in next(iter(bench.run.fleet.jobs.failures[0].errors.values()))
+
+
+def test_a_restart_in_mid_upload_asks_again_and_what_was_kept_stays(bench):
+    (name, job), (_, other) = bench.reach_collection()
+    for part in bench.parts(job):
+        bench.upload(name, part)
+    bench.deliver(name, result_of(job))
+    bench.upload(name, bench.parts(other)[0])
+    bench.restart()
+    assert bench.run.background_jobs.rollout_collections.progress == (1, DRIVES)
+    bench.handle_heartbeat(B, unacked=[other.digest])  # it was driven in the last life
+    for part in bench.parts(other):
+        bench.upload(B, part)
+    bench.deliver(B, result_of(other))
+    assert bench.run.ended is not None
+    assert bench.kept() == [drive_of(job), drive_of(other)]
+
+
+def fail(bench, name, digest, error):
+    bench.deliver(name, Result(digest, None, 0, 0.1, error, None))
+
+
+def test_a_pause_names_candidate_seed_every_worker_how_often_and_why(bench):
+    given = {send.identity: send.content.work for send in bench.run.worker_protocol.dispatch(bench.now)}
+    work = given[A][0]
+    seed, name = work.job.seeds[0], f"candidate 0/{work.job.candidate}"
+    fail(bench, A, work.job.digest, "boom")
+    assert bench.run.paused is None
+    bench.run.worker_protocol.dispatch(bench.now)
+    fail(bench, B, work.job.digest, "bang")
+    assert bench.run.paused.startswith(
+        f"{name}, seed {seed}, failed on two workers: {A} (once): boom; {B} (once): bang"
+    )
+    assert "dreamfleet resume" in bench.run.paused
+    assert f"paused: {bench.run.paused}" in bench.run.worker_protocol.take_notes()
+
+
+def test_a_pause_on_the_only_worker_speaks_of_one_worker_and_three_times(bench):
+    bench.run.worker_protocol.handle_departure(B, bench.now)
+    bench.now += 1
+    bench.run.worker_protocol.tick(bench.now)
+    digest = None
+    while bench.run.paused is None:
+        for send in bench.run.worker_protocol.dispatch(bench.now):
+            digest = digest or (send.content.work[0].job.digest if send.content.work else None)
+        fail(bench, A, digest, "boom")
+    assert f"failed on one worker: {A} (3 times): boom" in bench.run.paused
+    assert "two workers" not in bench.run.paused
+
+
+STEPS = st.one_of(
+    st.tuples(st.just("part"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1), st.integers(0, 2)),
+    st.tuples(st.just("spoilt"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1), st.integers(0, 2)),
+    st.tuples(st.just("result"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1)),
+    st.tuples(st.just("adopt"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1)),
+    st.tuples(st.just("wait"), st.floats(0.1, 90.0)),
+    st.tuples(st.just("restart")),
+)
+
+
+@pytest.mark.slow
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(steps=st.lists(STEPS, max_size=40))
+def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_once(
+    tmp_path_factory, random_bundle, steps
+):
+    bench = Bench(tmp_path_factory.mktemp("run") / "night", random_bundle.path)
+    given = bench.reach_collection()
+    jobs = [job for _, job in given]
+    accepted = []
+    for kind, *what in steps:
+        if kind in ("part", "spoilt"):
+            part = bench.parts(jobs[what[1]])[what[2]]
+            bench.upload(what[0], part if kind == "part" else replace(part, data=bytes(len(part.data))))
+        elif kind == "result":
+            bench.deliver(what[0], result_of(jobs[what[1]]))
+        elif kind == "adopt":
+            bench.handle_heartbeat(what[0], unacked=[jobs[what[1]].digest])
+        elif kind == "wait":
+            bench.now += what[0]
+            bench.run.worker_protocol.tick(bench.now)
+            bench.run.advance(bench.now)
+            bench.run.commit()
+        elif kind == "restart" and bench.run.ended is None:
+            bench.restart()
+        accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
+        whole = {drive_of(job) for job in jobs}
+        assert set(bench.kept()) <= whole, "what counts is whole"
+        assert len(bench.kept()) == bench.run.background_jobs.rollout_collections.progress[0]
+    for name, job in given:  # two rounds that come through: a spoilt part ends the first
+        for _ in range(2):
+            bench.handle_heartbeat(name, unacked=[job.digest])
+            for part in bench.parts(job):
+                bench.upload(name, part)
+            bench.deliver(name, result_of(job))
+        accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
+    assert bench.kept() == [drive_of(job) for job in jobs]
+    assert len(accepted) == len(set(accepted))
+    assert bench.run.ended is not None
+    bench.journal.close()
+
+
+def test_a_run_whose_population_is_one_point_ends_and_says_so(tmp_path, random_bundle):
+    """Where all fitness is equal the step size falls until nothing is left to learn; later it would underflow."""
+    settings = replace(SETTINGS, population=4, collect_every=0, sigma0=1e-30)
+    bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=0)
+    for _ in range(2):
+        while bench.run.ended is None:
+            for send in bench.run.fleet.dispatch(bench.now):
+                for work in send.content.work:
+                    bench.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
+        assert bench.run.ended.startswith("converged: generation ")
+        closed = len(bench.run.history)
+        bench.restart()
+        assert len(bench.run.history) == closed
+        assert bench.run.ended
+
+
+def test_a_limit_that_was_reached_stays_reached_when_the_last_evaluation_says_otherwise(tmp_path, random_bundle):
+    """`--parted` looks at the latest evaluations: the one that the end itself called for may be better again."""
+    settings = replace(SETTINGS, collect_every=0, evaluate_every=1, evaluation_episodes=4, confirm_episodes=8)
+    bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=0)
+    bench.limits = LimitsConfig(parted=1)
+    bench.restart()
+    level = {0: 9.0, 1: 1.0}
+
+    def step():
+        for send in bench.run.fleet.dispatch(bench.now):
+            for work in send.content.work:
+                noise = work.job.digest[0] / 1000
+                fitness = level.get(work.job.generation, 9.0) + noise if work.job.kind == "evaluate" else noise
+                bench.deliver(send.identity, Result(work.job.digest, fitness, 10, 0.1, None, None))
+
+    while bench.journal.fact("ending") is None:
+        step()
+    (ending, _), closed = json.loads(bench.journal.fact("ending")), len(bench.run.history)
+    assert "fell behind" in ending
+    bench.restart()
+    while bench.run.ended is None:
+        step()
+    assert (bench.run.ended, len(bench.run.history)) == (ending, closed)

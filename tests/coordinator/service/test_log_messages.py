@@ -1,0 +1,40 @@
+"""What a coordinator's log says of a run."""
+
+import dataclasses
+import socket
+from datetime import UTC, datetime, timedelta
+
+from dreamfleet.common.monitoring.status import Throughput
+from dreamfleet.common.security.credentials import Credentials
+from dreamfleet.common.transport.network import Network
+from dreamfleet.coordinator.service.log_messages import summary, worker_command
+from tests.support.samples import STATUS
+
+
+def test_one_line_tells_generation_score_speed_workers_and_what_is_left():
+    status = dataclasses.replace(STATUS, limits={"minutes": 30.0}, throughput=Throughput(987.5, 448000, 1080.0))
+    text, facts = summary(status)
+    assert text == (
+        "running, generation 7 (3/8 episodes), best mean 120.5 ± 7.6, 988 steps/s, 1 worker with 8 slots, "
+        "18 of 30 minutes, 12 s a generation, about 12 min to go"
+    )
+    assert (facts["event"], facts["generation"], facts["workers"]) == ("summary", 7, 1)
+    assert "nothing evaluated yet" in summary(dataclasses.replace(STATUS, best=None))[0]
+
+
+def test_the_command_names_an_address_that_others_reach():
+    assert worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night", "car-racing") == (
+        "dreamfleet worker --run night --connect tcp/127.0.0.1:7447"
+    )
+    everywhere = worker_command(Network(listen=("tcp/0.0.0.0:7448", "tcp/[::]:7449")), "night", "car-racing")
+    assert everywhere.endswith(f"--connect tcp/{socket.gethostname()}:7448 tcp/{socket.gethostname()}:7449")
+    own = worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night", "field:FieldTask")
+    assert own.endswith("--connect tcp/127.0.0.1:7447 --task field:FieldTask")
+    assert "--task" not in worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night", "gym:CartPole-v1")
+    assert "tcp/router:1" in worker_command(Network(connect=("tcp/router:1",)), "night", "car-racing")
+
+
+def test_in_a_fleet_with_join_files_the_workers_own_says_where():
+    credentials = Credentials("coordinator", 1, "home", datetime.now(UTC) + timedelta(days=90), "")
+    command = worker_command(Network(listen=("tls/0.0.0.0:7447",), credentials=credentials), "night", "car-racing")
+    assert command == "dreamfleet worker --run night --join FILE"

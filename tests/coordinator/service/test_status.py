@@ -1,0 +1,224 @@
+"""Snapshots of a run and the answers that are cut from them, without a transport."""
+
+import dataclasses
+import json
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.monitoring.status import PARTS, Population, WorkerStatus, read_document, read_status
+from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_OPTIONS, Result
+from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
+from dreamfleet.common.serialization.validation import from_plain
+from dreamfleet.coordinator.dispatch.event_log import EventLog
+from dreamfleet.coordinator.jobs.generation import CandidateScores
+from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.service import status_json
+from dreamfleet.coordinator.service.status import Snapshot, mark_left, take_snapshot
+from tests.coordinator.run.test_run import SETTINGS, A, Bench
+from tests.support.samples import CLOSED, STATUS
+
+SCORED = dataclasses.replace(SETTINGS, population=4, episodes=2, collect_every=0)
+
+
+@pytest.fixture
+def bench(tmp_path, random_bundle):
+    made = Bench(tmp_path / "night", random_bundle.path, SCORED, generations=3)
+    yield made
+    made.journal.close()
+
+
+def score(bench, count, fitness=lambda job: job.candidate + job.episode / 2):
+    """So many jobs, one after the other."""
+    while count:
+        for send in bench.run.worker_protocol.dispatch(bench.now):
+            bench.given = getattr(bench, "given", []) + [work.job for work in send.content.work]
+        job = bench.given.pop(0)
+        bench.answer(Result(job.digest, fitness(job), 10, 0.1, None, None))
+        count -= 1
+
+
+def snapshot_of(bench):
+    return take_snapshot(bench.run, "night", Counter(), 0.0, bench.now)
+
+
+def answered(snapshot, part="", **parameters):
+    return read_document(status_json.answer(snapshot, part, {name: str(value) for name, value in parameters.items()}))
+
+
+def test_every_candidate_of_the_open_and_of_the_last_generation_is_told(bench):
+    before = read_status(answered(snapshot_of(bench)))
+    assert before.population == Population(0, 0, 4, (0,) * 4, (2,) * 4, (None,) * 4)
+    assert before.last_population is None
+    score(bench, 3)
+    jobs = Counter(job.candidate for job in bench.given)
+    now = read_status(answered(snapshot_of(bench))).population.candidates
+    assert [each.done for each in now] == [2 - jobs[index] for index in range(4)]
+    assert [each.fitness is None for each in now] == [each.done == 0 for each in now]
+    score(bench, 5)
+    after = read_status(answered(snapshot_of(bench)))
+    assert after.last_population == Population(0, 0, 4, (2,) * 4, (2,) * 4, (0.25, 1.25, 2.25, 3.25))
+    assert (after.population.generation, after.generation.number, after.generations) == (1, 1, 1)
+    assert after.last == after.recent[-1]
+
+
+def test_a_restart_knows_the_last_generations_candidates_again(bench):
+    score(bench, 8)
+    before = snapshot_of(bench)
+    bench.restart()
+    after = snapshot_of(bench)
+    assert (after.last, after.status.last, after.candidate_scores) == (
+        before.last,
+        before.status.last,
+        before.candidate_scores,
+    )
+
+
+def rows(count):
+    return [dataclasses.replace(CLOSED, number=number, mean=-123.4567890123456 - number) for number in range(count)]
+
+
+def looks(count):
+    return tuple(StoredEvaluation(number, 16, 120.5 + number, 30.25) for number in range(count))
+
+
+def large(population, workers, generations, text="x"):
+    """A snapshot of an unusual run."""
+    candidate_scores = CandidateScores(
+        generations, [10_000] * population, [10_000] * population, [-123.45678901234567 + i for i in range(population)]
+    )
+    fleet = tuple(
+        dataclasses.replace(STATUS.worker_list[0], worker=f"a-rather-long-host-{i}/0a1b2c3d", fingerprint=text * 200)
+        for i in range(workers)
+    )
+    status = dataclasses.replace(
+        STATUS, why=text * 2000, failures=STATUS.failures * 3, worker_list=(), recent=(),
+        workers=dataclasses.replace(STATUS.workers, known=workers),
+    )  # fmt: skip
+    last = dataclasses.replace(candidate_scores, generation=generations - 1)
+    event_log = EventLog()
+    for number in range(3 * workers):
+        event_log.add(number / 10, "accepted", fleet[number % workers].worker)
+    told = History(rows(generations)).view(), looks(generations)
+    return Snapshot(status, fleet, *told, candidate_scores, last, None, event_log.view(), 1e6)
+
+
+@pytest.mark.parametrize(("population", "workers", "generations"), [(4, 1, 1), (100_000, 2000, 5000)])
+@pytest.mark.parametrize("text", ["x", "\N{SNOWMAN}", "\N{ROLLING ON THE FLOOR LAUGHING}"])
+def test_no_answer_is_longer_than_a_message_whatever_the_run(population, workers, generations, text):
+    snapshot = large(population, workers, generations, text)
+    longest = replace(snapshot.status.settings.task, options="x" * MAX_OPTIONS)
+    settings = replace(snapshot.status.settings, task=longest)
+    snapshot = replace(snapshot, status=replace(snapshot.status, settings=settings))
+    for part in PARTS:
+        payload = status_json.answer(snapshot, part, {})
+        assert len(payload) <= MAX_MESSAGE, part
+    status = read_status(answered(snapshot))
+    assert status.population.total == population
+    assert status.worker_list
+    assert status.recent[-1].number == generations - 1
+
+
+def collected(snapshot, part, column, **parameters):
+    found, offset, total = [], 0, 1
+    while offset < total:
+        document = answered(snapshot, part, offset=offset, **parameters)
+        total = document["total"]
+        found += document[column]
+        offset += len(document[column])
+    return found
+
+
+def test_pages_together_are_everything_and_come_from_the_same_moment():
+    snapshot = large(3000, 150, 250)
+    assert [each["worker"] for each in collected(snapshot, "workers", "workers")] == [
+        each.worker for each in snapshot.workers
+    ]
+    assert [from_plain(StoredGeneration, each) for each in collected(snapshot, "history", "history")] == rows(250)
+    told = collected(snapshot, "evaluations", "evaluations")
+    assert tuple(from_plain(StoredEvaluation, each) for each in told) == looks(250)
+    for candidate_scores in (snapshot.candidate_scores, snapshot.last):
+        asked = {"generation": candidate_scores.generation}
+        assert collected(snapshot, "candidates", "fitness", **asked) == candidate_scores.fitness
+        assert answered(snapshot, "candidates", **asked)["generation"] == candidate_scores.generation
+
+
+@pytest.mark.parametrize("damage", ["-1", "x", "1e9", "9" * 40, ""])
+def test_parameters_that_are_no_numbers_mean_the_beginning(damage):
+    snapshot = large(4, 1, 3)
+    for part in PARTS:
+        assert answered(snapshot, part, offset=damage, limit=damage) == answered(snapshot, part)
+
+
+class Rows(list):
+    """Counts every row that is looked at."""
+
+    touched = 0
+
+    def __getitem__(self, index):
+        found = super().__getitem__(index)
+        Rows.touched += len(found) if isinstance(index, slice) else 1
+        return found
+
+    def __iter__(self):
+        for row in super().__iter__():
+            Rows.touched += 1
+            yield row
+
+
+def touched(bench, generations):
+    """Rows of the history and of evaluations that a snapshot, an answer and the stop reason look at."""
+    bench.run.history.__init__(rows(generations))
+    evaluations = bench.run.background_jobs.evaluations
+    evaluations.__init__(
+        dataclasses.replace(STATUS.best, generation=number, mean=float(number % 7)) for number in range(generations)
+    )
+    bench.run.history._rows = Rows(bench.run.history._rows)
+    evaluations.rows, evaluations._bests = Rows(evaluations.rows), Rows(evaluations._bests)
+    bench.run.limits = dataclasses.replace(
+        bench.run.limits, generations=10**6, steps=10**12, minutes=1e6, target=1e6, parted=3
+    )
+    Rows.touched = 0
+    snapshot = snapshot_of(bench)
+    status_json.status(snapshot)
+    assert bench.run._stop_reason(bench.run.generation) is None
+    return Rows.touched
+
+
+def test_a_snapshot_costs_the_same_however_long_the_run_is(bench):
+    few, many = touched(bench, 100), touched(bench, 5000)
+    assert few == many
+    assert few < 100
+
+
+def test_the_best_answer_carries_the_controller_in_parts(bench):
+    assert answered(snapshot_of(bench), "best")["controller"] is None
+    score(bench, 8)
+    about = answered(snapshot_of(bench), "best")["controller"]
+    reported = bench.run.background_jobs.report.current.controller()
+    assert (about["sha256"], about["total"]) == (reported.sha256, len(reported.parameters))
+    assert about["provenance"]["generation"] == 0
+
+
+def test_a_run_that_is_left_open_says_so_and_one_that_ended_has_ended(bench):
+    assert mark_left(snapshot_of(bench)).status.state == "left"
+    while bench.run.ended is None:
+        score(bench, 1)
+    assert mark_left(snapshot_of(bench)).status.state == "ended"
+    assert json.loads(status_json.status(mark_left(snapshot_of(bench))))["why"] == "3 generations"
+
+
+def test_a_worker_is_told_with_the_time_of_a_job_its_round_trip_and_what_was_sent_again(bench):
+    first = snapshot_of(bench).workers[0]
+    assert (first.job_seconds, first.round_trip, first.resent) == (None, None, 0)
+    (send,) = [each for each in bench.run.worker_protocol.dispatch(0.0) if each.identity == A]
+    bench.now = 0.25
+    bench.handle_heartbeat(A)
+    assert snapshot_of(bench).workers[0].round_trip == 0.25
+    bench.answer(Result(send.content.work[0].job.digest, 1.0, 10, 0.1, None, None))
+    bench.run.worker_protocol.dispatch(bench.now)  # its verdict, which no beat shows as seen
+    bench.run.worker_protocol.dispatch(bench.now + 30.0)
+    told = snapshot_of(bench).workers[0]
+    assert (told.job_seconds, told.round_trip, told.resent) == (0.1, 0.25, 1)
+    assert WorkerStatus(**answered(snapshot_of(bench), "workers")["workers"][0]) == told

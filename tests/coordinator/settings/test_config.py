@@ -1,0 +1,323 @@
+import json
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.cli.config import load
+from dreamfleet.common.errors import ControllerError, DreamfleetError, UsageError
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.protocol.tasks import Description
+from dreamfleet.common.runs.lookup import find_subspace
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.coordinator.settings.config import RunConfig, config_values
+from dreamfleet.coordinator.settings.presets import PRESETS, find_preset
+from dreamfleet.coordinator.settings.start import StartPoint
+from dreamfleet.worker.tasks.api import Task
+from tests.support.bundles import states, write_random_bundle
+
+
+@pytest.mark.parametrize(
+    ("flags", "size"),
+    [
+        ({}, 867),
+        ({"features": "z"}, 99),
+        ({"controller": "hidden"}, 8 * 289 + 3 * 9),
+        ({"controller": "hidden", "hidden_units": 24, "features": "z"}, 867),  # as long as the linear one on z and h
+    ],
+)
+def test_a_runs_controller_is_as_configured_and_journalled(random_bundle, flags, size):
+    config = RunConfig(bundle=str(random_bundle.path), **flags)
+    settings = config.settings(random_bundle)
+    assert settings.controller.size == size
+    assert (settings.task.controller is None) == (not flags)
+    assert RunSettings.from_json(settings.to_json()) == settings
+    again = config_values(settings, random_bundle.path)
+    assert RunConfig(**again).settings(random_bundle) == settings
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_preset_of_a_run_is_one_that_can_begin_and_be_configured_again(name):
+    bundle = find_bundle("tiny")
+    preset = dict(PRESETS[name])
+    loaded_subspace = find_subspace(preset["subspace"]) if "subspace" in preset else None
+    settings = RunConfig(**preset, loaded_subspace=loaded_subspace).settings(bundle)
+    assert (
+        RunConfig(**config_values(settings, bundle.path), loaded_subspace=loaded_subspace).settings(bundle) == settings
+    )
+    assert RunSettings.from_json(settings.to_json()) == settings
+
+
+def test_heat_is_journalled_and_can_be_configured_again(random_bundle):
+    settings = RunConfig(heat=1.2, temperature=1.25).settings(random_bundle)
+    assert settings.heat == 1.2
+    assert RunSettings.from_json(settings.to_json()) == settings
+    assert RunConfig(**config_values(settings, random_bundle.path)).settings(random_bundle) == settings
+
+
+def test_a_default_controller_leaves_the_words_of_the_first_version(random_bundle):
+    text = json.loads(RunConfig().settings(random_bundle).to_json())
+    assert text["controller"] == {"features": 288, "actions": 3}
+    assert not {"features", "racing", "heat"} & text.keys()
+    assert "controller" not in text["task"]
+
+
+def test_jobs_of_other_controllers_have_other_digests(random_bundle):
+    plain = TaskSpec("car-racing", "ab" * 32, 10, 0)
+    other = TaskSpec("car-racing", "ab" * 32, 10, 0, random_bundle.shape_of("z", 24))
+    assert plain.digest("score", b"x", (1,)) != other.digest("score", b"x", (1,))
+    assert to_dict(other)["controller"] == {"features": 32, "actions": 3, "hidden": 24}
+
+
+def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured_again(tmp_path):
+    bundle = write_random_bundle(tmp_path / "b.zip", recorded=states(3))
+    settings = RunConfig(task="dream", recorded=0.5).settings(bundle)
+    assert (settings.task.recorded, settings.task.version, settings.task.options) == (0.5, 1, "")
+    assert RunSettings.from_json(settings.to_json()) == settings
+    assert RunConfig(**config_values(settings, bundle.path)).settings(bundle) == settings
+    plain = RunConfig(task="dream").settings(bundle)
+    assert "recorded" not in plain.to_json()
+    assert RunConfig(task="dream", recorded=0.0).settings(bundle) == plain
+    assert settings.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
+    assert settings.task.with_overrides(2.0, 100, 50).recorded == 0.5
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"task": "dream", "recorded": -0.1}, "--recorded must be from 0 to 1, not -0.1"),
+        ({"task": "dream", "recorded": 1.5}, "--recorded must be from 0 to 1, not 1.5"),
+        ({"recorded": 0.5}, "--recorded is of task dream, not of car-racing: leave it out, or say 0"),
+        ({"task": "gym:CartPole-v1", "recorded": 0.5}, "--recorded is of task dream, not of gym:CartPole-v1"),
+        ({"task": "dream", "recorded": 0.5}, "holds no recorded states that dreams could begin at: build it again"),
+    ],
+)
+def test_recorded_states_that_there_are_not_are_refused_in_one_line(random_bundle, changes, says):
+    with pytest.raises(DreamfleetError) as told:
+        RunConfig(**changes).settings(random_bundle)
+    assert says in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("texts", "options", "shape"),
+    [
+        (("pedals=one",), {"pedals": "one"}, (288, 2)),
+        (("pedals=one", "pedal_shift=0.25"), {"pedal_shift": 0.25, "pedals": "one"}, (288, 2)),
+        (("decide_every=4",), {"decide_every": 4}, (288, 3)),
+        (("feedback=last",), {"feedback": "last"}, (294, 3)),
+        (("feedback=last", "pedals=one"), {"feedback": "last", "pedals": "one"}, (292, 2)),
+        (("time_cost=1",), {"time_cost": 1.0}, (288, 3)),
+    ],
+)
+def test_a_variant_is_frozen_with_a_run_and_can_be_configured_again(random_bundle, texts, options, shape):
+    settings = RunConfig(variant=texts).settings(random_bundle)
+    assert json.loads(settings.task.options) == options
+    assert (settings.controller.features, settings.controller.actions) == shape
+    assert (settings.task.controller is None) == (shape == (288, 3))
+    assert RunSettings.from_json(settings.to_json()) == settings
+    assert RunConfig(**config_values(settings, random_bundle.path)).settings(random_bundle) == settings
+    plain = RunConfig().settings(random_bundle)
+    assert settings.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
+    assert RunConfig(variant=texts, task="dream").settings(random_bundle) if "time_cost=1" not in texts else True
+
+
+def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(random_bundle):
+    said = RunConfig(variant=("pedals=two", "decide_every=1", "feedback=none")).settings(random_bundle)
+    assert said.to_json() == RunConfig().settings(random_bundle).to_json()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (
+            {"variant": ("pedal=one",)},
+            "car-racing knows no option pedal: known are actions, pedals, pedal_shift, decide_every, ",
+        ),
+        ({"variant": ("pedals=three",)}, "pedals must be two, half or one, not 'three'"),
+        ({"variant": ("pedals",)}, "--variant 'pedals': write KEY=VALUE, such as pedals=one"),
+        ({"variant": ("pedals=one", "pedals=one")}, "a KEY stands there twice"),
+        ({"variant": ("time_cost=1",), "task": "dream"}, "time_cost is of candidates that drive"),
+        ({"variant": ("offroad_cost=2",), "task": "dream"}, "a dream knows of no lap and no road"),
+        ({"variant": ("pedals=one",), "task": "tests.support.tasks:Toy"}, "has no variants: car-racing has"),
+        ({"task_options": '{"pedals": "one"}'}, "--task-options are of tasks without a world model"),
+    ],
+)
+def test_a_variant_that_there_is_not_is_refused_in_one_line(random_bundle, changes, says):
+    with pytest.raises(UsageError) as told:
+        RunConfig(**changes).settings(random_bundle)
+    assert says in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_a_start_that_drives_otherwise_is_refused_and_one_that_pays_otherwise_is_not(random_bundle):
+    one_pedal = StartPoint(np.zeros(578), random_bundle.sha256, "run night", '{"pedals": "one"}')
+    one_pedal.check(RunConfig(variant=("pedals=one", "time_cost=1")).settings(random_bundle))
+    for variant in ((), ("pedals=one", "decide_every=4")):
+        with pytest.raises(ControllerError, match=r'run night drives with {"pedals": "one"}, this .* --variant out'):
+            one_pedal.check(RunConfig(variant=variant).settings(random_bundle))
+    with pytest.raises(ControllerError, match="drives the plain way"):
+        StartPoint(np.zeros(867), random_bundle.sha256, "run night").check(
+            RunConfig(variant=("decide_every=4",)).settings(random_bundle)
+        )
+    assert one_pedal.apply_to(RunConfig()).settings(random_bundle).task.options == one_pedal.options
+
+
+HALF, HELD = '{"pedals": "half"}', '{"decide_every": 2, "pedals": "half"}'
+
+
+@pytest.mark.parametrize(
+    ("texts", "options"),
+    [
+        ((), HALF),
+        (("decide_every=2",), HELD),
+        (("pedals=two",), ""),
+        (("pedals=one",), '{"pedals": "one"}'),
+    ],
+)
+def test_what_is_said_of_a_variant_is_stronger_than_the_presets_name_by_name(random_bundle, texts, options):
+    found = load(RunConfig, "run", file={"run": {"preset": "article", "variant": list(texts)}}, preset=find_preset)
+    assert found.settings(random_bundle).task.options == options
+
+
+def test_a_presets_variant_is_no_matter_of_worlds_without_a_world_model():
+    found = load(RunConfig, "run", file={"run": {"preset": "article", "task": "gym:CartPole-v1"}}, preset=find_preset)
+    assert found.settings(None).task == RunConfig(task="gym:CartPole-v1").settings(None).task
+
+
+@pytest.mark.parametrize(
+    ("own", "texts", "options"),
+    [
+        ("", (), ""),
+        (HALF, (), HALF),
+        (HALF, ("time_cost=1",), '{"pedals": "half", "time_cost": 1.0}'),
+        ('{"decide_every": 2, "time_cost": 1.0}', (), '{"decide_every": 2, "time_cost": 1.0}'),
+        ('{"decide_every": 2, "time_cost": 1.0}', ("offroad_cost=2",), '{"decide_every": 2, "offroad_cost": 2.0}'),
+    ],
+)
+def test_a_start_keeps_its_way_of_driving_whatever_a_preset_does(random_bundle, own, texts, options):
+    config = RunConfig(preset="article", variant=texts, preset_variant=("pedals=half",))
+    start = StartPoint(np.zeros(867), random_bundle.sha256, "run night", own)
+    settings = start.apply_to(config).settings(random_bundle)
+    start.check(settings)
+    assert settings.task.options == options
+
+
+def test_a_start_of_another_length_is_refused(random_bundle):
+    start = StartPoint(np.zeros(867), random_bundle.sha256, "run night")
+    start.check(RunConfig().settings(random_bundle))
+    with pytest.raises(ControllerError, match="867 parameters, this run's controllers 99"):
+        start.check(RunConfig(features="z").settings(random_bundle))
+
+
+@pytest.mark.parametrize("temperature", [0.0, -1.0, 5000.0, float("nan"), float("inf")])
+def test_a_temperature_that_a_journal_cannot_keep_is_refused(temperature):
+    with pytest.raises(UsageError, match=r"--temperature must be from 0\.001 to 1000"):
+        RunConfig(temperature=temperature)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"heat": 0.9}, "at least 1"),
+        ({"heat": float("nan")}, "at least 1"),
+        ({"heat": float("inf")}, "at least 1"),
+        ({"temperature": None}, "give it and --evaluate-every"),
+        ({"evaluate_every": 0}, "give it and --evaluate-every"),
+    ],
+)
+def test_heat_that_cannot_raise_a_temperature_is_refused(changes, says):
+    with pytest.raises(UsageError, match=says):
+        RunConfig(**{"heat": 1.2, "temperature": 1.25, "evaluate_every": 5, **changes})
+
+
+def test_a_hidden_layer_has_units():
+    with pytest.raises(UsageError, match="hidden-units"):
+        RunConfig(hidden_units=0)
+
+
+def test_an_optimiser_is_journalled_and_can_be_configured_again(random_bundle):
+    config = RunConfig(
+        optimiser="tests.support.optimisers:ParentsAndChildren", optimiser_options=("parents=2", ""), features="z"
+    )
+    settings = config.settings(random_bundle)
+    assert settings.optimiser_options == ("parents=2",)
+    assert RunSettings.from_json(settings.to_json()) == settings
+    assert RunConfig(**config_values(settings, random_bundle.path)).settings(random_bundle) == settings
+
+
+def test_a_run_that_says_nothing_of_optimisers_keeps_the_words_of_the_first_version(random_bundle):
+    text = json.loads(RunConfig().settings(random_bundle).to_json())
+    assert not {"optimiser", "optimiser_options"} & text.keys()
+    assert RunSettings.from_json(json.dumps(text)).optimiser == "cma"
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"optimiser": "cmea"}, "unknown optimiser 'cmea'"),
+        ({"optimiser": "cmaes-sep", "covariance": "full"}, "give --covariance diagonal"),
+        ({"optimiser_options": ("restarts=3",)}, "has no option 'restarts', it knows: covariance"),
+        ({"population": 2}, "at least 3 for 867 parameters"),
+    ],
+)
+def test_what_an_optimiser_cannot_do_is_refused_before_there_is_a_run(random_bundle, changes, says):
+    with pytest.raises(UsageError, match=says):
+        RunConfig(**changes).settings(random_bundle)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"horizon": 2_000_000}, "--horizon must be at most 1000000"),
+        ({"patience": 10**8}, "--patience must be at most"),
+        ({"seed": 10**20}, "--seed must be at most"),
+        ({"population": 10**11}, "--population must be at most 100000"),
+        ({"hidden_units": 10**12}, "--hidden-units must be at most"),
+        ({"sigma0": 1e300}, "at most 1e"),
+        ({"task": ""}, "cannot name a task"),
+        ({"task": "a b:x"}, "cannot name a task"),
+        ({"task": "car-racng"}, "did you mean car-racing"),
+        ({"task": "gymm:CartPole-v1"}, "did you mean gym:..."),
+    ],
+)
+def test_what_a_journal_cannot_hold_is_refused_before_there_is_one(changes, says):
+    with pytest.raises(UsageError, match=says):
+        RunConfig(**changes)
+
+
+class Field(Task):
+    """Needs no bundle, and says so."""
+
+    name = "field"
+
+    def describe(self, options):
+        return Description(2, 2)
+
+
+def test_a_task_that_describes_itself_needs_no_bundle(random_bundle):
+    config = RunConfig(task=f"{__name__}:Field")
+    assert config.needs_no_bundle
+    assert config.settings(None).task.bundle == ""
+    assert not RunConfig().needs_no_bundle
+    assert not RunConfig(task="dream").needs_no_bundle
+    assert not RunConfig(task="no.such.module:Task", bundle="tiny").needs_no_bundle
+    for unknown, says in {"moon": "unknown task 'moon'", "no.such.module:Task": "no module 'no'"}.items():
+        with pytest.raises(UsageError, match=f"{says}.*with --bundle"):
+            _ = RunConfig(task=unknown).needs_no_bundle
+    with pytest.raises(UsageError, match="without a world model"):
+        RunConfig(task="gym:CartPole-v1", bundle="tiny").settings(random_bundle)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"environment": ("x=1", "x=2")}, "stands there twice"),
+        ({"task_options": '{"normal": {"mean": [1], "deviation": [0]}}'}, "mean and a positive deviation of 4 numbers"),
+        ({"task_options": "{"}, "must be a JSON object"),
+    ],
+)
+def test_options_that_describe_no_world_are_refused(changes, says):
+    with pytest.raises(UsageError, match=says):
+        RunConfig(task="gym:CartPole-v1", **changes).settings(None)

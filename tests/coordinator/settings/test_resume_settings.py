@@ -1,0 +1,102 @@
+"""What a run keeps of how it was served."""
+
+import json
+
+import pytest
+
+from dreamfleet.common.cli.global_config import GlobalConfig
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.transport.network import DEFAULT_ENDPOINT
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.settings.resume_settings import (
+    choose_addresses,
+    resolve_strict,
+    serving_facts,
+    stored_limits,
+    stored_network,
+)
+from dreamfleet.coordinator.storage.journal import Journal
+
+HERE, THERE, FAR = "tcp/0.0.0.0:7610", "tcp/there:1", "tcp/far:2"
+
+
+@pytest.fixture
+def folder(tmp_path, random_bundle):
+    Journal.create(tmp_path, RunConfig().settings(random_bundle), random_bundle.path).close()
+    return tmp_path
+
+
+def keep(folder, facts):
+    journal = Journal(folder / "journal.sqlite")
+    for name, text in facts.items():
+        journal.set_fact(name, text)
+    journal.commit()
+    journal.close()
+
+
+def test_limits_and_network_come_back_as_they_were(folder):
+    limits, network = LimitsConfig(minutes=30.0, target=900.0), NetworkConfig((HERE,), (), 0.2, strict=True)
+    keep(folder, serving_facts(limits, network))
+    with RunFolder(folder) as run:
+        assert LimitsConfig(**stored_limits(run)) == limits
+        assert NetworkConfig(**stored_network(run)) == network
+
+
+@pytest.mark.parametrize(("kept", "strict"), [("{}", True), ('{"mixed": true}', False), ('{"strict": false}', False)])
+def test_a_run_from_before_runs_said_so_was_strict_unless_it_was_mixed_and_goes_on_so(folder, kept, strict):
+    with RunFolder(folder) as run:
+        assert (stored_limits(run), stored_network(run)) == ({}, {"strict": True})
+    keep(folder, {"network": kept})
+    with RunFolder(folder) as run:
+        assert stored_network(run) == {"strict": strict}
+
+
+def test_mixed_loosens_a_strict_run_unless_strict_is_said_beside_it():
+    asked = NetworkConfig(strict=True, mixed=True)
+    assert resolve_strict(asked, said=False) == NetworkConfig()
+    assert resolve_strict(asked, said=True) == NetworkConfig(strict=True)
+
+
+def test_defaults_are_not_written_but_whether_a_run_is_strict():
+    assert serving_facts(LimitsConfig(), NetworkConfig()) == {"limits": "{}", "network": '{"strict": false}'}
+
+
+@pytest.mark.parametrize("text", ["not JSON", "[]", '{"minutes": "many"}', json.dumps({"patience": 3})])
+def test_what_is_damaged_or_of_a_later_version_is_said(folder, text):
+    keep(folder, {"limits": text})
+    with RunFolder(folder) as run, pytest.raises(JournalError, match="the limits kept with run"):
+        stored_limits(run)
+
+
+@pytest.mark.parametrize("target", [float("nan"), float("inf")])
+def test_a_target_that_cannot_be_kept_is_refused(target):
+    with pytest.raises(UsageError, match="--target must be a number"):
+        LimitsConfig(target=target)
+
+
+@pytest.mark.parametrize(
+    ("own", "site", "kept", "addresses"),
+    [
+        ({}, {}, {}, ((DEFAULT_ENDPOINT,), ())),
+        ({}, {}, {"listen": (HERE,)}, ((HERE,), ())),
+        ({}, {}, {"connect": (THERE,)}, ((), (THERE,))),
+        ({"listen": (FAR,)}, {}, {"listen": (HERE,), "connect": (THERE,)}, ((FAR,), ())),
+        ({"connect": (FAR,)}, {}, {"listen": (HERE,)}, ((), (FAR,))),
+        ({"listen": (HERE,), "connect": (THERE,)}, {}, {}, ((HERE,), (THERE,))),
+        # One file for the whole fleet: the coordinator listens, and does not connect to itself.
+        ({}, {"listen": (HERE,), "connect": (THERE,)}, {}, ((HERE,), ())),
+        ({}, {"connect": (THERE,)}, {}, ((), (THERE,))),
+        ({"listen": (HERE,)}, {"connect": (THERE,)}, {}, ((HERE,), ())),
+    ],
+)
+def test_addresses_are_as_told_else_as_kept_else_this_host_alone(own, site, kept, addresses):
+    chosen = choose_addresses(NetworkConfig(**own), GlobalConfig(**site), kept)
+    assert (chosen.listen, chosen.connect) == addresses
+
+
+def test_where_everybody_connects_to_does_not_say_where_a_run_listened():
+    kept = {"listen": (HERE,)}
+    assert choose_addresses(NetworkConfig(), GlobalConfig(connect=(THERE,)), kept).listen == (HERE,)
+    assert choose_addresses(NetworkConfig(), GlobalConfig(connect=(THERE,)), {}).connect == (THERE,)
+    assert choose_addresses(NetworkConfig(connect=(FAR,)), GlobalConfig(), kept).listen == ()

@@ -1,0 +1,201 @@
+"""The receipt in a reported controller: drawn up from the journal, and enough to begin the run again."""
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.runs.effort import START_EFFORT, Effort
+from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+from dreamfleet.common.runs.run_folder import CONTROLLER
+from dreamfleet.common.runs.run_provenance import read_run_provenance, read_run_settings
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.settings.rerun import Rerun
+from dreamfleet.coordinator.settings.resume_settings import serving_facts
+from dreamfleet.coordinator.settings.start import StartPoint, find_start
+from dreamfleet.coordinator.storage.journal import Journal
+from tests.coordinator.run.test_report import EVALUATED, Reporting
+
+
+class Spending(Reporting):
+    """Each result took a tenth of a second and ten steps."""
+
+    start = None
+
+    def begin(self):
+        if self.start is not None:
+            for name, text in {**self.start.facts, **serving_facts(self.limits, NetworkConfig())}.items():
+                self.journal.set_fact(name, text)
+            self.journal.commit()
+        super().begin()
+
+    def end(self):
+        while self.run.ended is None:
+            self.step()
+        return Controller.load(self.path / CONTROLLER)
+
+
+@pytest.fixture
+def make(tmp_path, random_bundle):
+    made = []
+
+    def begin(start=None, **changes):
+        kind = type("One", (Spending,), {"start": start})
+        settings = replace(EVALUATED, **changes)
+        made.append(kind(tmp_path / "runs" / f"night-{len(made)}", random_bundle.path, settings, 4))
+        return made[-1]
+
+    yield begin
+    for each in made:
+        each.journal.close()
+
+
+def test_it_tells_generations_effort_fingerprint_versions_and_seeds(make):
+    bench = make()
+    receipt = read_run_provenance(bench.end())
+    settings = bench.settings
+    scored = 4 * settings.population * settings.episodes
+    assert receipt.generations == 4
+    assert receipt.effort == Effort(10 * scored, 10 * 2 * 2, 0, 100_000 * (scored + 4))
+    assert (receipt.fingerprint, receipt.mixed, receipt.start) == ("f", False, None)
+    assert {"dreamfleet", "numpy", "cma", "python"} <= receipt.versions.keys()
+    assert receipt.seeds == {"evaluation": (20_000, 2)}
+    assert read_run_settings(bench.saved()) == settings
+
+
+def test_effort_is_counted_on_as_it_would_be_summed_up(make):
+    bench = make()
+    before = bench.journal.effort
+    bench.step()
+    bench.run.commit()
+    assert bench.journal.effort == before + Effort(10, 0, 0, 100_000)
+    again = Journal(bench.path / "journal.sqlite")
+    assert again.effort == bench.journal.effort
+    again.close()
+
+
+def test_a_start_is_in_it_whole_with_what_had_been_spent(make, tmp_path):
+    size = EVALUATED.controller.size
+    start = StartPoint(np.linspace(0, 1, size), EVALUATED.task.bundle, "controller a", "", Effort(5, 6, 7, 8))
+    bench = make(start)
+    found = read_run_provenance(bench.end())
+    assert np.array_equal(found.start.vector, start.mean)
+    assert (found.start.source, found.start.effort, found.mixed) == ("controller a", start.effort, False)
+    assert found.total == start.effort + found.effort
+    follower = find_start(str(bench.path / CONTROLLER), tmp_path)
+    assert follower.effort == found.total
+    assert json.loads(follower.facts[START_EFFORT])["driven"] == found.total.driven
+
+
+def test_a_start_of_unknown_origin_has_no_effort(tmp_path, random_bundle):
+    shape = random_bundle.controller_shape
+    Controller(shape, np.zeros(shape.size, np.float32), "dream", random_bundle.sha256).save(tmp_path / "a.npz")
+    start = find_start(str(tmp_path / "a.npz"), tmp_path)
+    assert start.effort is None
+    assert START_EFFORT not in start.facts
+
+
+def test_what_ships_can_be_begun_again_as_it_was(tmp_path):
+    controller, _ = find_controller("tiny", tmp_path)
+    bundle = find_bundle_of(controller, None)
+    again = Rerun.of(controller, bundle)
+    config, kept = again.plan(tmp_path / "tiny-again")
+    assert config.settings(bundle) == read_run_settings(controller)
+    assert (again.limits, again.start, kept) == (LimitsConfig(generations=25), None, {})
+    assert "is not known" in again.expected_difference  # it is from before receipts
+
+
+def test_another_run_is_not_gone_on_with_and_another_version_is_named(tmp_path, random_bundle):
+    controller, settings = begun(random_bundle, population=6), RunConfig(population=5).settings(random_bundle)
+    folder = tmp_path / "other"
+    folder.mkdir()
+    Journal.create(folder, settings, random_bundle.path).close()
+    again = Rerun.of(controller, random_bundle)
+    with pytest.raises(UsageError, match="run other exists and is another one"):
+        again.plan(folder)
+    strange = replace(again, settings=replace(again.settings, packages=("rocks",)))
+    with pytest.raises(UsageError, match=r"packages would differ\): install dreamfleet as it was"):
+        strange.plan(tmp_path / "new")
+
+
+def test_a_run_is_neither_compared_with_itself_nor_with_one_that_began_elsewhere(make):
+    first = make()
+    again = Rerun.of(first.end(), None)
+    with pytest.raises(UsageError, match="is the one that the controller came from"):
+        again.plan(first.path)
+    same = make()
+    assert again.plan(same.path)[0] is None
+    size = first.settings.controller.size
+    other = make(StartPoint(np.ones(size), first.settings.task.bundle, "elsewhere"))
+    with pytest.raises(UsageError, match="exists and is another one"):
+        again.plan(other.path)
+
+
+def begun(bundle, **changes):
+    """A controller of a run that has just begun."""
+    settings = RunConfig(**changes).settings(bundle)
+    told = {"settings": asdict(settings), "generation": 0, "steps": 10}
+    still = np.zeros(settings.controller.size, np.float32)
+    return Controller(settings.controller, still, settings.task.task, bundle.sha256, told)
+
+
+def test_a_run_that_closed_nothing_cannot_be_repeated(random_bundle):
+    controller = begun(random_bundle)
+    told = {**controller.provenance, "receipt": {"generations": 0, "effort": {}}}
+    with pytest.raises(ControllerError, match="closed no generation"):
+        Rerun.of(replace(controller, provenance=told), random_bundle)
+
+
+def test_no_file_chooses_what_is_imported(random_bundle):
+    again = Rerun.of(begun(random_bundle), random_bundle)
+    again.check_optimiser(None)
+    strange = replace(again, settings=replace(again.settings, optimiser="os:abort"))
+    with pytest.raises(UsageError, match="if you trust that module, say --optimiser os:abort"):
+        strange.check_optimiser(None)
+    strange.check_optimiser("os:abort")
+
+
+def test_why_a_second_time_differs_is_said_as_far_as_it_is_known(make):
+    first, second = make(), make(seed=2)
+    controller = first.end()
+    second.end()
+    again = Rerun.of(controller, None)
+    assert again.compare(first.path).same
+    found = again.compare(second.path)
+    assert (found.same, found.why) == (False, "hosts and versions are equal")
+    for changes, says in (
+        ({"mixed": True}, "hosts of several classes"),
+        ({"fingerprint": None}, "names no fingerprint"),
+        ({"fingerprint": "g"}, "now [f]"),
+        ({"versions": {"cma": "1"}}, "cma 1, now"),
+    ):
+        other = replace(again, receipt=replace(again.receipt, **changes))
+        assert says in other.compare(second.path).summary
+    with pytest.raises(ControllerError):
+        again.compare(first.path.parent)
+
+
+def test_whether_hosts_of_the_second_time_are_of_the_first_ones_class_is_said(make):
+    first, second = make(), make(seed=2)
+    first.host_class, second.host_class = "a" * 16, "b" * 16
+    controller = first.end()
+    second.end()
+    assert read_run_provenance(controller).classes.description == "one class: to the bit"
+    again = Rerun.of(controller, None)
+    assert again.compare(first.path).summary.endswith("on hosts of the same class")
+    assert f"of class {'a' * 16}, these are of {'b' * 16}" in again.compare(second.path).summary
+
+
+def test_a_result_is_counted_once_whoever_says_it_again(make):
+    bench = make()
+    for send in bench.run.worker_protocol.dispatch(bench.now):
+        bench.given += [work.job for work in send.content.work]
+    job = bench.given.pop(0)
+    before = bench.journal.effort
+    for _ in range(2):
+        bench.deliver("a/00000001", Result(job.digest, 1.0, 10, 0.1, None, None))
+    assert bench.journal.effort == before + Effort(10, 0, 0, 100_000)

@@ -1,0 +1,191 @@
+"""A schedule as people write it: what it may say, and what is wrong with it in one line."""
+
+import argparse
+
+import pytest
+
+from dreamfleet.common.cli.config import read_toml
+from dreamfleet.common.cli.global_config import ARRAYS, TABLES
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs.records import RunSettings, StageSettings
+from dreamfleet.common.runs.stages import stages_of
+from dreamfleet.coordinator.settings.config import RunConfig, config_values
+from dreamfleet.coordinator.settings.run_setup import _with_stages
+from dreamfleet.coordinator.settings.schedule import find_schedule, remaining_settings
+
+WHOLE = """
+[[stage]]
+generations = 60
+steps = 3000000
+score = 880.0
+horizon = 400
+patience = 60
+episodes = 4
+population = 32
+sigma0 = 0.05
+racing = false
+
+[[stage]]
+horizon = 1000
+episodes = 16
+racing = true
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    def stages(text):
+        path = tmp_path / "stages.toml"
+        path.write_text(text)
+        return find_schedule(str(path), {})
+
+    return stages
+
+
+@pytest.fixture
+def settings(read, random_bundle):
+    return lambda text, **flags: RunConfig(stages=read(text), **flags).settings(random_bundle)
+
+
+def test_the_first_stage_is_what_the_run_begins_as(settings):
+    found = settings(WHOLE, population=10, horizon=700, seed=5)
+    assert (found.population, found.task.horizon, found.task.patience, found.sigma0) == (32, 400, 60, 0.05)
+    assert found.stages == (StageSettings(60, 3_000_000, 880.0), StageSettings(horizon=1000, episodes=16, racing=True))
+    assert [each.horizon for each in stages_of(found)] == [400, 1000]
+
+
+def test_what_the_first_stage_does_not_name_is_as_the_flags_say(settings):
+    found = settings("[[stage]]\nsteps = 5\n[[stage]]\nhorizon = 9\n", horizon=70, population=10)
+    assert [(each.horizon, each.population) for each in stages_of(found)] == [(70, 10), (9, 10)]
+
+
+def test_a_schedule_is_journalled_and_can_be_configured_again(settings, random_bundle):
+    found = settings(WHOLE)
+    assert RunSettings.from_json(found.to_json()) == found
+    assert RunConfig(**config_values(found, random_bundle.path)).settings(random_bundle) == found
+
+
+def test_one_stage_without_an_end_is_a_run_without_a_schedule(settings, random_bundle):
+    assert settings("[[stage]]\nhorizon = 70\n") == RunConfig(horizon=70).settings(random_bundle)
+    assert settings("[[stage]]\n") == RunConfig().settings(random_bundle)
+
+
+NEXT = "\n[[stage]]\nhorizon = 50\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "holds 0 stages, and a schedule has 1 to 32"),
+        ("stage = []", "holds 0 stages"),
+        ("[stage]\nhorizon = 3\n", r"stage must be tables, each written \[\[stage\]\]"),
+        ("[[stages]]\nhorizon = 3\n", "unknown key 'stages': did you mean 'stage'"),
+        ("[run]\nhorizon = 3\n", r"unknown table \[run\]"),
+        ("[[stage]]\nhorizont = 3\n", "unknown key 'horizont' in stage 1: did you mean 'horizon'"),
+        ("[[stage]]\nseed = 3\n", "unknown key 'seed' in stage 1"),
+        ("[[stage]]\nhorizon = 3.5\n", "horizon in stage 1 must be a whole number, not 3.5"),
+        ("[[stage]]\ngenerations = 0\n" + NEXT, "stage 1: generations must be from 1 to"),
+        ("[[stage]]\ngenerations = 9\n[[stage]]\nsteps = -1\n" + NEXT, "stage 2: steps must be from 1 to"),
+        ("[[stage]]\nscore = inf\n" + NEXT, "stage 1: score must be a number, not inf"),
+        ("[[stage]]\n" * 33, "holds 33 stages"),
+        ("[[stage", "cannot be read as TOML"),
+    ],
+)
+def test_what_no_schedule_can_be_is_one_line(read, text, told):
+    with pytest.raises(UsageError, match=told):
+        read(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[[stage]]\nhorizon = 3\n" + NEXT, "stage 1 never ends, and stage 2 would never begin"),
+        ("[[stage]]\ngenerations = 3\n[[stage]]\ngenerations = 3\n", "stage 2 is the last and names an end"),
+        ("[[stage]]\ngenerations = 3\n", "stage 1 is the last and names an end"),
+        (
+            "[[stage]]\ngenerations = 25\nscore = 1.0\n" + NEXT,
+            "stage 1 never ends by its score: an evaluation counts 25",
+        ),
+        (
+            "[[stage]]\ngenerations = 2\nsteps = 128001\n" + NEXT,
+            "stage 1 never ends by its steps: .* have 128000 at most",
+        ),
+        ("[[stage]]\ngenerations = 2\nhorizon = 0\n" + NEXT, "stage 1: --horizon must be at least 1, not 0"),
+        ("[[stage]]\ngenerations = 2\n" + NEXT + "sigma0 = 0.0\n", "stage 2: --sigma0 must be a positive number"),
+        ("[[stage]]\ngenerations = 2\n" + NEXT + "racing = true\nepisodes = 1\n", "stage 2: --racing needs at least 2"),
+        ("[[stage]]\ngenerations = 2\n" + NEXT + "population = 2\n", "stage 2: cma needs a population of at least 3"),
+    ],
+)
+def test_what_this_run_cannot_do_is_one_line(settings, text, told):
+    with pytest.raises(UsageError, match=told):
+        settings(text)
+
+
+def test_a_score_needs_evaluations(settings):
+    with pytest.raises(UsageError, match="stage 1 ends by the score of an evaluated mean: give --evaluate-every"):
+        settings("[[stage]]\nscore = 1.0\n" + NEXT, evaluate_every=0)
+
+
+def args(file=None, given=()):
+    return argparse.Namespace(sources={"file": file or {}}, given=frozenset(given))
+
+
+def test_stages_may_stand_in_the_configuration_file_beside_other_tables(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text("[run]\nhorizon = 500\n" + WHOLE + "\n[limits]\nminutes = 30\n")
+    file = read_toml(path, TABLES, arrays=ARRAYS)
+    assert [each.horizon for each in _with_stages(args(file), RunConfig()).stages] == [400, 1000]
+
+
+def test_a_schedule_of_its_own_is_stronger_than_the_configuration_file(tmp_path):
+    path = tmp_path / "stages.toml"
+    path.write_text("[[stage]]\nsteps = 5\n" + NEXT)
+    file = {"stage": [{"steps": 9}, {"horizon": 3}]}
+    assert _with_stages(args(file), RunConfig(schedule=str(path))).stages[0].steps == 5
+    assert _with_stages(args(file), RunConfig()).stages[0].steps == 9
+    assert _with_stages(args(file), RunConfig(schedule="none")).stages == ()
+
+
+def test_a_flag_that_the_first_stage_names_too_is_refused():
+    file = {"stage": [{"steps": 9, "horizon": 3}, {"horizon": 5}]}
+    with pytest.raises(UsageError, match="--horizon and horizon of stage 1 are the same setting"):
+        _with_stages(args(file, {"horizon"}), RunConfig(horizon=7))
+    assert _with_stages(args(file, {"patience"}), RunConfig(patience=7)).stages
+
+
+def test_what_remains_of_a_schedule_begins_with_the_stage_and_its_end(settings, random_bundle):
+    found = settings(WHOLE)
+    first, last = stages_of(found)
+    assert remaining_settings(found, first)["stages"] == found.stages
+    assert remaining_settings(found, last) == {
+        "horizon": 1000, "patience": 60, "episodes": 16, "population": 32, "sigma0": 0.05, "racing": True,
+        "driven": 0.0, "stages": (),
+    }  # fmt: skip
+    RunConfig(**{**config_values(found, random_bundle.path), **remaining_settings(found, last)}).settings(random_bundle)
+
+
+def test_a_share_that_is_driven_stays_a_share_whatever_the_episodes(settings):
+    text = "[[stage]]\ngenerations = 3\n[[stage]]\ndriven = 1\nepisodes = 4\nsteps = 9\n[[stage]]\nepisodes = 16\n"
+    found = stages_of(settings(text, task="dream"))
+    assert [each.driven_episodes for each in found] == [0, 4, 16]
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        ({"driven": 0.5}, "--driven is of task dream, not of car-racing"),
+        ({"task": "dream", "driven": 1.5}, "--driven must be from 0 to 1, not 1.5"),
+        ({"task": "dream", "driven": float("nan")}, "--driven must be from 0 to 1, not nan"),
+        ({"task": "dream", "driven": 0.1, "episodes": 4}, "--driven 0.1 of 4 episodes is none of them, or all"),
+        ({"task": "dream", "driven": 0.5, "episodes": 4, "racing": True}, "--racing compares all candidates"),
+    ],
+)
+def test_what_cannot_be_driven_is_said(flags, says):
+    with pytest.raises(UsageError, match=says.replace("(", "[(]")):
+        RunConfig(**flags)
+
+
+def test_a_later_stage_that_mixes_is_looked_at_as_the_first_is(settings):
+    text = "[[stage]]\ngenerations = 3\n[[stage]]\ndriven = 0.1\nepisodes = 4\n"
+    with pytest.raises(UsageError, match=r"stage 2: --driven 0\.1 of 4 episodes is none of them"):
+        settings(text, task="dream")

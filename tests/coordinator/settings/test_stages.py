@@ -1,0 +1,227 @@
+"""A run of several stages, against its journal, without a transport."""
+
+import argparse
+import io
+import random
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from dreamfleet.common.monitoring.status_panel import RunPanel
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.runs.records import StageSettings
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.scoring_params import scoring_params_of
+from dreamfleet.common.runs.stages import begun_stages
+from dreamfleet.coordinator.service.status import take_snapshot
+from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.verbs import fork
+from tests.coordinator.evaluated import EVERY, Evaluated
+from tests.coordinator.run.test_run import SETTINGS
+from tests.support.samples import SPEC
+
+GENERATIONS = 11
+STAGES = (
+    StageSettings(2),
+    StageSettings(score=500.0, horizon=400, patience=0, episodes=2, racing=True),
+    StageSettings(steps=150, population=8, horizon=600),
+    StageSettings(sigma0=0.05),
+)
+STAGED = replace(SETTINGS, population=6, evaluate_every=EVERY, evaluation_episodes=2, collect_every=0, stages=STAGES)
+REALITY = (900.0, 400.0, 510.0, 450.0, 350.0, 300.0, 300.0)  # of the means after generations 1, 3, 5, ...
+BEGUN = [0, 2, 8, 10]  # the score of generation 5's mean counts from generation 8 on, and 12 x 10 steps come twice
+SIZES = [6] * 8 + [8] * 4
+
+
+class Staged(Evaluated):
+    reality = REALITY
+
+    def outcome(self):
+        with RunFolder(self.path) as run:
+            numbers = [(number, index) for number in range(GENERATIONS) for index in range(SIZES[number])]
+            told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in numbers]
+            kept = [(each.episode, each.seed, each.fitness) for place in numbers for each in run.results(*place)]
+            begun = begun_stages(run.settings, run.history(), run.evaluations())
+            return told, kept, [each for each in run.evaluations() if each.generation % EVERY], begun
+
+
+@pytest.fixture
+def staged(tmp_path, random_bundle):
+    made = []
+
+    def make(name, generations=GENERATIONS, settings=STAGED):
+        made.append(Staged(tmp_path / name, random_bundle.path, settings, generations))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.journal.close()
+
+
+@pytest.fixture
+def undisturbed(staged):
+    bench = staged("undisturbed")
+    named = bench.drive(lambda _: 0)
+    assert (
+        list(named.values()) == [(None, None, None, None)] * 2 + [(None, 400, 0, None)] * 6 + [(None, 600, 0, None)] * 3
+    )
+    *_, begun = bench.outcome()
+    assert [each.since for each in begun] == BEGUN
+    return bench.outcome()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_killed_anywhere_it_comes_to_the_same_stages_and_gives_the_same_bits(staged, undisturbed, seed):
+    bench, chance = staged("night"), random.Random(seed)
+    bench.die_by(chance)
+    bench.drive(lambda bench: chance.randrange(len(bench.given)))
+    assert bench.run.incarnation > 10
+    assert bench.outcome() == undisturbed
+
+
+@pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep", "cmaes-lra"])
+def test_killed_as_each_generation_opens_every_optimiser_gives_the_same_bits(staged, optimiser):
+    settings = replace(STAGED, optimiser=optimiser)
+    calm, bench = staged("calm", settings=settings), staged("night", settings=settings)
+    calm.drive(lambda _: 0)
+    while bench.run.ended is None:
+        before = bench.run.generation.number
+        bench.fetch()
+        bench.finish(0)
+        if bench.run.generation.number > before and bench.run.ended is None:
+            bench.restart()
+            assert bench.run.generation.number == before + 1
+    assert bench.outcome() == calm.outcome()
+
+
+def test_a_run_that_ended_between_two_checks_and_goes_on_comes_to_the_same_stages(staged, undisturbed):
+    bench = staged("night", generations=5)
+    bench.drive(lambda _: 0)
+    bench.limits = LimitsConfig(generations=GENERATIONS)
+    bench.restart()
+    bench.drive(lambda _: 0)
+    assert bench.outcome() == undisturbed
+
+
+def test_a_generation_waits_for_the_check_that_may_end_its_stage_and_for_no_other(staged, undisturbed):
+    bench, waited = staged("night"), []
+    while bench.run.ended is None:
+        bench.fetch()
+        scored = bench.first("score")
+        if scored is None and bench.run.generation.complete:
+            assert bench.run.fleet.drain_background, "every slot may drive the check"
+            waited.append((bench.run.generation.number, {job.generation for job in bench.given}))
+        bench.finish(0 if scored is None else scored)
+    in_time = [(number, each) for number, each in waited if number < GENERATIONS - 1]
+    assert {number for number, _ in in_time} == {5, 7}, "of the stage that a score may end, and asked in it"
+    assert bench.outcome() == undisturbed
+
+
+def test_limits_count_over_the_whole_run(staged):
+    bench = staged("night")
+    bench.limits = LimitsConfig(steps=20 * 6)
+    bench.restart()
+    bench.drive(lambda _: 0)
+    assert bench.run.ended == f"{20 * 6} environment steps"
+    assert len(bench.run.history) == 2
+
+
+def test_the_log_says_when_a_stage_begins_and_why(staged):
+    bench = staged("night")
+    bench.drive(lambda _: 0)
+    said = [note for note in bench.run.fleet.notes if "stage" in note]
+    assert said == [
+        "generation 0 is in stage 1 of 4 (1000 steps, patience 100, 6 x 1 episode, a new search with step size 0.1)",
+        "stage 2 of 4 (400 steps, 6 x 2 episodes, racing, the search goes on) begins with generation 2 after "
+        "2 generations",
+        "stage 3 of 4 (600 steps, 8 x 2 episodes, racing, a new search with step size 0.1) begins with generation 8 "
+        "after the mean of generation 5 reached 510.5",
+        "stage 4 of 4 (600 steps, 8 x 2 episodes, racing, a new search with step size 0.05) begins with generation 10 "
+        "after 240 environment steps",
+    ]
+
+
+def test_the_status_says_which_stage_it_is_and_what_counts_there(staged):
+    bench, told = staged("night"), []
+    bench.drive(lambda _: 0, lambda: told.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
+    seen = {(each.generation.stage.number, each.generation.stage.since) for each in told}
+    assert seen == {(number, since) for number, since in enumerate(BEGUN, 1)}
+    stage = told[-1].generation.stage
+    assert (stage.total, stage.horizon, stage.patience, stage.population, stage.episodes) == (4, 600, 0, 8, 2)
+    console = Console(file=io.StringIO(), width=120)
+    console.print(RunPanel(told[-1]))
+    shown = console.file.getvalue()
+    assert "4 of 4, since generation 10" in shown
+    assert "600 steps" in shown
+    assert "8 x 2" in shown
+
+
+def test_a_search_that_begins_anew_begins_at_the_mean_and_draws_other_numbers(staged):
+    bench = staged("night", settings=replace(STAGED, stages=(StageSettings(1), StageSettings(sigma0=0.1))))
+    first = bench.run.generation
+    while bench.run.generation.number == 0:
+        bench.fetch()
+        bench.finish(0)
+    before = bench.run._generations.mean
+    assert bench.run.sigma == 0.1
+    assert {work.vector for work in first.work}.isdisjoint(work.vector for work in bench.run.generation.work)
+    bench.restart()
+    assert bench.run._generations.mean == before
+
+
+def test_a_kept_drive_is_driven_as_the_candidates_of_its_generation(staged):
+    bench = staged("night", settings=replace(STAGED, collect_every=1, collect_episodes=1), generations=3)
+    lives = {}, {}
+    while not bench.run.fleet.drain_background:
+        bench.fetch()
+        lives[0].update({job.generation: job for job in bench.given if job.kind == "collect"})
+        bench.given = [job for job in bench.given if job.kind != "collect"]
+        bench.finish(0)
+    bench.restart()
+    bench.fetch()
+    lives[1].update({job.generation: job for job in bench.given if job.kind == "collect"})
+    assert lives[0].items() <= lives[1].items()
+    kept = [lives[1][number] for number in range(3)]
+    assert [each.overrides for each in kept] == [(None, None, None, None)] * 2 + [(None, 400, 0, None)]
+    assert all(each.digest == each.spec(SPEC).digest("collect", each.vector, each.seeds) for each in kept)
+
+
+def test_a_result_is_bounded_by_the_horizon_of_its_own_stage(staged):
+    bench = staged("night", settings=replace(STAGED, stages=(StageSettings(1), StageSettings(horizon=2000))))
+    while bench.run.generation.number == 0:
+        bench.fetch()
+        bench.finish(0)
+    bench.fetch()
+    job = bench.given[bench.first("score")]
+    bench.answer(Result(job.digest, 1.0, 1500 * 1024, 0.1, None, None))
+    bench.restart()
+    assert bench.run.generation.done == 1, "no older version took it in"
+
+
+def forked(bench, monkeypatch, given=frozenset()):
+    served = []
+    monkeypatch.setattr(
+        "dreamfleet.coordinator.verbs.coordinator.serve_new_run", lambda _args, settings, *_: served.append(settings)
+    )
+    fork.run(argparse.Namespace(source="night", runs_dir=bench.path.parent, run_name=None, given=given))
+    return served[0]
+
+
+def test_a_fork_begins_with_the_stage_that_its_run_is_in_and_goes_on_with_the_others(staged, monkeypatch):
+    bench = staged("night", generations=4)
+    bench.drive(lambda _: 0)
+    with RunFolder(bench.path) as run:
+        assert scoring_params_of(run, 4).stage.number == 2
+    settings = forked(bench, monkeypatch)
+    assert settings["stages"] == (StageSettings(score=500.0), *STAGES[2:])
+    assert [settings[name] for name in ("horizon", "patience", "episodes", "racing")] == [400, 0, 2, True]
+    assert settings["sigma0"] == bench.run.sigma
+
+
+def test_a_fork_of_the_last_stage_has_no_schedule(staged, monkeypatch):
+    bench = staged("night")
+    bench.drive(lambda _: 0)
+    settings = forked(bench, monkeypatch)
+    assert settings["stages"] == ()
+    assert (settings["horizon"], settings["population"]) == (600, 8)

@@ -1,0 +1,151 @@
+"""A search that keeps to a subspace: it continues to the bit, and leaves it from where it came to."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.artifacts.subspace import SearchSpace, Subspace
+from dreamfleet.common.errors import ControllerError, JournalError, UsageError
+from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.records import RunSettings, StageSettings
+from dreamfleet.common.runs.run_provenance import RunProvenance
+from dreamfleet.common.runs.stages import stages_of
+from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.rerun import Rerun
+from dreamfleet.coordinator.settings.start import stored_subspace
+
+SHAPE = ControllerShape(9, 2)
+OPTIMISERS = [("cma", "diagonal"), ("cma", "full"), ("cmaes-sep", "diagonal"), ("cmaes-lra", "diagonal")]
+
+
+def few(inputs=9, bundle="ab" * 32):
+    random = np.random.default_rng(1)
+    return Subspace(random.normal(size=(2, inputs)).astype(np.float32), np.zeros(2, np.float32), ("a", "b"), bundle)
+
+
+def config(optimiser="cma", covariance="diagonal"):
+    return EvolutionConfig(SHAPE.size, 8, 0.3, covariance, 3, optimiser, (), SearchSpace(few(), SHAPE))
+
+
+def run(evolution, generations):
+    for generation in generations:
+        noise = np.random.default_rng(generation).normal(size=8)
+        evolution.tell(-((evolution.ask() - 1.0) ** 2).sum(axis=1) + 0.1 * noise)
+
+
+@pytest.mark.parametrize(("optimiser", "covariance"), OPTIMISERS)
+def test_it_keeps_to_the_subspace_and_continues_to_the_bit(optimiser, covariance):
+    start = np.random.default_rng(2).normal(size=SHAPE.size)
+    whole, first = (Evolution(config(optimiser, covariance), start) for _ in range(2))
+    run(whole, range(12))
+    run(first, range(5))
+    second = Evolution(config(optimiser, covariance))  # whoever continues a run does not know where its search began
+    second.restore(first.state().packed())
+    run(second, range(5, 12))
+    asked = whole.ask()
+    assert np.array_equal(second.ask(), asked)
+    assert np.array_equal(second.mean, whole.mean)
+    assert np.linalg.matrix_rank(asked - start, tol=1e-9) <= SearchSpace(few(), SHAPE).dimension == 6
+
+
+def test_a_state_without_its_origin_is_damaged():
+    other = Evolution(replace(config(), space=None, dimension=6))
+    with pytest.raises(JournalError, match=r"damaged .*origin of its subspace is not there"):
+        Evolution(config()).restore(other.state().packed())
+
+
+@pytest.mark.parametrize(
+    "origin", [np.full(SHAPE.size, "a"), np.full(SHAPE.size, np.nan), np.full(SHAPE.size, 1e300), np.zeros(3)]
+)
+def test_a_damaged_origin_is_the_journals_fault(origin):
+    checkpoint = Evolution(config()).state()
+    state = replace(checkpoint, head=replace(checkpoint.head, origin=origin)).packed()
+    with pytest.raises(JournalError, match="the journal's last state is damaged"):
+        Evolution(config()).restore(state)
+
+
+@pytest.fixture
+def settings(random_bundle):
+    subspace = few(random_bundle.controller_shape.features, random_bundle.sha256)
+
+    def made(**flags):
+        return RunConfig(loaded_subspace=subspace, **flags).settings(random_bundle), subspace
+
+    return made
+
+
+def test_it_is_frozen_by_its_hash_and_a_later_stage_leaves_it(settings):
+    found, subspace = settings(stages=(StageSettings(generations=2), StageSettings(whole=True, sigma0=0.01)))
+    assert found.subspace == subspace.sha256
+    assert RunSettings.from_json(found.to_json()) == found
+    first, second = stages_of(found)
+    assert (first.whole, second.whole, second.starts_new_search) == (False, True, True)
+    assert "in the subspace" in first.description
+    assert "subspace" not in second.description
+    assert EvolutionConfig.of(found, first, subspace).space is not None
+    assert EvolutionConfig.of(found, second, subspace).space is None
+
+
+@pytest.mark.parametrize(
+    ("stages", "why"),
+    [
+        ((StageSettings(whole=True),), "stage 1: whole is of a later stage"),
+        ((StageSettings(generations=2), StageSettings(whole=True)), "stage 2 leaves the subspace"),
+        (
+            (StageSettings(generations=2), StageSettings(whole=True, sigma0=0.1, generations=2),
+             StageSettings(whole=True, sigma0=0.1)),
+            "stage 3: the search is whole already",
+        ),
+    ],
+)  # fmt: skip
+def test_a_schedule_leaves_it_once(settings, stages, why):
+    with pytest.raises(UsageError, match=why):
+        settings(stages=stages)
+
+
+def test_without_one_there_is_nothing_to_leave(random_bundle):
+    stages = (StageSettings(generations=2), StageSettings(whole=True, sigma0=0.1))
+    with pytest.raises(UsageError, match="whole already"):
+        RunConfig(stages=stages).settings(random_bundle)
+
+
+def test_one_of_another_world_model_or_of_other_eyes_is_refused(random_bundle):
+    features = random_bundle.controller_shape.features
+    with pytest.raises(UsageError, match="is of world model abababababab"):
+        RunConfig(loaded_subspace=few(features)).settings(random_bundle)
+    with pytest.raises(UsageError, match=f"see {features - 1} numbers, .* and this run's see {features}"):
+        RunConfig(loaded_subspace=few(features - 1, random_bundle.sha256)).settings(random_bundle)
+    with pytest.raises(UsageError, match="without a world model"):
+        RunConfig(task="gym:CartPole-v1", loaded_subspace=few(4)).settings(None)
+
+
+def test_what_a_journal_kept_of_it_is_held_to_the_settings(settings, tmp_path):
+    found, subspace = settings()
+    assert stored_subspace(subspace.text, found, tmp_path).sha256 == subspace.sha256
+    assert stored_subspace(subspace.text, replace(found, subspace=""), tmp_path) is None
+    for damaged in (None, "", "{}", few().text):
+        with pytest.raises(JournalError, match=r"the subspace kept in .* is damaged"):
+            stored_subspace(damaged, found, tmp_path)
+
+
+def test_a_receipt_holds_it_whole():
+    assert RunProvenance(3, Effort(), subspace=few().text).subspace == few().text
+
+
+def test_a_receipt_of_another_subspace_than_its_settings_is_damaged(random_bundle):
+    subspace = few(random_bundle.controller_shape.features, random_bundle.sha256)
+    settings = RunConfig(loaded_subspace=subspace).settings(random_bundle)
+    controller = Controller(
+        settings.controller, np.zeros(settings.controller.size, np.float32), "car-racing", random_bundle.sha256
+    )
+    for kept in (None, few().text, "{}"):
+        again = Rerun(controller, random_bundle, settings, RunProvenance(1, Effort(), subspace=kept))
+        with pytest.raises(ControllerError, match=r"the subspace in the controller's receipt is damaged"):
+            again.plan(Path("nowhere") / "again")
+    again = Rerun(controller, random_bundle, settings, RunProvenance(1, Effort(), subspace=subspace.text))
+    config, _ = again.plan(Path("nowhere") / "again")
+    assert config.loaded_subspace.sha256 == subspace.sha256

@@ -1,0 +1,192 @@
+import sqlite3
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.runs.records import RunSettings, StoredGeneration
+from dreamfleet.common.runs.run_folder import RunFolder, open_run, run_lock
+from dreamfleet.coordinator.jobs.confirmation import Finalist
+from dreamfleet.coordinator.jobs.evaluation import Evaluation
+from dreamfleet.coordinator.jobs.generation import Generation
+from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.storage.journal import Journal
+from tests.support.samples import SPEC
+
+SETTINGS = RunSettings(SPEC, ControllerShape(1), 2, 1, 0.1, "diagonal", 1, 5, 2)
+VECTORS = [vector_bytes(np.full(6, value)) for value in (0.5, 1.5)]
+
+
+@pytest.fixture
+def folder(tmp_path, random_bundle):
+    path = tmp_path / "night"
+    path.mkdir()
+    Journal.create(path, SETTINGS, random_bundle.path).close()
+    return path
+
+
+@pytest.fixture
+def journal(folder):
+    opened = Journal(folder / "journal.sqlite")
+    yield opened
+    opened.close()
+
+
+def fill(journal):
+    """One generation, closed, and the next one opened."""
+    journal.open_generation(0, b"state 0", 0.1, [7], VECTORS)
+    generation = Generation(0, SPEC, VECTORS, [7])
+    for value, work in enumerate(generation.work):
+        result = Result(work.job.digest, float(value), 10, 0.5, None, None)
+        journal.add_result(work.job, result, "w/00000000", "f", 1)
+    journal.close_generation(StoredGeneration(0, 0.5, 0.5, 1.0, 0.0, 0.1, 20, 1.0), np.array([0.0, 1.0]))
+    journal.open_generation(1, b"state 1", 0.09, [8], VECTORS)
+    journal.commit()
+
+
+def test_it_gives_back_what_was_written(journal, folder):
+    fill(journal)
+    last = journal.last_generation()
+    assert (last.number, last.state, last.seeds, last.vectors) == (1, b"state 1", (8,), tuple(VECTORS))
+    with RunFolder(folder) as run:
+        assert run.settings == SETTINGS
+        assert np.array_equal(run.candidate(0, 1), np.full(6, 1.5, np.float32))
+        assert [run.fitness(0, 0), run.fitness(0, 1), run.fitness(1, 0)] == [0.0, 1.0, None]
+        assert [(each.seed, each.fitness) for each in run.results(0, 1)] == [(7, 1.0)]
+        assert [each.number for each in run.history()] == [0]
+
+
+def test_what_was_not_committed_never_happened(folder):
+    journal = Journal(folder / "journal.sqlite")
+    fill(journal)
+    journal.set_fact("fingerprint", "f")
+    journal.close()
+    with RunFolder(folder) as run:
+        assert run.fingerprint is None
+        assert len(run.history()) == 1
+
+
+def test_only_the_last_two_states_stay(journal):
+    for number in range(5):
+        journal.open_generation(number, b"s", 0.1, [number], VECTORS)
+    journal.commit()
+    count = journal._connection.execute("SELECT count(*) FROM strategy").fetchone()[0]
+    assert count == 2
+
+
+def test_incarnations_count(journal):
+    assert [journal.begin_incarnation(), journal.begin_incarnation()] == [1, 2]
+
+
+def test_evaluations_are_kept_until_finished(journal):
+    journal.schedule_evaluation(Evaluation(4, VECTORS[0], 2))
+    assert journal.pending_evaluations() == [Evaluation(4, VECTORS[0], 2)]
+    journal.finish_evaluation(4, 800.0, 10.0)
+    assert journal.pending_evaluations() == []
+    assert journal.evaluated_vector(4) == VECTORS[0]
+
+
+def test_finalists_are_the_best_means_each_once(journal):
+    vectors = [bytes([each]) * 8 for each in range(4)]
+    for generation, vector, mean in ((1, 0, 5.0), (2, 1, 7.0), (3, 1, 7.0), (4, 2, 7.0), (5, 3, 6.0)):
+        journal.schedule_evaluation(Evaluation(generation, vectors[vector], 2))
+        journal.finish_evaluation(generation, mean, 1.0)
+    assert [each.generation for each in journal.finalists(3)] == [2, 4, 5]
+    assert journal.finalists(1) == [Finalist(2, vectors[1], 2, 7.0)]
+
+
+def test_a_run_is_never_overwritten(folder, random_bundle):
+    with pytest.raises(JournalError, match=r"exists: choose another --run, or continue it with --resume"):
+        Journal.create(folder, SETTINGS, random_bundle.path)
+
+
+def damage_foreign(path):
+    path.unlink()
+    sqlite3.connect(path).execute("CREATE TABLE t (x)").connection.close()
+
+
+def damage_text(path):
+    path.write_text("this is no database, it is a text that is long enough to be mistaken for one" * 20)
+
+
+def damage_newer(path):
+    connection = sqlite3.connect(path)
+    connection.execute("PRAGMA user_version = 99")
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [(damage_foreign, "not a journal of dreamfleet"), (damage_text, "damaged|cannot be read|not a database"),
+     (damage_newer, "install a newer dreamfleet")],
+)  # fmt: skip
+def test_a_foreign_or_damaged_journal_is_refused_and_untouched(folder, damage, said):
+    path = folder / "journal.sqlite"
+    damage(path)
+    before = path.read_bytes()
+    for opening in (Journal, lambda path: RunFolder(path.parent)):
+        with pytest.raises(JournalError, match=said):
+            opening(path)
+    assert path.read_bytes() == before
+
+
+def test_a_full_disk_is_a_clear_error(journal):
+    journal._connection.execute("PRAGMA max_page_count = 20")
+    journal.open_generation(0, bytes(400_000), 0.1, [1], VECTORS)
+    with pytest.raises(JournalError, match=r"cannot write .* full"):
+        journal.commit()
+
+
+def test_an_unknown_run_names_those_that_exist(folder):
+    with pytest.raises(JournalError, match=r"no run 'day' in .*; there are: night"):
+        open_run(folder.parent, "day")
+    for number in range(2000):
+        (folder.parent / f"day-{number}").mkdir()
+        (folder.parent / f"day-{number}" / "journal.sqlite").touch()
+    with pytest.raises(JournalError, match=r"there are: night, .* and 1,993 more"):
+        open_run(folder.parent, "nighte")
+
+
+def test_a_folder_is_held_by_one(folder):
+    with run_lock(folder), pytest.raises(UsageError, match="held by a live coordinator"), run_lock(folder):
+        pass
+
+
+def test_a_run_is_live_while_its_folder_is_held(journal, folder):
+    journal.commit()
+    with RunFolder(folder) as run:
+        assert run.state == "open"
+        with run_lock(folder):
+            assert run.state == "live"
+        assert run.state == "open"
+    journal.set_fact("ended", "7 generations")
+    journal.commit()
+    with RunFolder(folder) as run, run_lock(folder):
+        assert run.state == "ended: 7 generations"
+
+
+def test_a_journal_that_is_overwritten_in_place_is_noticed_and_readers_are_not(journal, folder):
+    fill(journal)
+    journal.begin_incarnation()
+    journal._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    with RunFolder(folder) as run:
+        assert run.history()
+    assert not journal.is_overwritten
+    journal.commit()
+    path = folder / "journal.sqlite"
+    with path.open("r+b") as file:
+        file.write(bytes(path.stat().st_size))
+    journal.commit()
+    assert journal.is_overwritten
+
+
+def test_a_second_life_in_one_journal_is_noticed_by_the_first(journal, folder):
+    journal.begin_incarnation()
+    journal.check_incarnation()
+    other = Journal(folder / "journal.sqlite")
+    other.begin_incarnation()
+    other.close()
+    with pytest.raises(JournalError, match="another coordinator serves"):
+        journal.check_incarnation()

@@ -1,0 +1,53 @@
+"""The floors of `bench policy` and `bench dream`: no slow library, and no inherited setting, may flatter a step."""
+
+import argparse
+import json
+import os
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.host.resource_limits import POOLS
+from dreamfleet.worker.bench.command import print_figures
+from dreamfleet.worker.bench.matrix_products import LIBRARIES, fastest, product_cases, product_graph
+from dreamfleet.worker.worldmodel.inference import open_graph
+
+
+def inherited(_bundle):
+    """What a measurement's own process was told."""
+    return {name: value for name, value in os.environ.items() if "BLAS" in name or name.startswith("ATEN_")}
+
+
+def test_no_librarys_setting_reaches_a_measurement(monkeypatch, capsys):
+    settings = {"OPENBLAS_CORETYPE": "Prescott", "OPENBLAS_L2_SIZE": "1", "ATEN_CPU_CAPABILITY": "default"}
+    for name, value in {**settings, **dict.fromkeys(POOLS, "2")}.items():
+        monkeypatch.setenv(name, value)
+    print_figures(inherited, argparse.Namespace(bundle="tiny", json=True))
+    told = json.loads(capsys.readouterr().out)
+    assert not settings.keys() & told.keys()
+    assert told["OPENBLAS_NUM_THREADS"] == "1"
+
+
+def test_a_floor_is_each_product_by_the_library_that_is_fastest_at_it():
+    seconds = {
+        "product 0 by numpy": 2.0, "product 0 by torch": 3.0, "product 0 by onnxruntime": 1.0,
+        "product 1 by numpy": 4.0, "product 1 by onnxruntime": 5.0, "step": 0.1,
+    }  # fmt: skip
+    assert fastest(seconds, 2) == (5.0, ("onnxruntime", "numpy"))
+
+
+def test_numpy_and_the_runtime_are_always_asked():
+    cases = product_cases([((3, 4), (4, 5)), ((2, 3, 4), (2, 4, 1))])
+    for index in range(2):
+        assert {f"product {index} by numpy", f"product {index} by onnxruntime"} <= cases.keys()
+    assert len(cases) <= 2 * len(LIBRARIES)
+    for call in cases.values():
+        call()
+
+
+@pytest.mark.parametrize(("left", "right"), [((3, 4), (4, 5)), ((2, 3, 200), (2, 200, 1))])
+def test_the_runtimes_product_is_one(left, right):
+    random = np.random.default_rng(0)
+    first, second = (random.normal(size=shape).astype(np.float32) for shape in (left, right))
+    (product,) = open_graph(product_graph(left, second), threads=1).run(["out"], {"left": first})
+    assert np.allclose(product, first @ second, atol=1e-5)

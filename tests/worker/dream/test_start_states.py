@@ -1,0 +1,188 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle import RECORDED_STATES, write_bundle
+from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.dream.batch import DreamBatch
+from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreamVector
+from dreamfleet.worker.dream.noise import EpisodeNoise
+from dreamfleet.worker.dream.policy import DreamPolicy
+from dreamfleet.worker.dream.start_states import StartStates
+from dreamfleet.worker.dream.world import DreamWorld
+from dreamfleet.worker.tasks.api import Score
+from dreamfleet.worker.worldmodel.inference import NoiseSize
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import npy, states, write_random_bundle
+from tests.support.variants import VARIANTS
+
+RANDOM = np.random.default_rng(0)
+FIRST = RANDOM.normal(size=(5, 2, 3)).astype(np.float32)
+STATES = RANDOM.normal(size=(7, 6 + 4)).astype(np.float32)
+CHANCE = NoiseSize(3, 2, 0.0)
+HORIZON = 12
+SMALL = VAEConfig(latent=3, channels=(2, 2, 2, 2))
+PLAIN = MDNRNNConfig(latent=3, hidden=4)
+
+
+def begun(seed, share):
+    """The first latent, the memory, and the noise of the first step."""
+    noise = EpisodeNoise(seed, CHANCE)
+    latent, memory = noise.begin(StartStates(FIRST, STATES, share))
+    return latent, memory, noise.next().normal[0]
+
+
+@pytest.fixture
+def bundle(tmp_path):
+    return write_random_bundle(tmp_path / "b.zip", vae=SMALL, rnn=PLAIN, recorded=states(9, SMALL, PLAIN))
+
+
+def spec(bundle, recorded=0.5, **changes):
+    return dataclasses.replace(TaskSpec("dream", bundle.sha256, HORIZON, 0, recorded=recorded), **changes)
+
+
+def dreams_of(bundle, candidates, seeds):
+    random = np.random.default_rng(4)
+    vectors = [random.normal(0, 0.3, bundle.controller_shape.size).astype(np.float32) for _ in range(candidates)]
+    return [(vector, seed) for vector in vectors for seed in seeds]
+
+
+def test_the_share_of_dreams_that_is_asked_for_begins_at_recorded_states():
+    for share in (0.0, 0.25, 1.0):
+        recorded = np.mean([begun(seed, share)[1].any() for seed in range(400)])
+        assert abs(recorded - share) < 0.06 * (0 < share < 1) + 1e-9
+
+
+def test_every_recorded_state_is_begun_at_with_its_own_memory():
+    memories = {begun(seed, 1.0)[1].tobytes() for seed in range(200)}
+    assert memories == {state[6:].tobytes() for state in STATES}
+    spread = np.stack([begun(seed, 1.0)[0] for seed in range(200) if (begun(seed, 1.0)[1] == STATES[2, 6:]).all()])
+    assert (abs(spread.mean(0) - STATES[2, :3]) < 3 * np.exp(0.5 * STATES[2, 3:6]) / np.sqrt(len(spread))).all()
+
+
+def test_a_dream_that_begins_at_a_first_picture_is_the_same_at_every_share():
+    for seed in range(50):
+        plain, some = begun(seed, 0.0), begun(seed, 0.4)
+        assert not plain[1].any()
+        assert np.array_equal(plain[2], some[2]), "the noise of its steps is the same wherever it begins"
+        if some[1].any():
+            assert all(np.array_equal(a, b) for a, b in zip(some, begun(seed, 0.8), strict=True))
+        else:
+            assert np.array_equal(plain[0], some[0])
+
+
+def test_a_fitness_is_the_same_bits_alone_in_any_batch_and_in_any_order(bundle):
+    dreamer, dreams = DreamBatch(bundle, spec(bundle)), dreams_of(bundle, 9, range(6))
+    together = dreamer.score(dreams)
+    assert len({score.fitness for score in together}) == len(dreams)
+    assert dreamer.score(dreams[::-1])[::-1] == together
+    assert [dreamer.score([dream])[0] for dream in dreams[:13]] == together[:13]
+    assert DreamBatch(bundle, spec(bundle)).score(dreams[11:16]) == together[11:16]
+
+
+def test_only_dreams_that_begin_at_recorded_states_are_others_than_without_them(bundle):
+    dreams = dreams_of(bundle, 1, range(40))
+    plain, some, all_of_them = (DreamBatch(bundle, spec(bundle, share)).score(dreams) for share in (0.0, 0.5, 1.0))
+    same = [a == b for a, b in zip(plain, some, strict=True)]
+    assert 8 < sum(same) < 32
+    assert all(b == c for a, b, c in zip(same, some, all_of_them, strict=True) if not a)
+    assert not any(a == c for a, c in zip(plain, all_of_them, strict=True))
+
+
+def test_without_a_share_a_bundle_with_states_dreams_as_one_without(bundle, tmp_path):
+    without = write_random_bundle(tmp_path / "without.zip", vae=SMALL, rnn=PLAIN)
+    dreams = dreams_of(bundle, 3, range(5))
+    assert DreamBatch(without, spec(without, 0.0)).score(dreams) == DreamBatch(bundle, spec(bundle, 0.0)).score(dreams)
+
+
+MEMORIES = {
+    "plain": PLAIN,
+    "ending": MDNRNNConfig(latent=3, hidden=4, done=True),
+    "rewarded": MDNRNNConfig(latent=3, hidden=4, previous_reward=True),
+    "rewarded first": MDNRNNConfig(latent=3, hidden=4, previous_reward=True, first_reward=1.0),
+    "dropout": MDNRNNConfig(latent=3, hidden=4, dropout=0.2),
+    "attentive": MDNRNNConfig(latent=3, hidden=4, window=3, attention_units=4),
+}
+
+
+def dreamt(environment, policy, vector, seed):
+    """The score of a dream step by step."""
+    latent, info = environment.reset(seed=seed)
+    policy.begin(vector)
+    policy.set_memory(info["memory"])
+    fitness, steps, over = 0.0, 0, False
+    while not over:
+        latent, reward, done, truncated, _ = environment.step(policy.act(latent))
+        fitness, steps, over = fitness + reward, steps + 1, done or truncated
+    return Score(fitness, steps)
+
+
+@pytest.mark.parametrize("variant", ["plain", "all"])
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_the_environment_dreams_the_same_bits_with_any_memory(tmp_path, memory, variant):
+    rnn = MEMORIES[memory]
+    bundle = write_random_bundle(tmp_path / "b.zip", vae=SMALL, rnn=rnn, recorded=states(5, SMALL, rnn))
+    bundle = bundle if variant == "plain" else bundle.with_controllers(None, VARIANTS[variant])
+    dreams = dreams_of(bundle, 2, range(6))
+    environment, policy = CarRacingDream(bundle, horizon=HORIZON, recorded=0.5), DreamPolicy(bundle)
+    assert [dreamt(environment, policy, *dream) for dream in dreams] == DreamBatch(bundle, spec(bundle)).score(dreams)
+
+
+@pytest.mark.parametrize(("memory", "told"), [("rewarded", 0), ("rewarded first", 1)])
+def test_an_empty_memory_holds_the_reward_that_training_began_with(tmp_path, memory, told):
+    bundle = write_random_bundle(tmp_path / "b.zip", vae=SMALL, rnn=MEMORIES[memory])
+    _, info = CarRacingDream(bundle).reset(seed=1)
+    assert info["memory"].tolist() == [*[0] * 8, told]
+    assert np.array_equal(info["memory"], RecurrentState(bundle).state[0, :9]), "as in reality"
+
+
+def test_many_dreams_begin_and_begin_again_as_the_single_ones(bundle):
+    action = np.array([0.1, 0.5, 0.0], np.float32)
+    many = CarRacingDreamVector(6, bundle, horizon=3, recorded=0.5)
+    single = [CarRacingDream(bundle, horizon=3, recorded=0.5) for _ in range(6)]
+    latents, info = many.reset(seed=10)
+    assert info["_memory"].all()
+    begun = [each.reset(seed=10 + index) for index, each in enumerate(single)]
+    assert np.array_equal(latents, [latent for latent, _ in begun])
+    assert np.array_equal(info["memory"], [told["memory"] for _, told in begun])
+    assert 0 < info["memory"].any(axis=1).sum() < 6
+    for _ in range(3):
+        latents, _, _, _, told = many.step(np.tile(action, (6, 1)))
+        assert np.array_equal(latents, [each.step(action)[0] for each in single])
+        assert not told
+    _, _, _, _, told = many.step(np.tile(action, (6, 1)))
+    assert told["_memory"].all()
+    assert 0 < told["memory"].any(axis=1).sum() < 6
+
+
+def test_whoever_is_told_a_memory_may_do_with_it_what_he_likes(bundle):
+    environment = CarRacingDream(bundle, recorded=1.0)
+    first = environment.reset(seed=1)[1]["memory"]
+    kept = first.copy()
+    first[:] = 7
+    assert np.array_equal(environment.reset(seed=1)[1]["memory"], kept)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
+def test_a_share_that_is_none_is_refused(bundle, share):
+    with pytest.raises(UsageError, match="recorded states must be from 0 to 1"):
+        DreamWorld(bundle, 1.0, recorded=share)
+
+
+def test_a_bundle_without_states_is_refused_with_the_remedy(random_bundle):
+    with pytest.raises(BundleError, match=r"random\.zip holds no recorded states .*`dreamfleet bundle --recorded N`"):
+        DreamBatch(random_bundle, spec(random_bundle))
+    assert DreamWorld(random_bundle, 1.0).start_states.share == 0
+
+
+def test_states_of_another_model_are_refused(bundle, tmp_path):
+    parts = {name: bundle.read(name) for name in bundle.manifest.parts}
+    other = MDNRNNConfig(latent=3, hidden=4, window=2)
+    wrong = write_bundle(tmp_path / "w.zip", bundle.manifest, {**parts, RECORDED_STATES: npy(states(2, SMALL, other))})
+    with pytest.raises(BundleError, match=r"has 26 numbers, its model 14; build the bundle again"):
+        DreamWorld(wrong, 1.0, recorded=1.0)
+    assert DreamWorld(wrong, 1.0).start_states.share == 0, "who begins none there need not be able to"

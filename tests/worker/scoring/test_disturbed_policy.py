@@ -1,0 +1,94 @@
+"""Drives under disturbed actions."""
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.runs.lookup import find_controller
+from dreamfleet.worker.scoring.action_bursts import ActionBursts
+from dreamfleet.worker.scoring.actors import ControllerActor
+from dreamfleet.worker.scoring.disturbance import Disturbance, add_disturbance
+from dreamfleet.worker.scoring.disturbed_policy import DisturbedPolicy
+from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
+
+
+def test_noise_is_as_large_as_is_said_and_touches_no_action_at_its_bound():
+    disturbance = Disturbance(0, STEERING_GAS_BRAKE, 0.3)
+    pushes = np.concatenate([disturbance.next() for _ in range(20_000)])
+    np.testing.assert_allclose(pushes.std(axis=0), [0.3, 0.15, 0.15], rtol=0.1)
+    chosen = np.array([[0.9, 0.0, 1.0], [0.0, 0.5, 0.2]], np.float32)
+    done = add_disturbance(STEERING_GAS_BRAKE, chosen, np.array([[0.3, 0.3, -0.3]], np.float32))
+    np.testing.assert_allclose(done, [[1.0, 0.0, 1.0], [0.3, 0.8, 0.0]], atol=1e-6)
+
+
+def test_what_rests_is_tried_for_a_spell_and_then_rests_again():
+    chosen = np.array([[0.2, 1.0, 0.0]], np.float32)  # steers, full gas, no brake
+
+    def drive(seed):
+        bursts = ActionBursts(seed, STEERING_GAS_BRAKE, 0.02)
+        return np.concatenate([bursts.apply(chosen, chosen) for _ in range(5000)])
+
+    done = drive(4)
+    assert (done[:, 0] == chosen[0, 0]).all()
+    for action, resting in ((1, 1.0), (2, 0.0)):
+        tried = done[:, action] != resting
+        assert 0.1 < tried.mean() < 0.2  # 9 steps of every 50 + 9
+        changes = np.flatnonzero(np.diff(done[:, action])) + 1
+        lengths = np.diff(changes)[tried[changes[:-1]]]
+        assert lengths.min() >= 3
+        assert np.median(lengths) <= 12
+        assert done[tried, action].std() > 0.2
+    assert np.array_equal(done, drive(4))
+    assert not np.array_equal(done, drive(5))
+    assert (ActionBursts(0, STEERING_GAS_BRAKE, 0.0).apply(chosen, chosen) == chosen).all()
+
+
+class Recorder(DisturbedPolicy):
+    """Writes down what is done, and of it the disturbance."""
+
+    def on_action(self, action, push):
+        self.noted = (*getattr(self, "noted", ()), (action, push))
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return find_bundle("tiny")
+
+
+def driver(tiny, tmp_path, noise, watching=None):
+    controller, _ = find_controller("tiny", tmp_path)
+    mind = RecurrentState(tiny)
+    return mind, Recorder(ControllerActor(controller, tiny, mind), Disturbance(3, STEERING_GAS_BRAKE, noise), watching)
+
+
+def pictures(count):
+    return np.random.default_rng(0).integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
+
+
+def test_every_mind_remembers_what_was_done_and_not_what_was_chosen(tiny, tmp_path):
+    watching = RecurrentState(tiny)
+    mind, policy = driver(tiny, tmp_path, 0.5, watching)
+    calm = RecurrentState(tiny)
+    for picture in pictures(5):
+        done = policy.act(picture)
+        calm.see(picture)
+        calm.advance(done[None])
+    assert np.array_equal(mind.state, calm.state)
+    assert np.array_equal(watching.state, calm.state)
+    assert all(np.abs(push).max() > 0 for _, push in policy.noted)
+    policy.begin()
+    assert not mind.state.any()
+    assert not watching.state.any()
+
+
+def test_without_noise_it_does_what_the_hand_chooses(tiny, tmp_path):
+    mind, policy = driver(tiny, tmp_path, 0.0)
+    controller, _ = find_controller("tiny", tmp_path)
+    hand = ControllerActor(controller, tiny, mind)
+    for picture in pictures(3):
+        policy.begin()
+        done = policy.act(picture)
+        policy.begin()
+        mind.see(picture)
+        assert np.array_equal(hand.choose(None)[0], done)

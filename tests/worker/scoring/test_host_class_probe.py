@@ -1,0 +1,75 @@
+"""The class of a host: what it computes on fixed inputs, and nothing else."""
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.protocol.host_classes import class_from_fingerprint
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.scoring.host_class_probe import HostClassProbe, fixed_parameters
+from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tasks.policy import FlatPolicy
+from tests.support import tasks
+
+CART_POLE = TaskSpec("gym:CartPole-v1", "", 500, 0, ControllerShape(4, 2))
+
+
+def scorer_of(task, bundle):
+    return Scorer(TaskSpec(task, bundle.sha256, 100, 0), bundle)
+
+
+@pytest.mark.parametrize("task", ["car-racing", "dream"])
+def test_a_host_is_of_one_class_however_often_and_after_whatever_it_is_asked(random_bundle, task):
+    scorer = scorer_of(task, random_bundle)
+    found = scorer.host_class
+    assert len(found) == 16
+    again = scorer_of(task, random_bundle)
+    again.score("score", fixed_parameters(random_bundle.controller_shape.size), seed=7)
+    assert again.host_class == found
+    before = scorer.score("score", fixed_parameters(random_bundle.controller_shape.size), seed=7)
+    assert before == again.score("score", fixed_parameters(random_bundle.controller_shape.size), seed=7)
+
+
+def test_a_bit_of_the_world_is_another_class(random_bundle, monkeypatch):
+    here = scorer_of(tasks.ROUNDED, random_bundle).host_class
+    monkeypatch.setenv(tasks.ROUNDING, "1")
+    assert scorer_of(tasks.ROUNDED, random_bundle).host_class != here
+
+
+def test_a_bit_of_what_a_policy_computes_is_another_class_though_its_actions_are_the_same(monkeypatch):
+    here = Scorer(CART_POLE).host_class
+    outputs = FlatPolicy.outputs
+    monkeypatch.setattr(FlatPolicy, "outputs", lambda self, seen: np.nextafter(outputs(self, seen), np.float32(9)))
+    assert Scorer(CART_POLE).host_class != here
+
+
+def test_another_package_version_is_no_class_of_its_own(monkeypatch):
+    here = Scorer(CART_POLE).host_class
+    monkeypatch.setattr("dreamfleet.worker.scoring.scorer.fingerprint", lambda _: "riscv64 other")
+    assert Scorer(CART_POLE).host_class == here
+
+
+@pytest.mark.parametrize("task", [tasks.RAISING, tasks.CRASHING])
+def test_a_task_that_lets_nobody_look_or_fails_at_it_is_classed_by_the_fingerprint(random_bundle, task):
+    scorer = scorer_of(task, random_bundle)
+    assert scorer.host_class == class_from_fingerprint(fingerprint(scorer.world.packages))
+
+
+def test_whatever_an_environment_observes_counts_and_an_address_in_memory_does_not():
+    def host_class(value):
+        found = HostClassProbe()
+        found.add_value(value)
+        return found.host_class
+
+    assert host_class({"a": 1, "b": (1.5, None)}) == host_class({"b": (1.5, None), "a": 1})
+    assert host_class(np.float32(0.0)) != host_class(np.float32(-0.0))
+    assert host_class(0.1 + 0.2) != host_class(0.3)
+    assert host_class(np.zeros(2)) != host_class(np.zeros((2, 1)))
+    assert host_class([object()]) == host_class([object()])
+
+
+def test_the_parameters_are_the_same_bits_everywhere():
+    assert (
+        fixed_parameters(3).tobytes().hex() == fixed_parameters(867)[:3].tobytes().hex() == "cebb713d192207beda4c353e"
+    )

@@ -1,0 +1,59 @@
+from dreamfleet.worker.service.failure_log import MOST_KINDS, FailureLog
+from dreamfleet.worker.service.job_group import MAX_TRACE, ScoringFailure
+from tests.support.samples import job
+
+
+def raised(error, depth=0):
+    try:
+        if depth:
+            raise_deeper(error, depth)
+        raise error
+    except Exception as caught:
+        return ScoringFailure.of(caught)
+
+
+def raise_deeper(error, depth):
+    if depth:
+        raise_deeper(error, depth - 1)
+    raise error
+
+
+def test_a_failure_is_told_with_its_task_its_job_and_its_traceback():
+    told = FailureLog().format_if_new(raised(RuntimeError("the road has ended")), "moon", [job()])
+    first, *trace = told.splitlines()
+    assert first.startswith("task moon: RuntimeError: the road has ended (")
+    assert "generation 7, candidate 2, seed 1048576)" in first
+    assert trace[0].startswith("Traceback")
+    assert trace[-1] == "RuntimeError: the road has ended"
+
+
+def test_each_kind_is_told_once_whatever_its_numbers():
+    failures = FailureLog()
+    assert failures.format_if_new(raised(ValueError("lap 1")), "moon", [job()])
+    assert failures.format_if_new(raised(ValueError("lap 2")), "moon", [job(1)]) is None
+    assert failures.format_if_new(raised(KeyError("lap 2")), "moon", [job(1)]), "another error of the same line"
+    assert failures.format_if_new(raised(ValueError("lap 2"), depth=1), "moon", [job(1)]), (
+        "the same error of another line"
+    )
+
+
+def test_of_jobs_that_were_scored_together_the_first_is_named_and_the_others_counted():
+    told = FailureLog().format_if_new(raised(ValueError("lap 1")), "moon", [job(), job(1), job(2)])
+    assert "seed 1048576, or one of 2 jobs scored with it)" in told
+    assert "as a slot started" in FailureLog().format_if_new(raised(ValueError("lap 1")), "moon", [])
+
+
+def test_a_log_is_bounded():
+    failures = FailureLog()
+    told = [
+        failures.format_if_new(ScoringFailure("text", str(kind), "trace"), "moon", []) for kind in range(2 * MOST_KINDS)
+    ]
+    assert sum(text is not None for text in told) == MOST_KINDS
+    assert len(raised(RuntimeError("x" * 100_000)).trace) == MAX_TRACE
+
+
+def test_an_error_that_cannot_travel_as_it_is_travels_all_the_same():
+    failure = raised(OSError("no file \udcff\nsecond line"))
+    assert failure.text.encode() == b"OSError: no file ?"
+    assert failure.trace.encode()
+    assert raised(RuntimeError("")).text == "RuntimeError: "

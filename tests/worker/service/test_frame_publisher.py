@@ -1,0 +1,238 @@
+"""What a worker shows while somebody subscribes, and that nothing of it changes or delays anything."""
+
+import multiprocessing
+import queue
+
+import numpy as np
+import pytest
+import zenoh
+
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import decode
+from dreamfleet.common.protocol.frame_pictures import unpack_picture
+from dreamfleet.common.protocol.messages import Intervals, TaskSpec, ViewFrame
+from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.worker.service.frame_sampler import FRAME_INTERVAL, MAX_TIME_SHARE, FrameSampler
+from dreamfleet.worker.service.slot import Slot
+from dreamfleet.worker.tasks.api import StepSnapshot
+from tests.support import tasks
+from tests.support.hand import DEADLINE, tag
+from tests.support.samples import VECTOR, job
+from tests.worker.service.test_slot import Harness
+
+ACTION = (0.0, 1.0)
+
+
+class Viewer:
+    """Subscribes to all that a worker shows."""
+
+    def __init__(self, hand, worker=None):
+        self._frames = queue.SimpleQueue()
+        self.session = open_session(Network(connect=(hand.endpoint,)))
+        heard = zenoh.handlers.Callback(self._frames.put, indirect=False)
+        self._subscriber = self.session.declare_subscriber(keys.view(hand.run, worker or hand.worker), heard)
+
+    def frame(self, accept=lambda _: True):
+        while True:
+            frame = decode(ViewFrame, self._frames.get(timeout=DEADLINE).payload.to_bytes())
+            if accept(frame):
+                return frame
+
+    def leave(self):
+        self._subscriber.undeclare()
+
+    def close(self):
+        self.session.close()
+
+
+@pytest.fixture
+def hand(stage):
+    """A coordinator that nobody takes for silent."""
+    made = stage.hand(tasks.PAINTED)
+    made.intervals = Intervals(beat=10.0, repeat=0.1)
+    return made
+
+
+@pytest.fixture
+def viewer():
+    made = []
+
+    def make(*arguments):
+        made.append(Viewer(*arguments))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def test_a_viewer_is_shown_the_job_that_runs_and_what_it_sees(stage, hand, cached, viewer):
+    stage.worker()
+    hand.ready()
+    watching = viewer(hand)
+    jobs = hand.job(0), hand.job(1), hand.job(2)
+    hand.send(1, *jobs)
+    seen = [watching.frame()]
+    while seen[-1].tag == seen[0].tag:
+        seen.append(watching.frame())
+    shown = next(each for each in jobs if tag(each) == seen[0].tag)
+    for frame in seen[:-1]:
+        assert (frame.run_uid, frame.slot, frame.kind) == (hand.run_uid, 0, "score")
+        assert (frame.generation, frame.candidate, frame.seed) == (shown.generation, shown.candidate, shown.seeds[0])
+        assert (unpack_picture(frame) == frame.step).all()
+        assert len(frame.action) == 8
+    steps = [frame.step for frame in seen[:-1]]
+    assert steps == sorted(steps)
+    rewards = [frame.reward for frame in seen[:-1]]
+    assert rewards == sorted(rewards, reverse=True), "they are summed up, and each is below 0"
+
+
+def test_scores_are_the_same_bits_while_two_viewers_come_and_go_or_are_killed(stage, hand, cached, viewer):
+    stage.worker()
+    hand.ready()
+    hand.send(1, hand.job(0))
+    plain = hand.result(hand.job(0))
+    one, other = viewer(hand), viewer(hand)
+    hand.send(2, *(hand.job(episode) for episode in range(1, 4)), accepted=(hand.job(0),))
+    one.frame()
+    one.close()  # without a word to anybody
+    other.frame()
+    other.leave()
+    for episode in range(1, 4):
+        assert hand.result(hand.job(episode)).error is None
+    hand.send(3, hand.job(0), accepted=tuple(hand.job(episode) for episode in range(1, 4)))
+    assert hand.result(hand.job(0)).fitness == plain.fitness
+
+
+def test_frames_are_no_news_that_a_coordinator_owes_an_answer_to(stage, cached, viewer):
+    """A worker that has results without a verdict says hello again after five silent beats, watched or not."""
+    hand = stage.hand(tasks.PAINTED)
+    stage.worker()
+    hand.ready()
+    watching = viewer(hand)
+    hand.send(1, *(hand.job(episode) for episode in range(8)))
+    hand.result(hand.job(0))  # of which no verdict will tell
+    hand.hello()
+    watching.frame()
+
+
+def test_after_a_slot_was_killed_in_the_middle_the_next_child_is_watched(stage, hand, cached, viewer):
+    stage.worker()
+    hand.ready()
+    watching = viewer(hand)
+    jobs = [hand.job(episode) for episode in range(12)]
+    hand.send(1, *jobs)
+    watching.frame()
+    (child,) = multiprocessing.active_children()
+    child.kill()  # in whichever job it has come to by now
+    killed = hand.failure()
+    assert "slot crashed" in killed.error
+    later = {tag(job) for job in jobs[[job.digest for job in jobs].index(killed.digest) + 1 :]}
+    frame = watching.frame(lambda frame: frame.tag in later)
+    assert (unpack_picture(frame) == frame.step).all()
+
+
+def test_of_two_slots_one_is_shown(stage, hand, cached, viewer):
+    stage.worker(slots=2)
+    hand.hello()
+    hand.beat(lambda beat: beat.capacity == 2)
+    watching = viewer(hand)
+    hand.send(1, *(hand.job(episode) for episode in range(6)))
+    assert {watching.frame().slot for _ in range(5)} == {0}
+
+
+@pytest.fixture
+def slot(small_bundle):
+    made = Harness(tasks.PAINTED, small_bundle.path, 0)
+    made.wait_ready()
+    yield made
+    made.slot.stop()
+
+
+def shown_by(slot):
+    """The words that a slot's child says of one turn, its result last."""
+    slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
+    seen = []
+    while True:
+        event = slot.events.get(timeout=DEADLINE)[1]
+        if results := slot.slot.handle(event):
+            return seen, results[0].fitness
+        seen.append(event.message)
+
+
+def test_a_child_that_nobody_watches_says_nothing_but_its_result(slot):
+    unwatched, fitness = shown_by(slot)
+    assert unwatched == []
+    slot.slot.show(True)
+    watched, same = shown_by(slot)
+    assert 1 <= len(watched) <= 50
+    slot.slot.show(False)
+    assert shown_by(slot) == ([], fitness)
+    assert same == fitness
+
+
+@pytest.mark.parametrize("task", ["car-racing", "dream", "gym:CartPole-v1"])
+def test_a_real_slot_gives_the_same_bits_watched_and_not(random_bundle, task):
+    events, announced = queue.SimpleQueue(), ("car-racing", "dream", "gym")
+    sha256, path = ("", None) if task.startswith("gym") else (random_bundle.sha256, random_bundle.path)
+    shape = ControllerShape(4, 2) if path is None else random_bundle.controller_shape
+    spec = TaskSpec(task, sha256, 60, 0, controller=None if path else shape)
+    vector = np.random.default_rng(0).normal(0, 0.1, shape.size).astype("<f4").tobytes()
+    slot = Slot(0, spec, path, events, announced)
+    told, frames = [], 0
+    while not slot.ready:
+        slot.handle(events.get(timeout=DEADLINE)[1])
+    for shown in (False, True, False):
+        slot.show(shown)
+        slot.submit([(job(row, spec=spec), vector) for row in range(3 if task == "dream" else 1)])
+        while not (results := slot.handle(event := events.get(timeout=DEADLINE)[1])):
+            assert shown
+            frames += slot.find_job(event.child_number, event.message) is not None
+        told.append([(each.fitness, each.steps, each.error) for each in results])
+    slot.stop()
+    assert told[0] == told[1] == told[2]
+    assert told[0][0][2] is None
+    assert frames >= 1
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def test_showing_takes_no_more_than_a_hundredth_of_the_time_however_dear_a_picture_is():
+    clock, told = Clock(), []
+    sampler = FrameSampler(told.append, lambda: True, clock, clock)
+
+    def look():
+        clock.now += 0.05
+        return StepSnapshot(0, 0.0, ACTION)
+
+    for _ in range(100_000):
+        if sampler.due():
+            sampler.see(0, look)
+        clock.now += 0.001
+    assert 0.05 * len(told) <= 1.1 * MAX_TIME_SHARE * clock.now
+    assert len(told) > 10
+
+
+def test_cheap_pictures_come_ten_a_second_and_none_where_nobody_wants_them_any_more():
+    clock, told, wanted = Clock(), [], [True]
+    sampler = FrameSampler(told.append, lambda: wanted[0], clock, clock)
+    while clock.now < 10:
+        if sampler.due():
+            sampler.see(0, lambda: StepSnapshot(0, 0.0, ACTION))
+        clock.now += 0.001
+    assert len(told) == pytest.approx(10 / FRAME_INTERVAL, abs=3)
+    wanted[0] = False
+    clock.now += 10
+    assert not sampler.due()
+
+
+def test_what_goes_wrong_as_a_step_is_shown_fails_no_job():
+    sampler = FrameSampler(lambda _seen: 1 / 0, lambda: True)
+    sampler.see(0, lambda: StepSnapshot(0, 0.0, ACTION))
+    assert not sampler.due()

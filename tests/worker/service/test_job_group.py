@@ -1,0 +1,83 @@
+"""What a child does with a turn, without a child."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.worker.service.job_group import AbandonedError, score_group
+from dreamfleet.worker.tasks.api import Score
+from tests.support.samples import SPEC, VECTOR, job
+
+WORK = [(job(number), VECTOR) for number in range(3)]
+
+
+class Scorer:
+    """Gives the scores that it was made with, after one step each."""
+
+    def __init__(self, *scores):
+        self._scores = scores
+
+    spec = SPEC
+
+    def score_all(self, episodes, on_step, spec):
+        assert all(np.array_equal(vector, np.frombuffer(VECTOR, "<f4")) for _, vector, _ in episodes)
+        assert spec == SPEC.with_overrides(WORK[0][0].temperature)
+        for number, _ in enumerate(self._scores):
+            on_step(number + 1)
+        return list(self._scores)
+
+
+def ignore(_made):
+    pass
+
+
+def test_each_job_has_its_own_result_and_an_equal_share_of_the_time():
+    done = score_group(Scorer(*(Score(float(number), 10 + number) for number in range(3))), 5, WORK, ignore)
+    assert (done.group, done.upload, done.failure) == (5, None, None)
+    assert [(each.digest, each.fitness, each.steps) for each in done.results] == [
+        (job(number).digest, float(number), 10 + number) for number in range(3)
+    ]
+    assert len({each.seconds for each in done.results}) == 1
+
+
+@pytest.mark.parametrize(
+    ("scores", "said"),
+    [
+        ([Score(1.0, 1)], "1 scores of 3 episodes"),
+        ([Score(1.0, 1)] * 2 + [Score(float("nan"), 1)], "no number"),
+        ([Score(1.0, 1)] * 2 + [Score(float("inf"), 1)], "no number"),
+        ([Score(1.0, 1)] * 2 + [None], "AttributeError"),
+    ],
+)
+def test_scores_that_no_coordinator_could_count_are_the_tasks_error(scores, said):
+    done = score_group(Scorer(*scores), 5, WORK, ignore)
+    assert [each.fitness for each in done.results] == [None] * 3
+    assert all(said in each.error for each in done.results)
+    assert said in done.failure.trace
+
+
+def test_scores_of_numpys_types_travel_as_plain_numbers():
+    done = score_group(Scorer(*[Score(np.float32(0.5), np.int64(7))] * 3), 5, WORK, ignore)
+    assert {(type(each.fitness), type(each.steps)) for each in done.results} == {(float, int)}
+
+
+def test_a_turn_that_is_given_up_has_no_results_and_no_failure():
+    def count(made):
+        if made == 2:
+            raise AbandonedError
+
+    done = score_group(Scorer(*[Score(1.0, 1)] * 3), 5, WORK, count)
+    assert (done.results, done.failure) == ((), None)
+
+
+def test_steps_that_were_made_before_an_error_are_shared_out():
+    class Failing(Scorer):
+        def score_all(self, episodes, on_step, temperature):
+            on_step(9)
+            raise RuntimeError("the road has ended")
+
+    done = score_group(Failing(), 5, WORK, ignore)
+    assert [each.steps for each in done.results] == [3, 3, 3]
+    assert done.failure.text == "RuntimeError: the road has ended"
+    assert done.results == tuple(replace(each, error=done.failure.text) for each in done.results)

@@ -1,0 +1,159 @@
+"""What is shown live: of a worker's frames, and of drives for the viewer; and where it goes."""
+
+import io
+import json
+from itertools import islice
+
+import av
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.monitoring.live import LiveFrame
+from dreamfleet.common.monitoring.mjpeg import read_parts
+from dreamfleet.common.protocol.codec import decode, encode
+from dreamfleet.common.protocol.frame_pictures import pack_picture
+from dreamfleet.common.protocol.messages import TaskSpec, ViewFrame
+from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
+from dreamfleet.worker.scoring import episode
+from dreamfleet.worker.scoring.agents import make_agent
+from dreamfleet.worker.scoring.episode import EpisodeConfig
+from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tools.frame_sinks import encode_picture, open_sink
+from dreamfleet.worker.tools.live_sources import driven_frames
+from dreamfleet.worker.tools.live_view import AHEAD, SIZE, CaptionedFrame, LiveCanvas, LiveDreamer
+from dreamfleet.worker.worldmodel.inference import Decoder
+from tests.support.samples import HEAD
+
+SEED = 10_003
+PARAMETERS = np.random.default_rng(0).normal(0, 0.1, 867).astype(np.float32)
+
+
+class Once:
+    """Sees the tenth step."""
+
+    def __init__(self):
+        self.glimpse, self._asked = None, 0
+
+    def due(self):
+        self._asked += 1
+        return self._asked == 10
+
+    def see(self, _episode, look):
+        self.glimpse = look()
+
+
+def sight_of(bundle, task, **more):
+    """A worker's frame of a moment of the real task."""
+    scorer, eyes = Scorer(TaskSpec(task, bundle.sha256, 20, 0, temperature=1.0), bundle), Once()
+    scorer.observer = eyes
+    scorer.score("score", PARAMETERS, 2**20)
+    scorer.close()
+    seen = eyes.glimpse
+    picture = (1, 1, b"") if seen.picture is None else pack_picture(seen.picture)
+    numbers = [each.astype("<f4").tobytes() for each in (seen.latent, seen.state, PARAMETERS)]
+    told = {
+        "slot": 0, "tag": b"ABCDEFGH", "step": seen.step, "reward": seen.score, "height": picture[0],
+        "width": picture[1], "picture": picture[2], "packed": bool(picture[2]), "generation": 7, "candidate": 2,
+        "seed": 2**20, "action": tuple(map(float, seen.action)), "latent": numbers[0], "state": numbers[1],
+        "parameters": numbers[2], **more,
+    }  # fmt: skip
+    return LiveFrame.of("host-a/0a1b2c3d", decode(ViewFrame, encode(ViewFrame(**HEAD, **told))))
+
+
+@pytest.mark.parametrize("task", ["car-racing", "dream"])
+def test_a_workers_frame_is_decoded_and_dreamt_on_by_the_viewer(random_bundle, task):
+    sight, imagination = sight_of(random_bundle, task), LiveDreamer(random_bundle, 1.0)
+    imagined = imagination.decode_and_dream(sight)
+    assert (imagined.decoded == Decoder(random_bundle).decode(sight.latent[None])[0]).all()
+    assert [ahead for ahead, _ in imagined.dreamt] == list(AHEAD)
+    assert len({picture.tobytes() for _, picture in imagined.dreamt}) == len(AHEAD)
+    assert all(
+        np.array_equal(one[1], other[1])
+        for one, other in zip(imagined.dreamt, imagination.decode_and_dream(sight).dreamt, strict=True)
+    )
+    shown = LiveCanvas("night", ("steer", "gas", "brake"), imagination).draw(sight)
+    assert shown.picture.shape == (*SIZE[::-1], 3)
+    assert shown.facts == {
+        "run": "night", "worker": "host-a/0a1b2c3d", "kind": "score", "generation": 7, "candidate": 2, "seed": 2**20,
+        "step": 9, "score": sight.frame.reward,
+    }  # fmt: skip
+    assert (sight.picture is None) == (task == "dream")
+
+
+@pytest.mark.parametrize(
+    "more", [{"latent": bytes(8)}, {"latent": b""}, {"state": bytes(8)}, {"parameters": bytes(16)}, {"picture": b""}]
+)
+def test_a_frame_that_is_of_another_world_model_is_shown_as_far_as_it_goes(random_bundle, more):
+    sight = sight_of(random_bundle, "car-racing", **({"packed": False} if "picture" in more else {}), **more)
+    glass = LiveCanvas("n" * 63, ("steer", "gas", "brake"), LiveDreamer(random_bundle, 1.0))
+    assert glass.draw(sight).picture.shape == (*SIZE[::-1], 3)
+
+
+def driver(bundle):
+    controller = Controller(bundle.controller_shape, PARAMETERS, "car-racing", bundle.sha256)
+    agent = make_agent(controller, bundle)
+    return lambda: (agent, {"controller": "mine"})
+
+
+def test_a_controller_is_shown_at_the_worlds_pace_and_scores_as_it_would_unseen(random_bundle, monkeypatch):
+    drive = driver(random_bundle)
+    agent, _ = drive()
+    shown = list(islice(driven_frames(drive, ParallelDreamConfig(), 10, SEED), 8))
+    assert [each.facts["step"] for each in shown] == list(range(0, 40, 5)), "50 steps a second, 10 pictures"
+    judge = agent.make_judge()
+    plain = episode.score(judge, agent.make_policies()(SEED), PARAMETERS, EpisodeConfig(SEED, 35))
+    judge.close()
+    assert shown[7].facts["score"] == pytest.approx(plain.fitness)
+    assert shown[0].facts["seed"] == SEED
+    assert len({each.picture.tobytes() for each in shown}) == 8
+
+
+PICTURES = [CaptionedFrame(np.full((40, 60, 3), value, np.uint8), {"step": value}) for value in (10, 200, 90)]
+
+
+def test_stills_lie_in_a_folder_beside_what_they_show(tmp_path):
+    with open_sink(str(tmp_path / "new" / "stills"), 10, io.BytesIO()) as show:
+        assert all(show(each) for each in (None, *PICTURES))
+    assert sorted(path.name for path in (tmp_path / "new" / "stills").iterdir()) == [
+        f"{number:06d}.{kind}" for number in range(3) for kind in ("json", "png")
+    ]
+    assert json.loads((tmp_path / "new" / "stills" / "000001.json").read_text()) == {"step": 200}
+
+
+def test_a_video_has_every_picture(tmp_path):
+    with open_sink(str(tmp_path / "live.mp4"), 10, io.BytesIO()) as show:
+        assert all(show(each) for each in PICTURES)
+    with av.open(str(tmp_path / "live.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.width, stream.height) == ("h264", 60, 40)
+        assert len(list(container.decode(stream))) == 3
+
+
+def test_a_stream_is_read_back_picture_by_picture_and_ends_where_its_reader_leaves(tmp_path):
+    out = io.BytesIO()
+    with open_sink("-", 10, out) as show:
+        assert all(show(each) for each in (None, *PICTURES))
+    out.seek(0)
+    parts = list(read_parts(out))
+    assert [facts for _, facts in parts] == [each.facts for each in PICTURES]
+    assert parts[0][0] == encode_picture(PICTURES[0].picture, "jpg")
+    assert list(read_parts(io.BytesIO(out.getvalue()[:-200]))) == parts[:2], "the last one is cut short"
+    assert list(read_parts(io.BytesIO(b"HTTP/1.1 200 OK\r\n\r\n"))) == []
+
+    class Gone(io.BytesIO):
+        def write(self, _data):
+            raise BrokenPipeError
+
+    with open_sink("-", 10, Gone()) as show:
+        assert not show(PICTURES[0])
+
+
+def test_places_where_nothing_can_be_written_are_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    for name in ("live.webm", "file", "file/stills", "file/live.mp4"):
+        with pytest.raises(DreamfleetError, match="--out"), open_sink(str(tmp_path / name), 10, io.BytesIO()):
+            pass
+    with pytest.raises(UsageError, match=r"name an \.mp4"), open_sink(str(tmp_path / "live.webm"), 10, io.BytesIO()):
+        pass

@@ -1,0 +1,62 @@
+"""`record` and `baseline record` take the same tracks and answer alike."""
+
+import json
+
+import av
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.cli import command_line
+from dreamfleet.common.errors import UsageError
+
+FIRST, SECOND, STEPS = 20_000, 20_001, 5
+
+
+@pytest.fixture(params=["record", "baseline record"])
+def verb(request, random_bundle, tmp_path):
+    if request.param == "baseline record":
+        return ["baseline", "record", "random"]
+    shape, path = random_bundle.controller_shape, tmp_path / "controller.npz"
+    Controller(shape, np.zeros(shape.size, np.float32), "car-racing", random_bundle.sha256).save(path)
+    return ["record", "--controller", str(path), "--bundle", str(random_bundle.path)]
+
+
+def told(capsys, verb, *words):
+    assert command_line.main([*verb, "--steps", str(STEPS), "--json", *map(str, words)]) == 0
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+
+def pictures(video):
+    with av.open(str(video)) as container:
+        return [each.to_ndarray(format="rgb24").astype(int) for each in container.decode(container.streams.video[0])]
+
+
+def test_each_of_several_tracks_has_a_video_of_its_own(verb, tmp_path, capsys):
+    both = told(capsys, verb, "--seed", FIRST, SECOND, FIRST, "--out", tmp_path / "drive.mp4")
+    assert [each["seed"] for each in both] == [FIRST, SECOND]
+    for each in both:
+        video = tmp_path / f"drive-{each['seed']}.mp4"
+        assert each["video"] == str(video)
+        assert len(pictures(video)) == STEPS
+        alone = told(capsys, verb, "--seed", each["seed"], "--out", tmp_path / "alone.mp4")
+        assert alone == [{**each, "video": str(tmp_path / "alone.mp4")}]
+        np.testing.assert_allclose(pictures(tmp_path / "alone.mp4"), pictures(video), atol=8)  # x264 differs by a bit
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--steps", "0"), "--steps must be at least 1 and --seed at least 0"),
+        (("--seed", "7", "-1"), "--steps must be at least 1 and --seed at least 0"),
+        (("--out", "drive.avi"), "--out drive.avi: give a name that ends in .mp4"),
+        (("--out", "folder.mp4"), "--out folder.mp4 is a folder: name a file in it"),
+    ],
+)
+def test_what_cannot_be_recorded_is_one_line_before_anything_is_driven(
+    verb, words, says, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.mp4").mkdir()
+    assert command_line.main([*verb, *words]) == UsageError.exit_code
+    assert says in capsys.readouterr().err

@@ -1,0 +1,180 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
+from dreamfleet.common.runs.lookup import find_controller
+from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
+from dreamfleet.worker.car_racing.random_network import RandomNetworkPolicy
+from dreamfleet.worker.training.data.collect import collect, drive_episode, episode_path
+from dreamfleet.worker.training.data.collect_config import CollectConfig
+from dreamfleet.worker.training.data.dataset import load_pictures
+from dreamfleet.worker.training.data.pilot import Pilot
+
+# SWIG warns as Box2D is imported, and an error there kills the process.
+pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
+TINY = CollectConfig(episodes=3, steps=4, seed=5)
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def equal(one, other):
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def test_an_episode_is_a_pure_function_of_seed_and_number():
+    first = drive_episode(TINY, 1)
+    drive_episode(TINY, 2)  # what was driven before leaves no trace
+    assert equal(drive_episode(TINY, 1), first)
+    assert not equal(drive_episode(CollectConfig(steps=4, seed=6), 1), first)
+
+
+@pytest.mark.parametrize("anywhere", [0.0, 1.0])
+def test_an_episodes_arrays_belong_together(anywhere):
+    arrays = drive_episode(CollectConfig(steps=3, anywhere=anywhere), 0)
+    assert arrays["picture"].shape == (3, 64, 64, 3)
+    assert arrays["picture"].dtype == np.uint8
+    assert arrays["action"].shape == (3, 3)
+    assert arrays["action"].dtype == arrays["reward"].dtype == np.float32
+    assert str(arrays["driver"]) in DRIVERS
+
+
+def test_an_episode_ends_after_its_patience():
+    assert len(drive_episode(CollectConfig(steps=300, anywhere=0.0, patience=5), 0)["reward"]) < 60
+    assert len(drive_episode(CollectConfig(steps=200, anywhere=0.0, patience=0), 0)["reward"]) == 200
+
+
+def test_collecting_again_writes_only_what_is_missing_and_the_same(tmp_path):
+    assert sorted(collect(tmp_path, TINY, jobs=2)) == [4, 4, 4]
+    before = {number: episode_path(tmp_path, number).read_bytes() for number in range(3)}
+    kept = episode_path(tmp_path, 0).stat().st_mtime_ns
+    episode_path(tmp_path, 1).unlink()
+    assert list(collect(tmp_path, TINY, jobs=1)) == [4]
+    assert {number: episode_path(tmp_path, number).read_bytes() for number in range(3)} == before
+    assert episode_path(tmp_path, 0).stat().st_mtime_ns == kept
+    assert list(collect(tmp_path, TINY, jobs=2)) == []
+    assert len(load_pictures(episode_path(tmp_path, 2))) == 4
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"episodes": 0},
+        {"steps": 0},
+        {"patience": -1},
+        {"anywhere": 2},
+        {"driver": "ghost"},
+        {"seed": -1},
+        {"noise": -1},
+        {"spells": 1.1},
+    ],
+)
+def test_impossible_settings_are_refused(changes):
+    with pytest.raises(UsageError, match=f"--{next(iter(changes))}"):
+        CollectConfig(**changes)
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(DatasetError, match="choose another --data"):
+        list(collect(tmp_path / "file", TINY, jobs=1))
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_a_driver_stays_within_the_cars_controls_and_moves_it(name):
+    driver = DRIVERS[name](np.random.default_rng(0))
+    actions = np.array([driver.act() for _ in range(2000)])
+    assert actions.dtype == np.float32
+    assert (actions >= [-1, 0, 0]).all()
+    assert (actions <= 1).all()
+    assert ((actions[:, 1] > 0) & (actions[:, 2] > 0)).sum() == 0  # one pedal at a time
+    assert actions[:, 1].mean() > actions[:, 2].mean()
+
+
+SOURCES = ("uniform", "pushed", "network")
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_a_named_driver_drives_alone_as_a_function_of_seed_and_number(name):
+    config = replace(TINY, driver=name, anywhere=0.0, patience=0)
+    first = drive_episode(config, 1)
+    drive_episode(config, 2)
+    assert equal(drive_episode(config, 1), first)
+    assert not np.array_equal(drive_episode(config, 2)["action"], first["action"]) or name == "pushed"
+    assert str(first["driver"]) == name
+    assert (first["action"] >= [-1, 0, 0]).all()
+    assert (first["action"] <= 1).all()
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_one_of_the_random_drivers_may_drive_all(name):
+    assert [str(drive_episode(replace(TINY, driver=name), number)["driver"]) for number in range(3)] == [name] * 3
+
+
+def acted(driver, steps):
+    return np.array([driver.act() for _ in range(steps)])
+
+
+def test_the_notebooks_driver_holds_a_uniform_action_for_20_frames():
+    actions = acted(UniformDriver(np.random.default_rng(0)), 20_000).reshape(-1, 20, 3)
+    assert (actions == actions[:, :1]).all()
+    held = actions[:, 0]
+    np.testing.assert_allclose(held.mean(axis=0), [0, 0.5, 0.5], atol=0.05)
+    np.testing.assert_allclose(held.std(axis=0), np.array([2, 1, 1]) / np.sqrt(12), atol=0.03)
+
+
+def test_the_articles_driver_pushes_first_and_then_moves_one_control_at_a_time():
+    actions = acted(PushedDriver(np.random.default_rng(0)), 40_000).reshape(-1, 20, 3)
+    assert (actions == actions[:, :1]).all()
+    push, *held = actions[:, 0]
+    np.testing.assert_allclose(push, [-0.1, 1, 0], atol=1e-6)
+    kinds = np.array([(each[0] < 0, each[0] > 0, each[1] > 0, each[2] > 0) for each in held])
+    assert (kinds.sum(axis=1) <= 1).all()
+    np.testing.assert_allclose(kinds.mean(axis=0), [0.2, 0.2, 0.4, 0.1], atol=0.04)
+
+
+@pytest.mark.parametrize("side", [64, 96])
+def test_the_network_looks_at_pictures_and_each_drive_has_its_own(side):
+    pictures = np.random.default_rng(0).integers(0, 256, (2, side, side, 3), dtype=np.uint8)
+    drivers = [RandomNetworkPolicy(np.random.default_rng(seed)) for seed in range(6)]
+    actions = np.array([[driver.act(pictures[step % 2]) for step in range(8)] for driver in drivers])
+    assert actions.shape == (6, 8, 3)
+    assert np.isfinite(actions).all()
+    assert len(np.unique(actions[:, -1], axis=0)) > 2
+    blind = RandomNetworkPolicy(np.random.default_rng(1))
+    assert any(not np.array_equal(blind.act(255 - pictures[step % 2]), actions[1, step]) for step in range(8))
+
+
+@pytest.fixture
+def pilot(tmp_path):
+    return Pilot(find_controller("tiny", tmp_path)[0], find_bundle("tiny"))
+
+
+def test_controllers_drive_in_turn_under_noise_as_a_function_of_seed_and_number(pilot, tmp_path):
+    still = Pilot(replace(pilot.controller, parameters=np.zeros_like(pilot.controller.parameters)), pilot.bundle)
+    first = drive_episode(TINY, 1, (pilot, still))
+    assert equal(drive_episode(TINY, 1, (pilot, still)), first)
+    assert equal(drive_episode(TINY, 1, (still,)), first)
+    assert not equal(drive_episode(TINY, 1, (pilot,)), first)
+    assert str(first["driver"]) == "controller"
+    quiet = drive_episode(replace(TINY, noise=0.0), 1, (still,))
+    assert np.ptp(quiet["action"], axis=0).max() == 0 < np.ptp(first["action"], axis=0).max()
+    tried = drive_episode(replace(TINY, noise=0.0, spells=1.0), 1, (still,))
+    assert np.array_equal(tried["action"][:, 0], quiet["action"][:, 0])
+    assert (tried["action"][:, 2] > 0).all()
+    assert list(collect(tmp_path, TINY, 1, (pilot, still))) == [4, 4, 4]
+    with np.load(episode_path(tmp_path, 1)) as written:
+        assert equal(dict(written), first)
+
+
+def test_a_controller_of_another_model_or_other_pictures_drives_for_no_data_set(pilot, random_bundle, tmp_path):
+    with pytest.raises(ControllerError, match=r"is of the world model .*, not of .*random\.zip"):
+        list(collect(tmp_path, TINY, 1, (Pilot(pilot.controller, random_bundle),)))
+    with pytest.raises(ControllerError, match=r"sees 'box-64' .* holds 'raw-96' .*: choose another --picture"):
+        list(collect(tmp_path, replace(TINY, picture=96), 1, (pilot,)))
+    assert not (tmp_path / "episodes").exists()

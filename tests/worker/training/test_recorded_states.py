@@ -1,0 +1,191 @@
+import argparse
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle import RECORDED_STATES, Bundle
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.worker.dream.environment import CarRacingDream
+from dreamfleet.worker.inspection.page_builder import manifest_facts
+from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training.assemble import assemble
+from dreamfleet.worker.training.data.dataset import load_arrays
+from dreamfleet.worker.training.encode import encode
+from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.verbs import bundle as verb
+from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import write_random_bundle
+from tests.support.drives import write_drive
+
+SHORT = TrainConfig(updates=1, batch=4, rate=1e-3)
+LATENT, HIDDEN = 3, 4
+STEPS = 90
+MODELS = {
+    "plain": MDNRNNConfig(latent=LATENT, hidden=HIDDEN),
+    "rewarded": MDNRNNConfig(latent=LATENT, hidden=HIDDEN, previous_reward=True),
+    "value": MDNRNNConfig(latent=LATENT, hidden=HIDDEN, reward="value", previous_reward=True, dropout=0.2),
+    "attentive": MDNRNNConfig(latent=LATENT, hidden=HIDDEN, window=3, attention_units=4),
+}
+
+
+@pytest.fixture(scope="module")
+def encoded(tmp_path_factory):
+    """Drives of which each second one stays without a reward from step 40 on."""
+    folder = tmp_path_factory.mktemp("data")
+    drives = [write_drive(folder, number, STEPS - number) for number in range(4)]
+    train_vae.train_vae(folder, SHORT, ignore, VAEConfig(latent=LATENT, channels=(2, 2, 2, 2)))
+    list(encode(folder))
+    for number, path in enumerate(drives):
+        random, shape = np.random.default_rng(number), (STEPS - number, LATENT)
+        reward = load_arrays(path, "reward")["reward"]
+        reward[40 if number % 2 else STEPS :] = -0.1
+        # One update sees the same in every picture.
+        change(
+            folder / "encoded" / path.name,
+            reward=reward,
+            mu=random.normal(size=shape),
+            logvar=random.normal(size=shape),
+        )
+    return folder
+
+
+def change(path, **arrays):
+    with np.load(path) as whole:
+        kept = dict(whole)
+    np.savez(path, **{**kept, **{name: array.astype(np.float32) for name, array in arrays.items()}})
+
+
+def ignore(_done, _note):
+    pass
+
+
+@pytest.fixture
+def trained(encoded, tmp_path):
+    """A folder with these drives and an MDN-RNN of its own."""
+
+    def folder(layers):
+        made = tmp_path / "data"
+        shutil.copytree(encoded, made)
+        train_mdnrnn.train_mdnrnn(made, SHORT, ignore, layers)
+        return made
+
+    return folder
+
+
+def remembered(bundle, folder):
+    """By latents of each step of each drive: them, and what a drive by the bundle's graphs remembers before it."""
+    model, label, found = DreamStep(bundle), RewardLabel(bundle), {}
+    for path in sorted((folder / "encoded").iterdir()):
+        arrays = load_arrays(path, "mu", "logvar", "action", "reward")
+        state = model.zero_state(1)
+        for step, mu in enumerate(arrays["mu"]):
+            key = np.concatenate([mu, arrays["logvar"][step]])
+            found[key.astype(np.float16).tobytes()] = (path.stem, step, np.concatenate([key, state[0]]))
+            state = model.advance(mu[None], arrays["action"][step : step + 1], state)
+            label.write(state, arrays["reward"][step : step + 1])
+    return found
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_recorded_state_is_what_a_drive_up_to_there_remembers(trained, tmp_path, name):
+    folder = trained(MODELS[name])
+    bundle = assemble(folder, tmp_path / "b.zip", "b", with_weights=False, recorded=40)
+    states, places = bundle.read_recorded(), remembered(bundle, folder)
+    assert states.shape == (40, 2 * LATENT + MODELS[name].state)
+    at = [places[state[: 2 * LATENT].astype(np.float16).tobytes()] for state in states]
+    assert len({place[:2] for place in at}) == 40
+    assert min(step for _, step, _ in at) >= 20
+    np.testing.assert_allclose(states, [place for *_, place in at], rtol=1e-3, atol=1e-5)
+    assert bundle.manifest.provenance["recorded"] == {"states": 40, "before_losses": 2}
+
+
+def test_a_dream_that_begins_there_goes_on_as_the_drive_would(trained, tmp_path):
+    folder = trained(MODELS["attentive"])
+    bundle = assemble(folder, tmp_path / "b.zip", "b", with_weights=False, recorded=40)
+    environment = CarRacingDream(bundle, recorded=1.0)
+    latent, info = environment.reset(seed=3)
+    place = [state for state in bundle.read_recorded() if np.array_equal(state[2 * LATENT :], info["memory"])]
+    assert len(place) == 1
+    mu, deviation = place[0][:LATENT], np.exp(0.5 * place[0][LATENT : 2 * LATENT])
+    assert (abs(latent - mu) < 5 * deviation).all()
+    action = np.array([[0.1, 0.5, 0.0]], np.float32)
+    environment.step(action[0])
+    after = DreamStep(bundle).advance(latent[None], action, info["memory"][None])
+    assert np.array_equal(environment._state, after)
+
+
+def test_equal_folders_record_equal_states_and_none_are_the_bundle_of_before(trained, tmp_path):
+    folder = trained(MODELS["plain"])
+    first, again, fewer, none, before = (
+        assemble(folder, tmp_path / f"{number}.zip", "b", with_weights=False, **more)
+        for number, more in enumerate(({"recorded": 30}, {"recorded": 30}, {"recorded": 10}, {"recorded": 0}, {}))
+    )
+    assert first.sha256 == again.sha256
+    assert (first.recorded_count, fewer.recorded_count, none.recorded_count) == (30, 10, 0)
+    assert none.sha256 == before.sha256
+    assert RECORDED_STATES not in none.manifest.parts
+    assert "recorded" not in none.manifest.provenance
+
+
+def call(capsys, folder, *flags):
+    parser = argparse.ArgumentParser()
+    verb.configure(parser)
+    assert verb.run(parser.parse_args(["--data", str(folder), "--out", str(folder / "b.zip"), *flags])) == 0
+    return capsys.readouterr().out
+
+
+def test_the_verb_and_the_page_tell_how_many_there_are(trained, capsys):
+    folder = trained(MODELS["plain"])
+    every = sum(STEPS - number - 20 for number in range(4))
+    assert json.loads(call(capsys, folder, "--json"))["recorded"] == every < 512
+    assert dict(manifest_facts(Bundle.open(folder / "b.zip")))["recorded states"] == str(every)
+    assert ", 7 recorded states" in call(capsys, folder, "--recorded", "7")
+    assert ", 0 recorded states" in call(capsys, folder, "--recorded", "0")
+    assert dict(manifest_facts(Bundle.open(folder / "b.zip")))["recorded states"] == "none"
+    for wrong in ("-1", "16385"):
+        with pytest.raises(UsageError, match="--recorded must be from 0 to 16384"):
+            call(capsys, folder, "--recorded", wrong)
+
+
+FIGURES = {
+    "likeness": {"quantities": [{"quantity": "yaw", "rare": 3.0, "found": {"dream": {"value": 0.2, "error": 0.01}}}]},
+    "noise": 0.3, "first_seed": 20000, "driver": "f00",
+    "probe": {"drives": 2, "known": [{"quantity": "speed", "found": {"zh_linear": {"value": 0.86, "error": 0.01}}}]},
+    "losses": {
+        "begun": [{"begun": "40 steps before", "figures": {"lost": {"dream": {"value": 0.6, "error": 0.07}}}}],
+    },
+}  # fmt: skip
+
+
+def test_figures_that_were_measured_stay_with_the_bundle(trained, tmp_path, capsys):
+    folder, told = trained(MODELS["plain"]), tmp_path / "told.json"
+    bare = json.loads(call(capsys, folder, "--json"))["sha256"]
+    told.write_text(json.dumps({"bundle": bare, **FIGURES}))
+    assert json.loads(call(capsys, folder, "--measured", str(told), "--json"))["sha256"] != bare
+    bundle = Bundle.open(folder / "b.zip")
+    assert bundle.manifest.provenance["measured"] == [FIGURES]
+    rows = dict(manifest_facts(bundle))
+    assert rows["R² of speed, linear on [z, h]"] == "0.86 ± 0.01"
+    assert rows["dreamt share of yaw above 3"] == "0.20 ± 0.01"
+    assert rows["road lost in dreams begun 40 steps before"] == "0.60 ± 0.07"
+    for content, said in (
+        (json.dumps({"bundle": "0" * 64, **FIGURES}), "was measured of the world model 000000000000"),
+        (json.dumps({"bundle": bare, **FIGURES, "noise": float("nan")}), "holds no figures"),
+        (json.dumps({"bundle": bare, "driver": "", "noise": 0, "first_seed": 0}), "holds no figures"),
+        ("{}", "holds no figures"), ("[" * 100_000, "holds no figures"), ("", "holds no figures"),
+    ):  # fmt: skip
+        told.write_text(content)
+        with pytest.raises(DatasetError, match=said):
+            call(capsys, folder, "--measured", str(told))
+        assert Bundle.open(folder / "b.zip").sha256 == bundle.sha256
+
+
+@pytest.mark.parametrize("told", [7, [7], [{"probe": 7}], [{"probe": {"known": [{"quantity": 1}]}}]])
+def test_a_manifest_that_holds_anything_there_tells_nothing(tmp_path, told):
+    bundle = write_random_bundle(tmp_path / "b.zip")
+    bundle.manifest.provenance["measured"] = told
+    assert not [name for name, _ in manifest_facts(bundle) if "R²" in name]

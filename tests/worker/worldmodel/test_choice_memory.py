@@ -1,0 +1,157 @@
+"""Controllers of a variant: by their formula, held as long as they say, and the same bits in any batch."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.artifacts.controller import act
+from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.worker.worldmodel.inference import Controllers, DreamStep, Encoder, PolicyStep
+from tests.support.variants import VARIANTS, vectors
+
+ROWS = 256
+
+
+@pytest.fixture(scope="module", params=VARIANTS)
+def varied(request, random_bundle):
+    return random_bundle.with_controllers(None, VARIANTS[request.param])
+
+
+def feed(step, rows, seed=0):
+    """A batch in the middle of its dreams: rows are not all at the same step of what they hold."""
+    random = np.random.default_rng(seed)
+    state = random.normal(0, 0.5, (rows, step.state_size)).astype(np.float32)
+    state[:, -1] = random.integers(0, 2, rows)
+    latent, normal = random.normal(size=(2, rows, step.latent_size)).astype(np.float32)
+    return {"latent": latent, "state": state, "normal": normal, "uniform": random.random((rows, 32), np.float32)}
+
+
+@pytest.mark.parametrize("rows", [1, 2, 7, 256])
+@pytest.mark.parametrize("hidden", [0, 5])
+def test_a_dreamers_bits_do_not_depend_on_who_else_dreams(random_bundle, varied, rows, hidden):
+    bundle = random_bundle.with_controllers(random_bundle.shape_of("zh", hidden, varied.variant), varied.variant)
+    step, parameters = DreamStep(bundle), vectors(bundle, ROWS)
+    given = feed(step, ROWS)
+    whole = step.step(**given, parameters=parameters, temperature=1.15)
+    order = np.random.default_rng(3).permutation(ROWS)
+    for start in range(0, ROWS - rows + 1, max(rows, 8)):
+        chosen = order[start : start + rows]
+        few = step.step(
+            **{key: each[chosen] for key, each in given.items()}, parameters=parameters[chosen], temperature=1.15
+        )
+        assert all(np.array_equal(one, other[chosen]) for one, other in zip(few, whole, strict=True))
+
+
+def test_a_drivers_bits_do_not_depend_on_who_else_drives(varied):
+    policy, parameters = PolicyStep(varied), vectors(varied, 16)
+    random = np.random.default_rng(1)
+    pictures = random.integers(0, 256, (16, 64, 64, 3), dtype=np.uint8)
+    state = random.normal(0, 0.5, (16, policy.state_size)).astype(np.float32)
+    state[:, -1] = random.integers(0, 2, 16)
+    whole = policy.step(pictures, parameters, state)
+    for rows in ([0], [3, 4], list(range(16))[::-1]):
+        few = policy.step(pictures[rows], parameters[rows], state[rows])
+        assert all(np.array_equal(one, other[rows]) for one, other in zip(few, whole, strict=True))
+
+
+@pytest.mark.parametrize("features", ["z", "zh"])
+@pytest.mark.parametrize("hidden", [0, 5])
+def test_a_controller_acts_by_its_formula_in_the_dream_and_in_reality(random_bundle, varied, features, hidden):
+    variant = varied.variant
+    bundle = random_bundle.with_controllers(random_bundle.shape_of(features, hidden, variant), variant)
+    policy, dream, parameters = PolicyStep(bundle), DreamStep(bundle), vectors(bundle, 4)
+    given = feed(dream, 4)
+    given["state"][:, -1] = 0  # all decide anew, or it is a column like any other
+    real = policy.step(
+        np.random.default_rng(2).integers(0, 256, (4, 64, 64, 3), dtype=np.uint8), parameters, given["state"]
+    )
+    dreamt = dream.step(**{**given, "latent": real.latent}, parameters=parameters, temperature=1.0)
+    assert np.array_equal(dreamt.action, real.action)
+    assert dreamt.action.shape == (4, 3)
+    seen = [real.latent, given["state"][:, :256]] if features == "zh" else [real.latent]
+    if variant.feedback == "last":
+        last, before = given["state"][:, -7:-4], given["state"][:, -4:-1]
+        told = [variant.controls.to_outputs(each) for each in (last, before)]
+        seen += [told[0], told[0] - told[1]]
+    for row, value in enumerate(np.concatenate(seen, axis=1)):
+        expected = act(bundle.controller_shape, parameters[row], value, variant.controls)
+        np.testing.assert_allclose(real.action[row], expected, atol=1e-5)
+
+
+def drive(bundle, pictures, parameters):
+    """Actions and states of a drive."""
+    policy = PolicyStep(bundle)
+    state, actions, states = policy.zero_state(1), [], []
+    for each in pictures:
+        states.append(state)
+        step = policy.step(each[None], parameters, state)
+        state = step.state
+        actions.append(step.action[0])
+    return np.stack(actions), np.concatenate(states)
+
+
+def test_a_choice_is_held_and_the_memory_advances_each_step_with_it(random_bundle):
+    varied = random_bundle.with_controllers(None, Variant(decide_every=3))
+    pictures = np.random.default_rng(5).integers(0, 256, (8, 64, 64, 3), dtype=np.uint8)
+    actions, states = drive(varied, pictures, vectors(varied, 1))
+    held = [np.array_equal(one, other) for one, other in pairwise(actions)]
+    assert held == [True, True, False, True, True, False, True]
+    encoder, memory, state = Encoder(random_bundle), DreamStep(random_bundle), np.zeros((1, 512), np.float32)
+    for picture, action, known in zip(pictures, actions, states, strict=True):
+        assert np.array_equal(known[:512], state[0])
+        latent, _ = encoder.encode(picture[None])
+        state = memory.advance(latent, action[None], state)
+
+
+def test_a_choice_and_its_change_are_those_of_decisions_not_of_held_steps(random_bundle):
+    varied = random_bundle.with_controllers(None, Variant(pedals="one", decide_every=2, feedback="last"))
+    pictures = np.random.default_rng(5).integers(0, 256, (7, 64, 64, 3), dtype=np.uint8)
+    actions, states = drive(varied, pictures, vectors(varied, 1))
+    choices = Controllers(varied).choices
+    assert not choices.features(states[:1]).any()
+    last, before = (varied.variant.controls.to_outputs(actions[step]) for step in (2, 0))
+    assert np.array_equal(choices.features(states[4:5])[0], np.concatenate([last, last - before]))
+
+
+def test_whatever_is_kept_leaves_a_plain_state_as_it_is(random_bundle):
+    assert PolicyStep(random_bundle).state_size == DreamStep(random_bundle).state_size == 512
+    assert PolicyStep(random_bundle.with_controllers(None, Variant(pedals="one"))).state_size == 512
+    assert PolicyStep(random_bundle.with_controllers(None, Variant(decide_every=2))).state_size == 512 + 7
+
+
+def test_a_variant_that_says_nothing_is_the_one_graph_to_the_bit(random_bundle):
+    inputs = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
+    parameters = vectors(random_bundle, 3)
+    steps = [
+        PolicyStep(each).step(inputs, parameters, np.zeros((3, 512), np.float32))
+        for each in (random_bundle, random_bundle.with_controllers(None, Variant.from_json('{"pedals": "two"}')))
+    ]
+    assert all(np.array_equal(one, other) for one, other in zip(*steps, strict=True))
+
+
+def test_a_controller_of_another_variant_does_not_fit(random_bundle):
+    plain, one_pedal = random_bundle.shape_of("zh"), random_bundle.shape_of("zh", 0, Variant(pedals="one"))
+    assert (plain.size, one_pedal.size) == (867, 578)
+    with pytest.raises(ControllerError, match=r"a controller of 867 parameters does not fit .*, which needs 578"):
+        random_bundle.with_controllers(plain, Variant(pedals="one"))
+    with pytest.raises(ControllerError, match=r"578 parameters does not fit .*, which needs 867"):
+        random_bundle.with_controllers(one_pedal)
+
+
+def test_a_world_model_of_another_world_has_no_variants(random_bundle):
+    moon = Bundle(random_bundle.path, random_bundle.sha256, replace(random_bundle.manifest, task="moon"))
+    with pytest.raises(BundleError, match=r'is of moon: {"pedals": "one"} are options of car-racing'):
+        moon.with_controllers(None, Variant(pedals="one"))
+
+
+def test_what_ships_drives_by_every_variant():
+    tiny = find_bundle("tiny")
+    for variant in VARIANTS.values():
+        policy = PolicyStep(tiny.with_controllers(None, variant))
+        parameters, picture = vectors(tiny.with_controllers(None, variant), 1), np.zeros((1, 64, 64, 3), np.uint8)
+        assert np.isfinite(policy.step(picture, parameters, policy.zero_state(1)).action).all()

@@ -1,0 +1,119 @@
+"""Simulated workers: the whole protocol and no scoring, many in one process, to load a real coordinator."""
+
+from __future__ import annotations
+
+import queue
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import zenoh
+
+from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import CountingDecoder, encode, encoding
+from dreamfleet.common.protocol.messages import MAX_LEASES, TAG_BYTES, Heartbeat, JobBatch, Result, ResultBatch
+from dreamfleet.common.transport.session import Network, enqueue_into, open_session
+from dreamfleet.worker.bench.sleep_tasks import NULL_TASK
+from dreamfleet.worker.service.admission import Admission, make_request, request_admission
+from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.outbox import Outbox
+
+
+@dataclass
+class SimulatedWorker:
+    """One worker: its jobs end as they come."""
+
+    identity: str
+    admission: Admission
+    slots: int
+    backlog: Backlog = field(init=False)
+    outbox: Outbox = field(init=False)
+    beat_at: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.backlog = Backlog(self.admission.spec)
+        self.backlog.start_numbering(self.admission.numbering)
+        self.outbox = Outbox(self.admission.intervals.repeat)
+
+    def take(self, batch: JobBatch) -> None:
+        """Finish every job of a batch."""
+        self.backlog.add_batch(batch)
+        self.outbox.acknowledge(verdict.digest for verdict in batch.verdicts)
+        for job, _ in self.backlog.take(MAX_LEASES):
+            self.outbox.add(Result(job.digest, float(job.seeds[0] % 1000), 1, 0.0, None, None))
+
+    def beat(self) -> Heartbeat:
+        """What it holds: nothing but results without a verdict."""
+        run = self.admission
+        return Heartbeat(
+            run_uid=run.run_uid, incarnation=run.incarnation, nonce=run.nonce,
+            numbering=self.backlog.numbering, seen=self.backlog.seen, capacity=self.slots, slots=self.slots, queued=(),
+            running=(),
+            unacked=tuple(digest[:TAG_BYTES] for digest in self.outbox.digests), load=0.0, steps_per_second=0.0,
+            drawn_by="-",
+        )  # fmt: skip
+
+
+def run_simulated_workers(endpoint: str, count: int, slots: int) -> None:
+    """Join as `count` workers and work until killed."""
+    session, inbox = _connect(endpoint), CountingDecoder()
+    events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+    crowd: dict[str, SimulatedWorker] = {}
+    declarations: list[Any] = []
+    for number in range(count):
+        identity = keys.new_worker_identity(f"crowd-{number}")
+        request = make_request(identity, (NULL_TASK,), slots)
+        while (admission := request_admission(session, None, request, inbox)) is None:
+            time.sleep(0.1)
+        crowd[identity] = SimulatedWorker(identity, admission, slots)
+        declarations.append(session.declare_subscriber(keys.job(admission.run, identity), enqueue_into(events, "job")))
+        declarations.append(session.liveliness().declare_token(keys.live_worker(admission.run, identity)))
+        _handle_and_send(session, crowd, events, inbox, wait=0.0)
+    while True:
+        _handle_and_send(session, crowd, events, inbox, wait=0.02)
+
+
+def _connect(endpoint: str) -> zenoh.Session:
+    while True:
+        try:
+            return open_session(Network(connect=(endpoint,)), timeout=1.0)
+        except ConnectionFailedError:
+            time.sleep(0.1)
+
+
+def _handle_and_send(
+    session: zenoh.Session,
+    crowd: dict[str, SimulatedWorker],
+    events: queue.SimpleQueue[tuple[str, Any]],
+    inbox: CountingDecoder,
+    wait: float,
+) -> None:
+    """Handle what has come, send results and beats that are due."""
+    active: set[str] = set()
+    try:
+        _, sample = events.get(timeout=wait) if wait else events.get_nowait()
+        while True:
+            batch = inbox.decode(JobBatch, sample.payload.to_bytes())
+            identity = keys.worker_from_key(str(sample.key_expr))
+            if batch is not None and identity in crowd:
+                crowd[identity].take(batch)
+                active.add(identity)
+            _, sample = events.get_nowait()
+    except queue.Empty:
+        pass
+    now = time.monotonic()
+    for identity, worker in crowd.items():
+        run = worker.admission
+        if now >= worker.beat_at:
+            worker.beat_at = now + run.intervals.beat
+            active.add(identity)
+            session.put(keys.beat(run.run, identity), encode(worker.beat()), encoding=encoding(Heartbeat))
+        if identity not in active:
+            continue
+        for results in worker.outbox.due(now):
+            message = ResultBatch(
+                run_uid=run.run_uid, incarnation=run.incarnation, fingerprint=fingerprint(run.packages), results=results
+            )
+            session.put(keys.result(run.run, identity), encode(message), encoding=encoding(ResultBatch))

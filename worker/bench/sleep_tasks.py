@@ -1,0 +1,71 @@
+"""Tasks whose episodes cost a known time, for measuring everything around them."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.worker.tasks.api import Assignment, Continuous, Task, World
+
+SLEEP_SECONDS = 0.05
+SLEEP_TASK, NULL_TASK = (f"{__name__}:{name}" for name in ("Naps", "Nulls"))
+
+
+class SleepEnvironment(gymnasium.Env[Any, Any]):
+    """One step, which takes `seconds`; the reward follows from the seed."""
+
+    def __init__(self, seconds: float) -> None:
+        self.observation_space = gymnasium.spaces.Box(-1, 1, (1,))
+        self.action_space = gymnasium.spaces.Box(-1, 1, (1,))
+        self._seconds = seconds
+        self._seed = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:  # noqa: ARG002 - gymnasium's
+        """Begin."""
+        super().reset(seed=seed)
+        self._seed = seed or 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, _action: Any) -> Any:
+        """Sleep, and end."""
+        if self._seconds:
+            time.sleep(self._seconds)
+        return np.zeros(1, np.float32), float(self._seed % 1000), True, False, {}
+
+
+class IdlePolicy:
+    """A policy that does nothing."""
+
+    def begin(self, parameters: NDArray[np.float32]) -> None:
+        """Begin an episode."""
+
+    def act(self, observation: Any) -> Any:
+        """No action."""
+        return observation
+
+
+class SleepTask(Task):
+    """Episodes of 50 ms."""
+
+    name = SLEEP_TASK
+    world = World(actions=Continuous.between([-1.0], [1.0]))
+    seconds = SLEEP_SECONDS
+
+    def make_environment(self, _assignment: Assignment) -> gymnasium.Env[Any, Any]:
+        """A nap."""
+        return SleepEnvironment(self.seconds)
+
+    def make_policy(self, _assignment: Assignment) -> IdlePolicy:
+        """Of any bundle."""
+        return IdlePolicy()
+
+
+class NullTask(SleepTask):
+    """Episodes of no time."""
+
+    name = NULL_TASK
+    seconds = 0.0

@@ -1,0 +1,47 @@
+"""A policy that chooses one of a few actions and holds it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+
+
+class FrameSkipPolicy(ABC):
+    """Chooses by a picture, and holds what it chose for `frame_skip` steps."""
+
+    def __init__(self, choices: Sequence[Sequence[float]], frame_skip: int) -> None:
+        """`choices` are steering, gas and brake of each."""
+        self._actions, self._frame_skip = np.array(choices, np.float32), frame_skip
+        self._steps_held = 0
+        self.choice = 0
+
+    @property
+    def is_new_decision(self) -> bool:
+        """Whether the last action was a new decision, and not one that was held."""
+        return self._steps_held == 1
+
+    def begin(self, _parameters: Floats) -> None:
+        """Begin an episode: nothing is held, and nothing is remembered."""
+        self._steps_held = 0
+        self.reset_memory()
+
+    def act(self, observation: NDArray[np.uint8]) -> Floats:
+        """Steering, gas and brake `(3,)` for one picture."""
+        if self._steps_held in (0, self._frame_skip):
+            self.choice, self._steps_held = self.choose(observation), 0
+        self._steps_held += 1
+        action: Floats = self._actions[self.choice]
+        return action
+
+    @abstractmethod
+    def reset_memory(self) -> None:
+        """Be as an episode begins."""
+
+    @abstractmethod
+    def choose(self, picture: NDArray[np.uint8]) -> int:
+        """The number of the next choice."""

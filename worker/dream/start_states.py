@@ -1,0 +1,81 @@
+"""Where dreams begin: at first pictures with an empty memory, or at recorded states, with what a drive remembered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.bundle import INITIAL_LATENTS_PART, RECORDED_STATES, Bundle
+from dreamfleet.common.artifacts.onnx_checks import read_float_array
+from dreamfleet.common.errors import BundleError, UsageError
+
+Floats = NDArray[np.float32]
+START_SPAWN_KEY = (1,)  # the spawn key of what chooses a beginning: it takes nothing from a dream's other chance
+
+
+class StartState(NamedTuple):
+    """One of them: `mu`, `logvar` `(latent,)`, and the model's recurrent state `memory` `(memory,)`."""
+
+    mu: Floats
+    logvar: Floats
+    memory: Floats
+
+
+@dataclass(frozen=True)
+class StartStates:
+    """All that a bundle has, and the share of dreams that begins at recorded states.
+
+    `initial` `(N, 2, latent)` are the mu and logvar of first pictures, `recorded` `(M, 2 * latent + memory)` those of
+    recorded moments, with what the model remembered there. `empty` `(memory,)` is what it remembers before it has seen
+    anything; zeros unless it is given.
+    """
+
+    initial: Floats
+    recorded: Floats
+    share: float = 0.0
+    empty: Floats | None = None
+
+    @classmethod
+    def of(cls, bundle: Bundle, share: float, empty: Floats) -> StartStates:
+        """A bundle's own, by its model's `empty` memory; `UsageError` for a share that is none.
+
+        `BundleError` where recorded states are asked for and there are none, or they are of another model.
+        """
+        check_recorded_share(share)
+        initial, width = read_float_array(bundle.read(INITIAL_LATENTS_PART)), 2 * bundle.manifest.latent + len(empty)
+        if not share:
+            return cls(initial, np.zeros((0, width), dtype=np.float32), empty=empty)
+        recorded = bundle.read_recorded()
+        if recorded.shape[1] != width:
+            raise BundleError(
+                f"{bundle.path}: a state in {RECORDED_STATES} has {recorded.shape[1]} numbers, its model {width}; "
+                "build the bundle again"
+            )
+        return cls(initial, recorded, share, empty)
+
+    def choose(self, seed: int, first: int) -> StartState:
+        """Where the dream of this seed begins: at a recorded state, or else at the `first` of the first pictures.
+
+        A seed that begins at a recorded state does so at every larger share, at the same one.
+        """
+        if self.share:
+            random = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=START_SPAWN_KEY)))
+            if random.random() < self.share:
+                return self._recorded(int(random.integers(len(self.recorded))))
+        mu, logvar = self.initial[first]
+        memory = np.zeros(self.recorded.shape[1] - 2 * len(mu), np.float32) if self.empty is None else self.empty
+        return StartState(mu, logvar, memory)
+
+    def _recorded(self, index: int) -> StartState:
+        latent = self.initial.shape[2]
+        mu, logvar, memory = np.split(self.recorded[index], [latent, 2 * latent])
+        return StartState(mu, logvar, memory)
+
+
+def check_recorded_share(share: float) -> None:
+    """`UsageError` unless it is from 0 to 1."""
+    if not 0 <= share <= 1:
+        raise UsageError(f"the share of dreams that begins at recorded states must be from 0 to 1, not {share}")

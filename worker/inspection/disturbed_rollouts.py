@@ -1,0 +1,168 @@
+"""Drives under disturbed actions, with the simulator's truth beside what a world model held at each step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs.seeds import VALIDATION
+from dreamfleet.worker.inspection.encoded_rollout import ZOOM
+from dreamfleet.worker.scoring.actors import Actor
+from dreamfleet.worker.scoring.disturbance import Disturbance
+from dreamfleet.worker.scoring.disturbed_policy import DisturbedPolicy
+from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
+from dreamfleet.worker.tasks.api import Assignment, RecordableTask, Task, TaskWithTrueState
+from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
+
+Floats = NDArray[np.float32]
+Truth = dict[str, NDArray[np.float64]]
+OFF, OFFSET = "off_road", "lateral_offset"  # of a world's truth: 1 or 0; how far off it is
+
+
+@dataclass(frozen=True)
+class DisturbedDriveConfig:
+    """How drives are disturbed, and where they end.
+
+    `noise` is the standard deviation of what is added to each action, in halves of its range. The road is lost where
+    the car is off it for `lasting` steps in a row; a drive goes on `after` steps from the first of them. The first
+    `opening` steps are not measured: in CarRacing's the camera comes down. `anywhere` begins drives at a random place
+    of their world, for drivers that never come far.
+    """
+
+    noise: float = 0.3
+    steps: int = 1000
+    lasting: int = 10
+    after: int = 40
+    opening: int = ZOOM
+    first_seed: int = VALIDATION.start
+    anywhere: bool = False
+
+
+@dataclass(frozen=True)
+class DisturbedDrive:
+    """T steps: before each what the mind held, `latent` (T, latent) and `state` (T, state), and the `truth` (T,).
+
+    Then the `action` (T, actions) that was done, `push` (T, actions) of it the disturbance, and its `reward` (T,).
+    `lost` is the first step of the loss that ended it, if one did; `hidden` how many columns of the state are h.
+    """
+
+    seed: int
+    latent: Floats
+    state: Floats
+    hidden: int
+    truth: Truth
+    action: Floats
+    push: Floats
+    reward: NDArray[np.float64]
+    lost: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    @property
+    def features(self) -> Floats:
+        """[z, h] of each step `(T, latent + hidden)`: what a controller sees."""
+        return np.concatenate([self.latent, self.state[:, : self.hidden]], axis=1)
+
+
+@dataclass
+class Notes:
+    """What a witness writes down, step by step."""
+
+    latent: list[Floats] = field(default_factory=list)
+    state: list[Floats] = field(default_factory=list)
+    truth: list[dict[str, float]] = field(default_factory=list)
+    action: list[Floats] = field(default_factory=list)
+    push: list[Floats] = field(default_factory=list)
+
+
+class DisturbedDriveRecorder(DisturbedPolicy):
+    """A policy that drives by a disturbed hand, and notes what was true and what the mind held."""
+
+    def __init__(
+        self, mind: RecurrentState, actor: Actor, disturbance: Disturbance, truth: Callable[[], dict[str, float]]
+    ) -> None:
+        super().__init__(actor, disturbance, mind)
+        self._mind, self._truth = mind, truth
+        self.notes, self.hidden = Notes(), mind.hidden
+
+    def on_action(self, action: Floats, push: Floats) -> None:
+        """Write a step down."""
+        notes, mind = self.notes, self._mind
+        notes.latent.append(mind.latent[0])
+        notes.state.append(mind.state[0])
+        notes.truth.append(self._truth())
+        notes.action.append(action[0])
+        notes.push.append(push[0])
+
+
+def witness(
+    bundle: Bundle, mind: RecurrentState, hand_of: Callable[[int], Actor], config: DisturbedDriveConfig
+) -> Iterator[DisturbedDrive]:
+    """One drive a seed after the other, without end; `mind` is the bundle's, `hand_of` gives the hand of a seed.
+
+    `UsageError` where the bundle's world tells no truth, or its actions cannot be disturbed.
+    """
+    assignment = Assignment.of(bundle.manifest.task, bundle)
+    task = find_task(bundle.manifest.task)
+    if not isinstance(task, TaskWithTrueState):
+        raise UsageError(f"task {task.name} tells no truth to compare with: give it a `truth` (docs/tasks.md)")
+    if not isinstance(actions := task.world_of(assignment).actions, Continuous):
+        raise UsageError(f"task {task.name} has no continuous actions: its drives cannot be disturbed")
+    begin_at = _random_begin(task) if config.anywhere else lambda _seed: None
+    environment = task.make_environment(assignment)
+    try:
+        for seed in count(config.first_seed):
+            disturbance = Disturbance(seed, actions, config.noise)
+            witness = DisturbedDriveRecorder(mind, hand_of(seed), disturbance, lambda: task.truth(environment))
+            yield _drive(environment, witness, EpisodeConfig(seed, config.steps), config, begin_at(seed))
+    finally:
+        environment.close()
+
+
+def _random_begin(task: Task) -> Callable[[int], ResetHook]:
+    if not isinstance(task, RecordableTask):
+        raise UsageError(f"drives of task {task.name} cannot begin anywhere: let a --controller drive")
+    begin = task.begin_anywhere
+    return lambda seed: lambda environment, _seen: begin(environment, np.random.default_rng(seed))
+
+
+def _drive(
+    environment: gymnasium.Env[Any, Any],
+    witness: DisturbedDriveRecorder,
+    episode_config: EpisodeConfig,
+    config: DisturbedDriveConfig,
+    begin: ResetHook | None,
+) -> DisturbedDrive:
+    witness.begin()
+    notes, rewards, lost, off = witness.notes, [], None, 0
+    for moment in run_episode(environment, witness, episode_config, begin):
+        rewards.append(moment.reward)
+        off = off + 1 if notes.truth[-1].get(OFF) else 0
+        if lost is None and off == config.lasting:
+            lost = moment.step - config.lasting
+        if lost is not None and moment.step >= lost + config.after:
+            break
+    columns = {name: np.array([each[name] for each in notes.truth]) for name in notes.truth[0]}
+    latent, state, action, push = map(np.stack, (notes.latent, notes.state, notes.action, notes.push))
+    return DisturbedDrive(
+        episode_config.seed, latent, state, witness.hidden, columns, action, push, np.array(rewards), lost
+    )
+
+
+def first_sustained(off: NDArray[np.bool_], lasting: int) -> NDArray[np.int64]:
+    """Where each row `(rows, T)` is first off for `lasting` steps in a row `(rows,)`; -1: nowhere."""
+    if off.shape[1] < lasting:
+        return np.full(len(off), -1)
+    stays: NDArray[np.bool_] = np.all(np.lib.stride_tricks.sliding_window_view(off, lasting, axis=1), axis=2)
+    return np.where(stays.any(axis=1), stays.argmax(axis=1), -1)

@@ -1,0 +1,84 @@
+"""Dreams that begin at a step of a real drive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.worker.dream.noise import BLOCK_STEPS, EpisodeNoise, stack_draws
+from dreamfleet.worker.dream.world import DreamWorld
+from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDrive
+from dreamfleet.worker.scoring.disturbance import add_disturbance
+from dreamfleet.worker.worldmodel.inference import Controllers
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DreamSegment:
+    """A step of a drive from which dreams begin, and how many steps they last."""
+
+    drive: DisturbedDrive
+    step: int
+    length: int
+
+    @property
+    def steps(self) -> slice:
+        """The drive's steps that are dreamt."""
+        return slice(self.step, self.step + self.length)
+
+
+class DriveDreamer:
+    """Dreams from real states on, under a controller that is pushed as in reality, or under reality's own actions."""
+
+    def __init__(self, bundle: Bundle, controller: Controller, temperature: float, rows: int) -> None:
+        fitting = bundle.for_controller(controller)
+        self._world, self._controllers = DreamWorld(fitting, temperature), Controllers(fitting)
+        self._hidden = bundle.manifest.hidden
+        self._parameters = np.repeat(controller.parameters[None], rows, axis=0)
+
+    def dream(self, segment: DreamSegment, *, own: bool) -> tuple[Floats, Doubles]:
+        """[z, h] `(dreams, steps, features)`, the first step's reality's, and rewards `(dreams, steps)`.
+
+        `own`: the controller chooses what is done; else what was done in reality is done again. A dream that ends stays
+        as it was, and brings nothing more.
+        """
+        drive, rows, features, rewards = segment.drive, len(self._parameters), list[Floats](), list[Doubles]()
+        noises = [
+            EpisodeNoise((drive.seed << 20) + segment.step * rows + row, self._world.chance) for row in range(rows)
+        ]
+        latent, state = (np.repeat(each[segment.step][None], rows, axis=0) for each in (drive.latent, drive.state))
+        going = np.ones((rows, 1), dtype=bool)
+        for action, push in zip(drive.action[segment.steps], drive.push[segment.steps], strict=True):
+            features.append(np.concatenate([latent, state[:, : self._hidden]], axis=1))
+            chosen = self._controllers.act(self._parameters, latent, state) if own else None
+            done = np.repeat(action[None], rows, axis=0) if chosen is None else self._pushed(chosen, push)
+            draw = stack_draws([noise.next() for noise in noises], axis=0).map(np.concatenate)
+            moment = self._world.imagine(latent, done, state, draw, chosen)
+            rewards.append(np.where(going[:, 0], moment.reward, 0.0))
+            latent, state = np.where(going, moment.latent, latent), np.where(going, moment.state, state)
+            going = going & ~moment.done[:, None]
+        return np.stack(features, axis=1), np.stack(rewards, axis=1)
+
+    def predict_next(self, drive: DisturbedDrive) -> tuple[Floats, Doubles]:
+        """[z, h] of each step `(T, features)`, z as dreamt from the real step before, and its foretold reward `(T,)`.
+
+        The first z is the picture's own.
+        """
+        noise = EpisodeNoise(drive.seed, self._world.chance)
+        pieces = [noise.draw_block() for _ in range(0, len(drive), BLOCK_STEPS)]
+        draw = stack_draws(pieces, axis=0).map(lambda part: part.reshape(-1, part.shape[-1])[: len(drive)])
+        moment = self._world.imagine(drive.latent, drive.action, drive.state, draw)
+        latent = np.concatenate([drive.latent[:1], moment.latent[:-1]])
+        return np.concatenate([latent, drive.state[:, : self._hidden]], axis=1), moment.reward
+
+    def _pushed(self, chosen: Floats, push: Floats) -> Floats:
+        actions = self._world.world.actions
+        assert isinstance(actions, Continuous)
+        return add_disturbance(actions, chosen, push[None])

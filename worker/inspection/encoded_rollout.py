@@ -1,0 +1,129 @@
+"""A drive, and what the encoder makes of it: a fresh one in a bundle's own world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.scoring.actors import check_same_pictures
+from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
+from dreamfleet.worker.tasks.api import Assignment, Continuous, Policy, RecordableTask, World
+from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.worldmodel.inference import Encoder
+
+Floats = NDArray[np.float32]
+Pictures = NDArray[np.uint8]
+ZOOM = 50  # steps: CarRacing's camera comes down in the first second
+
+
+@dataclass(frozen=True)
+class DriveConfig:
+    """Which track, and how far."""
+
+    seed: int = 20_000  # a validation track
+    steps: int = 300
+    action: tuple[float, ...] = ()  # done at each step, whoever else could drive
+
+
+@dataclass(frozen=True)
+class EncodedRollout:
+    """T steps: `picture` (T, side, side, 3) and its `mu`, `logvar` (T, latent); then `action` (T, 3), `reward` (T,)."""
+
+    picture: Pictures
+    mu: Floats
+    logvar: Floats
+    action: Floats
+    reward: NDArray[np.float64]
+    description: str  # what drive it is
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    @property
+    def nats(self) -> Floats:
+        """What each latent carries `(latent,)`: its divergence from the standard normal, on average."""
+        nats: Floats = self._divergence.mean(axis=0)
+        return nats
+
+    @property
+    def most_active(self) -> NDArray[np.int64]:
+        """The latents' numbers `(latent,)`, those that carry most first."""
+        return np.argsort(-self.nats, kind="stable")
+
+    @property
+    def most_informative_step(self) -> int:
+        """The step whose picture says most; of a drive that is long enough, one after the opening's zoom."""
+        start = ZOOM if len(self) > ZOOM else 0
+        return start + int(self._divergence[start:].sum(axis=1).argmax())
+
+    @property
+    def _divergence(self) -> Floats:
+        """In nats `(T, latent)`."""
+        told: Floats = 0.5 * (self.mu**2 + np.exp(self.logvar) - self.logvar - 1)
+        return told
+
+
+class ConstantDriver:
+    """A driver that does the same at each step; `UsageError` for what is no action of the world."""
+
+    def __init__(self, action: Sequence[float], world: World) -> None:
+        actions, names = world.actions, world.action_names
+        done = np.array(action, np.float64)
+        if not isinstance(actions, Continuous) or done.shape != (actions.actions,):
+            wanted = f"{', '.join(names)}: {len(names)} numbers" if names else "numbers, of a world with such actions"
+            raise UsageError(f"--action takes {wanted}, not {_format_action(action)}")
+        if not ((actions.low <= done) & (done <= actions.high)).all():
+            bounds = ", ".join(
+                f"{name} from {low:g} to {high:g}"
+                for name, low, high in zip(names, actions.low, actions.high, strict=True)
+            )
+            raise UsageError(f"--action takes {bounds}, not {_format_action(action)}")
+        self._done = done.astype(np.float32)
+
+    def act(self) -> Floats:
+        """The action."""
+        return self._done
+
+
+def _format_action(action: Sequence[float]) -> str:
+    return " ".join(f"{each:g}" for each in action)
+
+
+def record_drive(
+    bundle: Bundle, controller: Controller | None, config: DriveConfig, own: Bundle | None = None
+) -> EncodedRollout:
+    """Drive one episode: one action alone, else the controller, else the world's second random driver, which drifts.
+
+    `own` is the controller's world model, where that is another than the bundle which sees the drive.
+    """
+    if own is not None:
+        check_same_pictures(own, bundle)
+    assignment = Assignment.of(bundle.manifest.task, own or bundle)
+    task, driver = find_task(bundle.manifest.task), "the controller"
+    policy: Policy = task.make_policy(assignment)
+    if config.action:
+        driver, policy = (
+            f"one action alone, {_format_action(config.action)}",
+            DriverPolicy(ConstantDriver(config.action, task.world)),
+        )
+    elif controller is not None:
+        policy.begin(controller.parameters)
+    elif isinstance(task, RecordableTask):
+        driver = "a random driver"
+        policy = DriverPolicy(list(task.drivers.values())[1 % len(task.drivers)](np.random.default_rng(config.seed)))
+    else:
+        raise UsageError(f"task {bundle.manifest.task} has no driver: look at a run, whose controller drives")
+    environment = task.make_environment(assignment)
+    moments = list(run_episode(environment, policy, EpisodeConfig(config.seed, config.steps)))
+    environment.close()
+    seen = np.stack([moment.seen for moment in moments])
+    mu, logvar = Encoder(bundle).encode(seen)
+    actions, rewards = np.stack([moment.action for moment in moments]), np.array([each.reward for each in moments])
+    return EncodedRollout(seen, mu, logvar, actions, rewards, f"a fresh drive by {driver}")

@@ -1,0 +1,100 @@
+"""Figures of a world model, measured on disturbed drives of its world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDrive, DisturbedDriveConfig, witness
+from dreamfleet.worker.inspection.knowledge import Knowledge, cross_validate_probes
+from dreamfleet.worker.inspection.likeness import RareFrequency
+from dreamfleet.worker.inspection.likeness import compare as alike
+from dreamfleet.worker.inspection.road_losses import RoadLossComparison, RoadLossConfig, collect_losing_drives, compare
+from dreamfleet.worker.scoring.actors import Actor, make_controller_actor, make_driver_actors
+from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
+
+OnCount = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class DriverChoice:
+    """Who drives: a controller and its own world model, or a random driver of the world by name."""
+
+    controller: Controller | None = None
+    own: Bundle | None = None
+    driver: str = ""
+
+    def observing_model(self, bundle: Bundle) -> Bundle:
+        """The world model that watches, under the controller if that drives by it."""
+        if self.controller is None or self.controller.bundle != bundle.sha256:
+            return bundle
+        return bundle.for_controller(self.controller)
+
+    def hands(self, bundle: Bundle, mind: RecurrentState) -> Callable[[int], Actor]:
+        """The hand of each seed."""
+        if self.controller is None:
+            return make_driver_actors(bundle, self.driver)
+        if self.own is None:
+            raise UsageError("this controller sees no world model: give one that was evolved with one")
+        actor = make_controller_actor(self.controller, self.own, bundle, mind)
+        return lambda _seed: actor
+
+
+def probe(
+    bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig, episodes: int, on_drive: OnCount
+) -> Knowledge:
+    """What the world model holds of the truth on so many drives."""
+    drives = []
+    for drive in islice(_drives(bundle, driving, config), episodes):
+        drives.append(drive)
+        on_drive(len(drives))
+    return cross_validate_probes(drives, config.opening)
+
+
+def likeness(
+    bundle: Bundle,
+    driving: DriverChoice,
+    config: DisturbedDriveConfig,
+    dreams: RoadLossConfig,
+    episodes: int,
+    on_drive: OnCount,
+) -> list[RareFrequency]:
+    """How often dreams come to what is rare on so many drives; `UsageError` as of `dream_losses`."""
+    controller = _dream_controller(bundle, driving)
+    drives = []
+    for drive in islice(_drives(bundle, driving, config), episodes):
+        drives.append(drive)
+        on_drive(len(drives))
+    return alike(drives, bundle, controller, config.opening, dreams.dreams, dreams.temperature)
+
+
+def measure_dream_losses(
+    bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig, losses: RoadLossConfig, on_loss: OnCount
+) -> tuple[list[RoadLossComparison], int]:
+    """Dreams begun before real losses of the road, and how many drives it took to find these.
+
+    `UsageError` unless a controller drives that was evolved with this world model: it has to drive on in the dream.
+    """
+    controller = _dream_controller(bundle, driving)
+    drives = collect_losing_drives(_drives(bundle, driving, config), losses, config, on_loss)
+    return compare(drives, bundle, controller, losses, config), len(drives)
+
+
+def _dream_controller(bundle: Bundle, driving: DriverChoice) -> Controller:
+    """Who drives in dreams too."""
+    controller = driving.controller
+    if controller is None or controller.bundle != bundle.sha256:
+        raise UsageError(
+            "these dreams need a --controller that was evolved with this world model: it drives them; "
+            "`dreamfleet refit CONTROLLER --to BUNDLE --data FOLDER` fits another one to it"
+        )
+    return controller
+
+
+def _drives(bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig) -> Iterator[DisturbedDrive]:
+    mind = RecurrentState(driving.observing_model(bundle))
+    return witness(bundle, mind, driving.hands(bundle, mind), config)

@@ -1,0 +1,219 @@
+"""The whole look: from a bundle, a run or trainings to a folder of pictures and a page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle, shipped_names
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.errors import BundleError, DatasetError, JournalError, MissingExtraError, UsageError
+from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.regular_files import is_file
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.runs.stages import begun_stages, join_distinct
+from dreamfleet.worker.dream.parallel_dream import can_dream
+from dreamfleet.worker.inspection import curve_sections, mdnrnn_sections, vae_sections
+from dreamfleet.worker.inspection.encoded_rollout import DriveConfig, EncodedRollout, record_drive
+from dreamfleet.worker.inspection.own_pictures import own_pictures
+from dreamfleet.worker.inspection.page import Page, Section
+from dreamfleet.worker.inspection.tables import measured_rows
+from dreamfleet.worker.inspection.training_curves import MODELS, TrainingCurves, load_trainings
+from dreamfleet.worker.inspection.vae_view import CHECKPOINT, VAEView, held_out_drive
+
+PAGE = "index.html"
+UNITS = {  # of figures of quality, by a part of their names, and what is good
+    "picture_error": "summed squared error of the mean picture, which a reconstruction has to beat",
+    "reconstruction_error": "summed squared error of a picture: the less, the better",
+    "nats_per_dimension": "of the next latent: the less, the better",
+    "latent_error": "root mean square, in the latents' spread: 0 is exact, 1 as bad as their mean",
+    "auc": "0.5 is chance, 1 exact",
+}
+DRIVEN = ("episodes", "frames", "held_out_episodes")  # of a bundle's provenance
+
+
+@dataclass(frozen=True)
+class InspectionSubject:
+    """What is looked at: a bundle; of a run, its controller too. A run without a world model shows how it went.
+
+    With neither, trainings alone are looked at. `own` is the controller's world model, where that is another.
+    """
+
+    bundle: Bundle | None
+    controller: Controller | None = None
+    run: RunFolder | None = None
+    own: Bundle | None = None
+
+
+@contextmanager
+def find_subject(name: str, runs_dir: Path) -> Iterator[InspectionSubject]:
+    """A bundle by file or shipped name, else a run by name."""
+    if is_file(Path(name)) or name in shipped_names():
+        yield InspectionSubject(find_bundle(name))
+        return
+    try:
+        run = open_run(runs_dir, name)
+    except JournalError as error:
+        shipped = ", ".join(shipped_names()) or "none"
+        raise BundleError(f"no bundle {name!r} (a file, or one that ships: {shipped}), and {error}") from error
+    with run:
+        if not run.spec.bundle:
+            yield InspectionSubject(None, run=run)
+            return
+        bundle = Bundle.open(run.bundle_path, run.spec.bundle)
+        if not run.controller_path.exists():
+            yield InspectionSubject(bundle, run=run)
+            return
+        controller = Controller.load(run.controller_path)
+        yield InspectionSubject(bundle.for_controller(controller), controller, run)
+
+
+def write_page(
+    subject: InspectionSubject, out: Path, config: DriveConfig, data: Sequence[Path] = (),
+    on_section: Callable[[int, str], None] = lambda _done, _name: None, pictures: Sequence[Path] = (),
+) -> Path:  # fmt: skip
+    """Write a PNG a section and the page, with the trainings in the folders of `data`; returns the page's path.
+
+    `pictures` are files of one's own, which the bundle's VAE looks at, else that of the first folder.
+    """
+    sections: list[Section] = []
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        trained = load_trainings(data)
+        for section in sections_of(subject, config, data, pictures, trained):
+            sections.append(section)
+            on_section(len(sections), section.name)
+            if section.picture is not None:
+                with atomic_write(out / f"{section.name}.png") as file:
+                    file.write(section.picture)
+        with atomic_write(out / PAGE) as file:
+            file.write(_page(subject, trained, sections).html().encode(errors="replace"))
+    except OSError as error:
+        raise DatasetError(f"cannot write in {out}: {error.strerror}; choose another --out") from error
+    return out / PAGE
+
+
+def _page(subject: InspectionSubject, trained: Sequence[TrainingCurves], sections: list[Section]) -> Page:
+    told = [(f"{each.name}, {MODELS[each.model]}", each.summary) for each in trained]
+    if subject.bundle is not None:
+        title = f"{subject.bundle.manifest.name}, a world model"
+        about = f"{subject.bundle.path.name}, SHA-256 {subject.bundle.sha256}"
+        return Page(title, about, manifest_facts(subject.bundle) + told, sections)
+    if subject.run is None:
+        names = ", ".join(dict.fromkeys(each.name for each in trained))
+        return Page(f"How {names} learnt", f"trainings: {len(told)}", told, sections)
+    settings, history = subject.run.settings, subject.run.history()
+    stages = begun_stages(settings, history, subject.run.evaluations())
+    rows = [
+        ("task", settings.task.task),
+        ("controller", f"{settings.controller.size} parameters, layers {settings.controller.layers}"),
+        ("population", join_distinct(f"{each.stage.population} x {each.stage.episodes} episodes" for each in stages)),
+        ("generations", str(len(history))),
+    ]
+    return Page(f"{subject.run.name}, a run without a world model", f"run {subject.run.uid}", rows + told, sections)
+
+
+def sections_of(
+    subject: InspectionSubject,
+    config: DriveConfig,
+    data: Sequence[Path],
+    pictures: Sequence[Path],
+    trained: Sequence[TrainingCurves],
+) -> Iterator[Section]:
+    """The sections of the page, each as it is drawn."""
+    if pictures:
+        yield own_pictures(_find_vae_view(subject, data), pictures)
+    if subject.bundle is not None:
+        yield from _bundle_sections(subject.bundle, subject, config)
+    else:
+        yield from _vae_sections(data, config)
+    yield from _fitness_section(subject)
+    yield from curve_sections.loss_sections(trained)
+
+
+def _find_vae_view(subject: InspectionSubject, data: Sequence[Path]) -> VAEView:
+    if subject.bundle is not None:
+        return VAEView.of_bundle(subject.bundle)
+    if not data:
+        raise UsageError(
+            "--picture is looked at by a VAE, and this run has none: name a bundle, or a training's --data"
+        )
+    return VAEView.of_folder(data[0])
+
+
+def _vae_sections(data: Sequence[Path], config: DriveConfig) -> Iterator[Section]:
+    """What VAEs keep that no bundle need hold yet: of one folder everything, of several the pictures of each."""
+    folders = [each for each in data if (each / CHECKPOINT).exists() and any(each.glob("episodes/[0-9]*.npz"))]
+    for number, folder in enumerate(folders, 1):
+        try:
+            vae_view = VAEView.of_folder(folder)
+        except MissingExtraError as error:
+            yield Section("reconstructions", "What it sees, and what it keeps", f"Not shown: {error}")
+            return
+        driven = held_out_drive(folder, vae_view, config)
+        section = vae_sections.reconstructions(driven, vae_view)
+        if len(folders) > 1:
+            yield replace(section, name=f"{section.name}-{number}", title=f"{section.title}: {folder.resolve().name}")
+            continue
+        yield section
+        yield from _latent_sections(driven, vae_view)
+
+
+def _bundle_sections(bundle: Bundle, subject: InspectionSubject, config: DriveConfig) -> Iterator[Section]:
+    driven, vae_view = record_drive(bundle, subject.controller, config, subject.own), VAEView.of_bundle(bundle)
+    yield vae_sections.reconstructions(driven, vae_view)
+    yield from _latent_sections(driven, vae_view)
+    yield from _dream_sections(bundle, driven, vae_view)
+
+
+def _latent_sections(driven: EncodedRollout, vae_view: VAEView) -> Iterator[Section]:
+    yield vae_sections.traversals(driven, vae_view)
+    yield vae_sections.latent_moments(driven)
+    yield vae_sections.samples(vae_view)
+
+
+def _fitness_section(subject: InspectionSubject) -> Iterator[Section]:
+    if subject.run is not None and (evolved := curve_sections.fitness_section(subject.run)):
+        yield evolved
+
+
+def _dream_sections(bundle: Bundle, driven: EncodedRollout, vae_view: VAEView) -> Iterator[Section]:
+    if not can_dream(bundle):
+        text = "This bundle is from before dreams; build it again with `dreamfleet bundle` to see one."
+        yield Section("dream", "A dream beside the drive", text)
+        return
+    yield mdnrnn_sections.dream_section(bundle, driven, vae_view)
+    if bundle.manifest.models.get("mdnrnn", {}).get("reward", "none") != "none":
+        yield mdnrnn_sections.reward_section(bundle, driven)
+    if looked := mdnrnn_sections.attention_section(bundle, driven):
+        yield looked
+
+
+def _with_unit(name: str, value: object) -> str:
+    """A figure of quality with its unit, and what is good."""
+    return next((f"{value} ({unit})" for known, unit in UNITS.items() if known in name), str(value))
+
+
+def manifest_facts(bundle: Bundle) -> list[tuple[str, str]]:
+    """What the manifest tells: sizes, models, origin, and the figures of quality on held-out drives."""
+    manifest, provenance = bundle.manifest, bundle.manifest.provenance
+    model, quality = manifest.models.get("mdnrnn", {}), provenance.get("quality", {})
+    rows = [
+        ("pictures", " x ".join(str(size) for size in manifest.picture)),
+        ("latents", str(manifest.latent)),
+        ("hidden units", str(manifest.hidden)),
+        ("reward head", str(model.get("reward", "not told"))),
+        ("attention window", str(model.get("window", 0) or "none")),
+        ("recorded states", str(bundle.recorded_count or "none")),
+    ]
+    rows += [
+        (name, str(provenance[name])) for name in ("episodes", "frames", "held_out_episodes") if name in provenance
+    ]
+    if isinstance(quality, dict):
+        rows += [(f"quality: {name}", _with_unit(name, value)) for name, value in quality.items()]
+    measured = provenance.get("measured", [])
+    rows += [row for told in measured for row in measured_rows(told)] if isinstance(measured, list) else []
+    return [(name.replace("_", " "), value) for name, value in rows]

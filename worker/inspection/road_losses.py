@@ -1,0 +1,156 @@
+"""Whether a dream loses the road where reality lost it: dreams begun shortly before real losses.
+
+Whether a dream is off the road is told by probes, which also judge real steps that they were not fitted on, and dreams
+begun where reality loses nothing: so their own faults show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.dream.world import check_temperature
+from dreamfleet.worker.inspection.disturbed_rollouts import OFF, OFFSET, DisturbedDrive, DisturbedDriveConfig
+from dreamfleet.worker.inspection.drive_dreams import DreamSegment, DriveDreamer
+from dreamfleet.worker.inspection.estimate import Estimate
+from dreamfleet.worker.inspection.probe import folds, other_rows
+from dreamfleet.worker.inspection.road_probe import RoadOutcome, RoadProbe
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+FOLDS = 10  # a linear probe is fitted at once, and steps off the road are rare
+PATIENCE = 10  # drives for each loss that is wanted, at most
+CALM = "no loss"  # the beginnings behind which reality loses nothing
+Kinds = list[tuple[str, dict[int, DreamSegment]]]
+
+
+@dataclass(frozen=True)
+class RoadLossConfig:
+    """How many losses, how many steps before each dreams begin, and how many of each beginning at which temperature."""
+
+    losses: int = 30
+    before: tuple[int, ...] = (40, 20, 0)
+    dreams: int = 8
+    temperature: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_temperature(self.temperature)
+
+
+@dataclass(frozen=True)
+class RoadLossComparison:
+    """Means over beginnings of one kind, by figure and by where it was measured.
+
+    `reality` is the simulator's truth, `foreseen` what probe and reward head make of its steps, one step ahead.
+    `dream` is the controller's, under the real disturbance; in `same_actions` reality's actions are repeated.
+    """
+
+    begun: str
+    count: int
+    figures: dict[str, dict[str, Estimate]]
+
+
+def collect_losing_drives(
+    drives: Iterator[DisturbedDrive], config: RoadLossConfig, driven: DisturbedDriveConfig,
+    on_loss: Callable[[int], None] = lambda _losses: None,
+) -> list[DisturbedDrive]:  # fmt: skip
+    """Drives until so many have lost the road; `UsageError` if ten times as many have not."""
+    taken, losses = list[DisturbedDrive](), 0
+    for drive in islice(drives, PATIENCE * config.losses):
+        _check_truth(drive)
+        taken.append(drive)
+        losses += has_usable_loss(drive, config, driven)
+        on_loss(losses)
+        if losses == config.losses:
+            return taken
+    raise UsageError(
+        f"{len(taken)} drives lost the road {losses} times, not {config.losses}: raise --noise, or ask for fewer"
+    )
+
+
+def compare(
+    drives: Sequence[DisturbedDrive],
+    bundle: Bundle,
+    controller: Controller,
+    config: RoadLossConfig,
+    driven: DisturbedDriveConfig,
+) -> list[RoadLossComparison]:
+    """Dreams begun before each loss, and where nothing is lost; each judged by probes fitted on other folds' drives."""
+    imagination = DriveDreamer(bundle, controller, config.temperature, config.dreams)
+    foreseen = [imagination.predict_next(drive) for drive in drives]
+    judges = dict[int, RoadProbe]()
+    for fold in folds(len(drives), most=FOLDS):
+        rest = other_rows(fold, len(drives))
+        judge = RoadProbe([drives[row] for row in rest], [foreseen[row][0] for row in rest], driven.opening)
+        judges |= dict.fromkeys(fold, judge)
+    found = []
+    for name, beginnings in _dream_segments(drives, config, driven):
+        courses = [_outcomes(each, foreseen[row], imagination, judges[row]) for row, each in beginnings.items()]
+        found.append(RoadLossComparison(name, len(courses), _average(courses, driven.lasting)))
+    return found
+
+
+def _average(courses: Sequence[dict[str, RoadOutcome]], lasting: int) -> dict[str, dict[str, Estimate]]:
+    told = [{where: outcome.summarise(lasting) for where, outcome in each.items()} for each in courses]
+    return {
+        figure: {where: Estimate.of([each[where][figure] for each in told]) for where in told[0]}
+        for figure in told[0]["reality"]
+    }
+
+
+def _outcomes(
+    begun: DreamSegment, foreseen: tuple[Floats, Doubles], imagination: DriveDreamer, judge: RoadProbe
+) -> dict[str, RoadOutcome]:
+    drive, steps = begun.drive, begun.steps
+    off, offset, reward = (each[None, steps] for each in (drive.truth[OFF], drive.truth[OFFSET], drive.reward))
+    held, foretold = foreseen
+    return {
+        "reality": RoadOutcome(off > 0, np.abs(offset), reward),
+        "foreseen": judge.outcome(held[None, steps], foretold[None, steps]),
+        "dream": judge.outcome(*imagination.dream(begun, own=True)),
+        "same_actions": judge.outcome(*imagination.dream(begun, own=False)),
+    }
+
+
+def _dream_segments(drives: Sequence[DisturbedDrive], config: RoadLossConfig, driven: DisturbedDriveConfig) -> Kinds:
+    """Each kind of beginning, by the drives' rows."""
+    lost = {row: drive for row, drive in enumerate(drives) if has_usable_loss(drive, config, driven)}
+    kinds: Kinds = []
+    for before in config.before:
+        begun = {
+            row: DreamSegment(drive, (drive.lost or 0) - before, before + driven.after) for row, drive in lost.items()
+        }
+        kinds.append((f"{before} steps before", begun))
+    found = {
+        row: _find_calm_stretch(drive, max(config.before) + driven.after, driven.opening)
+        for row, drive in enumerate(drives)
+    }
+    calm = {row: each for row, each in found.items() if each is not None}
+    return [*kinds, (CALM, calm)] if len(calm) > 1 else kinds
+
+
+def _find_calm_stretch(drive: DisturbedDrive, length: int, opening: int) -> DreamSegment | None:
+    """A stretch of a drive on which it is never off the road, taken by its seed."""
+    steps = np.arange(opening, len(drive) - length + 1)
+    off = np.concatenate([[0], np.cumsum(drive.truth[OFF])])
+    calm = steps[off[steps + length] == off[steps]]
+    return DreamSegment(drive, int(np.random.default_rng(drive.seed).choice(calm)), length) if len(calm) else None
+
+
+def has_usable_loss(drive: DisturbedDrive, config: RoadLossConfig, driven: DisturbedDriveConfig) -> bool:
+    """Whether it lost the road, with enough of the drive before and behind."""
+    if drive.lost is None:
+        return False
+    return drive.lost - max(config.before) >= driven.opening and drive.lost + driven.after <= len(drive)
+
+
+def _check_truth(drive: DisturbedDrive) -> None:
+    if lacking := {OFF, OFFSET} - drive.truth.keys():
+        raise UsageError(f"the world's truth does not tell {' and '.join(sorted(lacking))}: no loss of a road is seen")

@@ -1,0 +1,111 @@
+"""What a worker says to its run's coordinator, as messages on its keys."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+
+import zenoh
+
+from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import encode, encoding
+from dreamfleet.common.protocol.messages import (
+    MAX_LEASES,
+    TAG_BYTES,
+    Heartbeat,
+    Message,
+    Result,
+    ResultBatch,
+    RunningJob,
+    UploadPart,
+)
+from dreamfleet.worker.service.admission import Admission
+from dreamfleet.worker.service.slot_pool import SlotPool
+from dreamfleet.worker.service.upload_queue import FilePart
+
+MAX_STEPS_PER_SECOND = 1e9  # steps that a beat can say
+SMOOTHING = 0.3  # weight of the newest interval in the throughput
+
+
+class StepRate:
+    """Environment steps a second, smoothed over the intervals between two readings."""
+
+    def __init__(self, now: float) -> None:
+        self._value = 0.0
+        self._last = (now, 0)
+
+    def update(self, now: float, steps: int) -> float:
+        """The rate, with `steps` made in all until now."""
+        (then, before), self._last = self._last, (now, steps)
+        if now > then:
+            self._value += SMOOTHING * (max(steps - before, 0) / (now - then) - self._value)
+        return self._value
+
+
+class CoordinatorSender:
+    """Sends to the coordinator's life that `admission` names; a new life makes a new one."""
+
+    def __init__(self, session: zenoh.Session, identity: str, admission: Admission) -> None:
+        self._session = session
+        self._identity = identity
+        self._admission = admission
+
+    def results(self, slots: SlotPool, results: tuple[Result, ...]) -> None:
+        """One message of finished jobs."""
+        batch = ResultBatch(
+            run_uid=self._admission.run_uid,
+            incarnation=self._admission.incarnation,
+            fingerprint=fingerprint(self._admission.packages),
+            results=results,
+            host_class=self._host_class(slots),
+        )
+        self._publish(keys.result(self._admission.run, self._identity), batch)
+
+    def upload(self, piece: FilePart) -> None:
+        """One part of a job's file."""
+        part = UploadPart(
+            run_uid=self._admission.run_uid,
+            incarnation=self._admission.incarnation,
+            digest=piece.digest,
+            sha256=piece.sha256,
+            offset=piece.offset,
+            total=piece.total,
+            data=piece.data,
+        )
+        self._publish(keys.upload(self._admission.run, self._identity), part)
+
+    def beat(
+        self, slots: SlotPool, *, numbering: int, seen: int, capacity: int, queued: Sequence[bytes],
+        unacked: Sequence[bytes], rate: float,
+    ) -> None:  # fmt: skip
+        """What this worker holds: batches up to `seen`, jobs queued and running, results without a verdict."""
+        running: list[RunningJob] = slots.running
+        beat = Heartbeat(
+            run_uid=self._admission.run_uid,
+            incarnation=self._admission.incarnation,
+            nonce=self._admission.nonce,
+            numbering=numbering,
+            seen=seen,
+            capacity=capacity,
+            slots=len(slots),
+            queued=_tags([*queued, *(job.digest for job in slots.waiting)]),
+            running=tuple(running[:MAX_LEASES]),
+            unacked=_tags(unacked),
+            load=os.getloadavg()[0],
+            steps_per_second=min(rate, MAX_STEPS_PER_SECOND),
+            drawn_by=slots.drawn_by,
+            host_class=self._host_class(slots),
+        )
+        self._publish(keys.beat(self._admission.run, self._identity), beat)
+
+    def _host_class(self, slots: SlotPool) -> str | None:
+        """The host's class, if it is known and the coordinator knows what that is."""
+        return slots.host_class or None if self._admission.classes else None
+
+    def _publish(self, key: str, message: Message) -> None:
+        self._session.put(key, encode(message), encoding=encoding(type(message)))
+
+
+def _tags(digests: Iterable[bytes]) -> tuple[bytes, ...]:
+    return tuple(digest[:TAG_BYTES] for digest in list(digests)[:MAX_LEASES])

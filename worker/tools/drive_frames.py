@@ -1,0 +1,104 @@
+"""A drive as frames: the world, what the model sees of it, what it makes of that, and what it dreams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.worker.dream.parallel_dream import ParallelDream, ParallelDreamConfig, can_dream
+from dreamfleet.worker.tasks.api import World
+from dreamfleet.worker.tools.canvas import (
+    AWAKE,
+    DREAMING,
+    Canvas,
+    DreamPicture,
+    DriveFrame,
+    Frame,
+    FrameLayout,
+    ModelPictures,
+    plain_layout,
+)
+from dreamfleet.worker.worldmodel.inference import Decoder
+
+
+class WorldModelView:
+    """What a world model sees, decodes and dreams while its controller drives."""
+
+    def __init__(
+        self, bundle: Bundle, policy: Any, parameters: NDArray[np.float32], dreaming: ParallelDreamConfig
+    ) -> None:
+        self._policy, self._decoder = policy, Decoder(bundle)
+        self._parallel_dream = ParallelDream(bundle, parameters, dreaming) if can_dream(bundle) else None
+        self.layout = DREAMING if self._parallel_dream else AWAKE
+
+    def follow(self, step: int, state: Any) -> None:
+        """Dream this step too; `state` is the policy's from before it acted."""
+        if self._parallel_dream is not None:
+            self._imagined = self._parallel_dream.follow(step, self._policy.latent, state)
+
+    def pictures(self, seen: NDArray[np.uint8]) -> ModelPictures:
+        """The pictures at the step that was followed last."""
+        decoded, dreamt = self._decoder.decode(self._policy.latent)[0], None
+        if self._parallel_dream is not None:
+            dreamt = DreamPicture(self._decoder.decode(self._imagined)[0], self._parallel_dream.since)
+        return ModelPictures(seen, decoded, dreamt)
+
+
+class FilmedPolicy:
+    """A policy whose steps become frames, as the world looks before the action."""
+
+    def __init__(self, policy: Any, painter: FramePainter, model_view: WorldModelView | None) -> None:
+        self._policy, self._painter, self._model_view = policy, painter, model_view
+        self._step, self._score = 0, 0.0
+
+    def begin(self, parameters: NDArray[np.float32]) -> None:
+        """Begin an episode."""
+        self._policy.begin(parameters)
+
+    def act(self, observation: Any) -> Any:
+        """The policy's action, and a frame of it if one is due."""
+        state = getattr(self._policy, "state", None)
+        action = self._policy.act(observation)
+        if self._model_view is not None:
+            self._model_view.follow(self._step, state)
+        if self._step % self._painter.every == 0:
+            pictures, layout = None, None
+            if self._model_view is not None:
+                pictures, layout = self._model_view.pictures(observation), self._model_view.layout
+            self._painter.add(action, self._step, self._score, pictures, layout)
+        self._step += 1
+        return action
+
+    def reward(self, value: float) -> None:
+        """What the action brought."""
+        self._score += value
+        tell = getattr(self._policy, "reward", None)
+        if tell is not None:
+            tell(value)
+
+
+class FramePainter:
+    """Draws frames of one drive, all of one size, and hands them to `take`."""
+
+    def __init__(
+        self, environment: gymnasium.Env[Any, Any], world: World, seed: int, on_frame: Callable[[Frame], None],
+        every: int = 1,
+    ) -> None:  # fmt: skip
+        """`every` is how many steps lie between two frames."""
+        self.every = every
+        self._environment, self._world, self._seed, self._on_frame = environment, world, seed, on_frame
+        self._canvas: Canvas | None = None
+
+    def add(
+        self, action: Any, step: int, score: float, pictures: ModelPictures | None, layout: FrameLayout | None
+    ) -> None:
+        """The frame of a step."""
+        picture: Any = self._environment.render()
+        if self._canvas is None:
+            self._canvas = Canvas(self._seed, layout or plain_layout(picture), self._world.action_names)
+        self._on_frame(self._canvas.draw(DriveFrame(picture, np.atleast_1d(np.asarray(action)), step, score, pictures)))

@@ -1,0 +1,141 @@
+"""A live frame for people: what the model sees, what it decodes, and how it would dream on from there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.monitoring.live import LiveFrame
+from dreamfleet.common.printable import truncate
+from dreamfleet.worker.dream.parallel_dream import DreamContinuation, can_dream
+from dreamfleet.worker.tools.canvas import BACKGROUND, FAINT, INK, Board, Frame, pixels
+from dreamfleet.worker.worldmodel.inference import Decoder
+
+SIZE = 720, 680  # of a frame
+EDGE, LABEL, BIG, SMALL = 16, 22, 340, 163  # pixels: margin, a line of words, the sides of large and small pictures
+STRIP = EDGE + LABEL + BIG + 10  # where the dream's row begins
+FOOT = STRIP + LABEL + SMALL + 16  # where the words begin
+WHOLE = SIZE[0] - 2 * EDGE, FOOT - EDGE - LABEL - 10  # the room of a picture alone
+AHEAD = (10, 25, 50, 100)  # steps on: by two seconds a dream has left the track that is driven
+NAME = 28  # characters of a name that have room
+Corner = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class CaptionedFrame:
+    """A picture for people, and in facts what it shows."""
+
+    picture: Frame  # (height, width, 3)
+    facts: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class DecodedDream:
+    """What a world model makes of a moment: its own picture of it, and of so many steps on."""
+
+    decoded: Frame
+    dreamt: tuple[tuple[int, Frame], ...]  # steps on, as far as the dream lasts
+
+
+class LiveDreamer:
+    """Decodes and dreams on what live frames tell, by the run's world model."""
+
+    def __init__(self, bundle: Bundle, temperature: float) -> None:
+        self._decoder, self._latent = Decoder(bundle), bundle.manifest.latent
+        self._onward = DreamContinuation(bundle, temperature) if can_dream(bundle) else None
+
+    def decode_and_dream(self, sight: LiveFrame) -> DecodedDream | None:
+        """`None` where the frame tells nothing of this world model."""
+        latent = sight.latent
+        if latent is None or len(latent) != self._latent:
+            return None
+        dreamt = self._dream(sight)
+        pictures = self._decoder.decode(np.stack([latent, *dreamt.values()]))
+        return DecodedDream(pictures[0], tuple(zip(dreamt, pictures[1:], strict=True)))
+
+    def _dream(self, sight: LiveFrame) -> dict[int, NDArray[np.float32]]:
+        """The latents so many steps on."""
+        if self._onward is None or sight.latent is None or sight.state is None or sight.parameters is None:
+            return {}
+        moment = sight.latent, sight.state, sight.parameters
+        if not self._onward.fits(*moment):
+            return {}
+        steps = islice(self._onward.dream(*moment, sight.frame.seed), max(AHEAD))
+        return {ahead: latent[0] for ahead, latent in enumerate(steps, 1) if ahead in AHEAD}
+
+
+class LiveCanvas(Board):
+    """Lays live frames of one run out, all of one size."""
+
+    def __init__(self, run: str, actions: tuple[str, ...] = (), dreamer: LiveDreamer | None = None) -> None:
+        """`actions` names what the bars show; without an imagination there is only what is seen."""
+        super().__init__(SIZE, actions)
+        self._run, self._dreamer = run, dreamer
+
+    def draw(self, sight: LiveFrame) -> CaptionedFrame:
+        """The frame, with its facts."""
+        imagined = None if self._dreamer is None else self._dreamer.decode_and_dream(sight)
+        self._surface.fill(BACKGROUND)
+        if imagined is not None:
+            self._draw_model(sight.picture, imagined)
+        elif sight.picture is not None:
+            self._draw_fitted("what it looks like", sight.picture, (EDGE, EDGE), WHOLE)
+        else:
+            self._text("this task shows no picture", (EDGE, EDGE), self._small, FAINT)
+        self._draw_words(sight)
+        return CaptionedFrame(pixels(self._surface), frame_facts(self._run, sight))
+
+    def _draw_model(self, seen: Frame | None, imagined: DecodedDream) -> None:
+        """What is seen and decoded side by side, or, where all is dreamt, the one picture in the middle."""
+        left, words = (SIZE[0] - BIG) // 2, "its dream, decoded"
+        if seen is not None:
+            self._draw_fitted("what the model sees", seen, (EDGE, EDGE), (BIG, BIG))
+            left, words = SIZE[0] - EDGE - BIG, "what it decodes"
+        self._draw_fitted(words, imagined.decoded, (left, EDGE), (BIG, BIG))
+        self._draw_strip(imagined)
+
+    def _draw_strip(self, imagined: DecodedDream) -> None:
+        pitch = (SIZE[0] - 2 * EDGE - SMALL) // (len(AHEAD) - 1)
+        if not imagined.dreamt:
+            self._text("no dream goes on from here", (EDGE, STRIP), self._small, FAINT)
+        for column, (ahead, picture) in enumerate(imagined.dreamt):
+            words = f"dreamt {ahead} steps on" if column == 0 else f"{ahead} steps on"
+            self._draw_fitted(words, picture, (EDGE + column * pitch, STRIP), (SMALL, SMALL))
+
+    def _draw_words(self, sight: LiveFrame) -> None:
+        frame = sight.frame
+        whose = f"candidate {frame.candidate}" if frame.kind == "score" else "its mean, in reality"
+        lines = [
+            f"generation {frame.generation}, {whose}",
+            f"run {truncate(self._run, NAME)}   worker {truncate(sight.worker.partition('/')[0], NAME)}",
+            f"seed {frame.seed}",
+        ]
+        self._text(f"score {frame.reward:7.1f}   step {frame.step}", (EDGE, FOOT), self._large, INK)
+        for row, line in enumerate(lines):
+            self._text(line, (EDGE, FOOT + 30 + 20 * row), self._small, FAINT)
+        discrete = self._dreamer is None and len(frame.action) == 1 and frame.action[0].is_integer()
+        if frame.action:
+            action = np.array(frame.action, np.int64 if discrete else np.float64)
+            self._draw_action(action, SIZE[0] - EDGE + 16, FOOT)
+
+    def _draw_fitted(self, label: str, picture: Frame, corner: Corner, room: tuple[int, int]) -> None:
+        """A picture as large as there is room, under its label."""
+        height, width = picture.shape[:2]
+        scale = min(room[0] / width, room[1] / height)
+        self._text(label, corner, self._small, FAINT)
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        self._picture(picture, (corner[0], corner[1] + LABEL), size, smooth=height != width)
+
+
+def frame_facts(run: str, sight: LiveFrame) -> dict[str, Any]:
+    """What a frame shows, for a caption."""
+    frame = sight.frame
+    return {
+        "run": run, "worker": sight.worker, "kind": frame.kind, "generation": frame.generation,
+        "candidate": frame.candidate, "seed": frame.seed, "step": frame.step, "score": frame.reward,
+    }  # fmt: skip

@@ -1,0 +1,76 @@
+"""What a program of one's own does with a controller; exported by `dreamfleet` itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.trained_agent import TrainedAgent
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.runs import lookup, run_folder
+from dreamfleet.common.runs.episode_results import EpisodeResults
+from dreamfleet.common.runs.seeds import TEST
+from dreamfleet.worker.scoring.agents import Agent, make_agent
+from dreamfleet.worker.tasks.api import Policy
+from dreamfleet.worker.tools import evaluation
+
+
+def find_controller(name: str, runs_dir: Path | str | None = None) -> Controller:
+    """A controller's file, a run's own, or one that ships; `ControllerError` names those that do."""
+    controller, _ = lookup.find_controller(name, _folder(runs_dir))
+    return controller
+
+
+def find_agent(path: Path | str) -> TrainedAgent:
+    """What `dreamfleet baseline export` wrote; it goes wherever a controller is driven here."""
+    return TrainedAgent.load(Path(path))
+
+
+def open_run(name: str, runs_dir: Path | str | None = None) -> run_folder.RunFolder:
+    """A run's journal, read-only; to be closed, or used in a `with`. `JournalError` names those that exist."""
+    return run_folder.open_run(_folder(runs_dir), name)
+
+
+def make_environment(
+    controller: Controller | TrainedAgent, bundle: Bundle | None = None, render_mode: str | None = None
+) -> gymnasium.Env[Any, Any]:
+    """The environment that a controller is judged in, observing what its policy takes."""
+    return _agent(controller, bundle).make_judge(render_mode)
+
+
+def make_policy(controller: Controller | TrainedAgent, bundle: Bundle | None = None) -> Policy:
+    """The policy of a controller, its first episode begun: `act(observation)` gives an action of its environment.
+
+    Of a policy with a `reward` method, tell it each action's reward; some world models look at it.
+    """
+    agent = _agent(controller, bundle)
+    policy = agent.make_policies()(0)
+    policy.begin(agent.parameters)
+    return policy
+
+
+def evaluate(
+    controller: Controller | TrainedAgent, bundle: Bundle | None = None, episodes: int = 100,
+    first_seed: int = TEST.start, jobs: int | None = None,
+) -> EpisodeResults:  # fmt: skip
+    """Whole episodes, one a seed, in `jobs` processes (one a core), as `dreamfleet evaluate` drives them.
+
+    With more than one job a script calls this under `if __name__ == "__main__":`, for processes are spawned.
+    """
+    if episodes < 1 or first_seed < 0 or (jobs is not None and jobs < 1):
+        raise UsageError("episodes and jobs must be at least 1, first_seed at least 0")
+    seeds = tuple(range(first_seed, first_seed + episodes))
+    return EpisodeResults.of(evaluation.evaluate(_agent(controller, bundle), seeds, jobs or usable_cores()))
+
+
+def _agent(controller: Controller | TrainedAgent, bundle: Bundle | None) -> Agent:
+    return make_agent(controller, bundle or lookup.find_bundle_of(controller, None))
+
+
+def _folder(runs_dir: Path | str | None) -> Path:
+    return run_folder.default_runs_dir() if runs_dir is None else Path(runs_dir)

@@ -1,0 +1,65 @@
+"""What `record` and `baseline record` have in common: their arguments, and a video a track."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.errors import StoppedError, UsageError
+from dreamfleet.common.files.atomic_write import check_output_path
+from dreamfleet.common.host.stop_signals import Stop, stop_on_signals
+from dreamfleet.common.runs.seeds import TEST
+
+Record = Callable[[int, Path, Callable[[int], None], Stop], float]
+"""Records the drive on the track of a seed into a file, tells of each step, ends when it is told to; its score."""
+
+
+def add_video_flags(parser: argparse.ArgumentParser) -> None:
+    """Add what both verbs take."""
+    parser.add_argument(
+        "--seed", type=int, nargs="+", default=[TEST.start], metavar="N",
+        help=f"the seed, as of a track (default {TEST.start}); of several each has a video of its own, drive-N.mp4",
+    )  # fmt: skip
+    parser.add_argument("--steps", type=int, default=1000, help="steps at most (default 1000)")
+    parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help="the video to write (default drive.mp4)")
+    add_json_flag(parser)
+
+
+def video_paths(args: argparse.Namespace) -> dict[int, Path]:
+    """The file of each track's video; `UsageError` for arguments that cannot be met."""
+    out: Path = args.out
+    if args.steps < 1 or min(args.seed) < 0:
+        raise UsageError("--steps must be at least 1 and --seed at least 0")
+    if out.suffix != ".mp4":
+        raise UsageError(f"--out {out}: give a name that ends in .mp4")
+    seeds = dict.fromkeys(args.seed)
+    videos = {seed: out if len(seeds) == 1 else out.with_stem(f"{out.stem}-{seed}") for seed in seeds}
+    for video in videos.values():
+        check_output_path(video)
+    return videos
+
+
+def record_videos(args: argparse.Namespace, videos: dict[int, Path], record: Record) -> int:
+    """Record one after the other and answer each one's score; Ctrl-C ends the one that is under way, and the verb."""
+    from dreamfleet.common.cli.progress import progress_bar
+
+    with stop_on_signals() as stop:
+        for seed, video in videos.items():
+            driven = 0
+
+            def move(done: int) -> None:
+                nonlocal driven
+                driven = done
+                bar.update(done)
+
+            with progress_bar("record", args.steps, "steps") as bar:
+                score = record(seed, video, move, stop)
+            if stop():
+                raise StoppedError(
+                    f"stopped: {video} shows the first {driven} steps on seed {seed}, with a score of {score:.1f}; "
+                    "the same command records whole drives"
+                )
+            print_answer(args, f"{video}: score {score:.1f} on seed {seed}", video=video, score=score, seed=seed)
+    return 0

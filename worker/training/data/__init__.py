@@ -1,0 +1,1 @@
+"""A data set of recorded drives: collected, stored, read."""

@@ -1,0 +1,142 @@
+"""Recorded episodes on disk, streamed: memory holds a few dozen of them, never all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.files.archives import ArchiveLimits, Arrays, DamagedArchiveError, open_archive, read_arrays
+from dreamfleet.common.files.regular_files import open_regular
+from dreamfleet.worker.training.data.world import find_world, preprocessing_of_size
+
+POOL_EPISODES = 48  # whose frames are shuffled together
+POOL_FRAMES = 16_000  # of them at most, or one episode: 200 MB of 64x64, 440 MB of 96x96
+VALIDATION_EVERY = 20  # every 20th episode is held out, whole
+LIMITS = ArchiveLimits(512 << 20)  # bytes of an episode: 19,000 pictures of 96x96
+
+
+def episode_paths(folder: Path, kind: str = "episodes") -> list[Path]:
+    """The episodes of a data set, `episodes` or `encoded`, by number; `DatasetError` if there are too few."""
+    paths = sorted((folder / kind).glob("[0-9]*.npz"))
+    if len(paths) < 2:
+        verb = "dreamfleet collect" if kind == "episodes" else "dreamfleet encode"
+        raise DatasetError(f"{folder} holds {len(paths)} {kind}; at least 2 are needed: run `{verb} --data {folder}`")
+    return paths
+
+
+def split_held_out(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Episodes to train on and episodes held out."""
+    held_out = list(paths[::VALIDATION_EVERY])
+    return [path for path in paths if path not in set(held_out)], held_out
+
+
+def load_arrays(path: Path, *names: str) -> Arrays:
+    """The named arrays of one episode; `DatasetError` if the file is damaged or lacks one."""
+    try:
+        return read_arrays(path, LIMITS, names)
+    except (OSError, DamagedArchiveError) as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> DatasetError:
+    return DatasetError(f"{path} is damaged ({error}); delete it and run the verb that wrote it again")
+
+
+def check_whole(paths: Sequence[Path], *names: str) -> None:
+    """`DatasetError` names the first episode that is damaged or lacks an array; reads the archives' directories."""
+    for path in paths:
+        try:
+            with open_regular(path, LIMITS.size) as file, open_archive(file, LIMITS) as archive:
+                missing = {f"{name}.npy" for name in names} - archive.names
+        except (OSError, DamagedArchiveError) as error:
+            raise _damaged(path, error) from error
+        if missing:
+            raise DatasetError(
+                f"{path} lacks {', '.join(sorted(missing))}; delete it and run the verb that wrote it again"
+            )
+
+
+def check_pictures(paths: Sequence[Path], size: int) -> None:
+    """`DatasetError` names the first episode whose pictures are of another preprocessing than that to `size`."""
+    wanted = preprocessing_of_size(size).name
+    for path in paths:
+        if (found := preprocessing_of(path)) != wanted:
+            raise DatasetError(
+                f"{path} holds pictures {found!r}, and {wanted!r} are asked for: a data set and its VAE have one kind; "
+                "choose another --data, or --picture"
+            )
+
+
+def preprocessing_of(path: Path) -> str:
+    """The name of the preprocessing that made an episode's pictures."""
+    return str(load_arrays(path, "preprocessing")["preprocessing"])
+
+
+def load_pictures(path: Path) -> NDArray[np.uint8]:
+    """An episode's pictures `(T, side, side, 3)`; `DatasetError` if they are not what its preprocessing makes."""
+    arrays = load_arrays(path, "picture", "preprocessing")
+    pictures: NDArray[np.uint8] = arrays["picture"]
+    known = find_world().preprocessings.get(str(arrays["preprocessing"]))
+    fits = known is not None and pictures.ndim == 4 and pictures.shape[1:] == known.shape
+    if not fits or not len(pictures) or pictures.dtype != np.uint8:
+        raise DatasetError(f"{path} holds pictures of another preprocessing or shape; collect into an empty folder")
+    return pictures
+
+
+def load_steps(path: Path, *latents: str) -> Arrays:
+    """`action` (T, actions), `reward` (T,), `ended` and these `latents` (T, n) of an episode; all floats are float32.
+
+    `DatasetError` if they are not of one drive: other types, other lengths, or none.
+    """
+    arrays = load_arrays(path, "action", "reward", "ended", *latents)
+    ended, steps = arrays["ended"], len(arrays["reward"]) if arrays["reward"].ndim else 0
+    ranks = {"reward": 1, "action": 2, **dict.fromkeys(latents, 2)}
+    fits = all(arrays[name].ndim == rank and len(arrays[name]) == steps for name, rank in ranks.items())
+    if not (steps and fits and ended.shape == () and ended.dtype.kind in "bu"):
+        raise _damaged(path, DatasetError("its arrays are not of one drive"))
+    if not all(arrays[name].dtype.kind == "f" for name in ranks):
+        raise _damaged(path, DatasetError("its actions, rewards or latents are no floats"))
+    return {**arrays, **{name: arrays[name].astype(np.float32, copy=False) for name in ranks}}
+
+
+def picture_batches(
+    paths: Sequence[Path], batch: int, seed: int, first_pool: int = 0, taken: int = 0
+) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
+    """Endless shuffled batches `(batch, side, side, 3)`, each with its pool and how many of that are taken with it.
+
+    A pure function of its arguments: begin behind a batch with the numbers that came with it.
+    """
+    pool = first_pool
+    while True:
+        random = np.random.default_rng([seed, pool])
+        chosen = random.choice(len(paths), size=min(POOL_EPISODES, len(paths)), replace=False)
+        pictures = _load_pool([paths[index] for index in chosen])
+        order = random.permutation(len(pictures))
+        starts = range(0, max(len(order) - batch, 0) + 1, batch)
+        for number, start in enumerate(starts[taken:], start=taken + 1):
+            yield pool, number, pictures[order[start : start + batch]]
+        pool, taken = pool + 1, 0
+
+
+def _load_pool(paths: Sequence[Path]) -> NDArray[np.uint8]:
+    loaded: list[NDArray[np.uint8]] = []
+    frames = 0
+    for path in paths:
+        loaded.append(load_pictures(path))
+        frames += len(loaded[-1])
+        if frames >= POOL_FRAMES:
+            break
+    return np.concatenate(loaded)
+
+
+def pad(sequences: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Sequences `(T_i, ...)` of unequal length as one `(N, max T, ...)`, zero where one has ended."""
+    longest = max(len(sequence) for sequence in sequences)
+    padded = np.zeros((len(sequences), longest, *sequences[0].shape[1:]), dtype=np.float32)
+    for row, sequence in zip(padded, sequences, strict=True):
+        row[: len(sequence)] = sequence
+    return padded

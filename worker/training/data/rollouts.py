@@ -1,0 +1,90 @@
+"""Encoded rollouts as batches of an MDN-RNN."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from dreamfleet.worker.training.data.dataset import load_steps, pad
+from dreamfleet.worker.worldmodel.mdnrnn import reward_labels
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+
+FLIP = np.array([-1, 1, 1], dtype=np.float32)  # a mirrored drive steers the other way
+CHUNK_STEPS = 10_000  # that go through a model at once: about 300 MB
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """A batch `(N, T, ...)` of rollouts, padded; `mask` `(N, T)` is 1 where a step is real, `done` where one ended."""
+
+    mu: Tensor
+    logvar: Tensor
+    action: Tensor
+    reward: Tensor
+    done: Tensor
+    mask: Tensor
+
+    def chunks(self) -> Iterator[Rollouts]:
+        """The same rollouts, few at a time."""
+        rows = max(1, CHUNK_STEPS // self.mask.shape[1])
+        for start in range(0, len(self.mask), rows):
+            yield Rollouts(*(getattr(self, each.name)[start : start + rows] for each in fields(self)))
+
+    def to(self, device: torch.device | None) -> Rollouts:
+        """On a device."""
+        return Rollouts(*(getattr(self, each.name).to(device) for each in fields(self)))
+
+
+def load_rollouts(paths: Sequence[Path], mirrored: NDArray[np.bool_] | None = None) -> Rollouts:
+    """The rollouts of these episodes, some of them mirrored."""
+    columns: dict[str, list[NDArray[np.float32]]] = {each.name: [] for each in fields(Rollouts)}
+    for path, flip in zip(paths, np.zeros(len(paths), np.bool_) if mirrored is None else mirrored, strict=True):
+        prefix = "mirrored_" if flip else ""
+        arrays = load_steps(path, f"{prefix}mu", f"{prefix}logvar")
+        columns["mu"].append(arrays[f"{prefix}mu"])
+        columns["logvar"].append(arrays[f"{prefix}logvar"])
+        columns["action"].append(arrays["action"] * (FLIP if flip else FLIP**2))
+        columns["reward"].append(arrays["reward"])
+        done = np.zeros(len(arrays["reward"]), dtype=np.float32)
+        done[-1] = arrays["ended"]
+        columns["done"].append(done)
+        columns["mask"].append(np.ones(len(arrays["reward"]), dtype=np.float32))
+    return Rollouts(**{name: torch.from_numpy(pad(arrays)) for name, arrays in columns.items()})
+
+
+def done_labels(config: MDNRNNConfig, rollouts: Rollouts) -> Tensor:
+    """What the done head shall tell `(N, T)`: 1 where an episode ended, and where `lost` steps without reward follow.
+
+    A drive that was given up without a reward for so long is lost from its last reward to its end.
+    """
+    if not config.lost:
+        return rollouts.done
+    paid = (rollouts.reward > 0) & (rollouts.mask > 0)
+    count = paid.shape[1]
+    steps = torch.arange(count, device=paid.device)
+    never = torch.full_like(steps[:1], count).expand(len(paid), 1)
+    following = torch.where(paid, steps, count).flip(1).cummin(dim=1).values.flip(1)
+    next_paid = torch.cat([following[:, 1:], never], dim=1)
+    last_paid = torch.where(paid, steps, -1).amax(dim=1, keepdim=True)
+    given_up = rollouts.mask.sum(dim=1, keepdim=True) - 1 - last_paid > config.lost
+    lost = torch.where(next_paid == count, given_up, next_paid - steps > config.lost)
+    return torch.maximum(rollouts.done, lost * rollouts.mask)
+
+
+def model_inputs(config: MDNRNNConfig, latents: Tensor, rollouts: Rollouts) -> Tensor:
+    """`(N, T, inputs)`: latents, actions, and where the model takes it the reward head's label of the step before.
+
+    The first step has `first_reward` instead.
+    """
+    parts = [latents, rollouts.action]
+    if config.previous_reward:
+        labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
+        parts.append(functional.pad(labels, (1, 0), value=config.first_reward)[:, :-1, None])
+    return torch.cat(parts, dim=-1)

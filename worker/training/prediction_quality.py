@@ -1,0 +1,113 @@
+"""How well a model foresees: heads' accuracy at once, and after steps of dreaming under recorded actions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels, load_rollouts
+from dreamfleet.worker.training.teacher_forcing import teacher_force, with_reward_label
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction, reward_labels
+
+DREAM_STEPS = (1, 10, 50)  # steps of dreaming
+START_EVERY = 25  # a dream begins behind so many recorded steps more
+MAX_ROLLOUTS = 40  # held-out rollouts
+
+Floats = NDArray[np.float32]
+
+
+def foresight(model: MDNRNN, held_out: Sequence[Path]) -> dict[str, float]:
+    """Of each head, how it judges recorded steps, and `_after_N` those that N dreamt steps lead to.
+
+    Binary heads by the area under the curve, a value by its root mean square error; latents by theirs, in units of
+    their spread. A figure that the rollouts cannot tell (they are too short, or all labels equal) is left out.
+    """
+    device = next(model.parameters()).device
+    rollouts = load_rollouts(held_out[:MAX_ROLLOUTS]).to(device)
+    model.eval()
+    with torch.no_grad():
+        hidden, states = teacher_force(model, rollouts)
+        told = model.predict(hidden)
+        labels = _labels(model, rollouts)
+        mask = rollouts.mask > 0
+        figures = {name: _score_head(model, name, _head(told, name)[mask], labels[name][mask]) for name in labels}
+        for ahead, (seen, predicted, latents) in _dream(model, rollouts, states).items():
+            rows, steps = seen
+            for name in labels:
+                figures[f"{name}_after_{ahead}"] = _score_head(
+                    model, name, _head(predicted, name), labels[name][rows, steps]
+                )
+            error = (latents - rollouts.mu[rows, steps]).square().mean().sqrt() / rollouts.mu[mask].std()
+            figures[f"latent_error_after_{ahead}"] = float(error)
+    named = {name if "error" in name else _figure_name(model, name): value for name, value in figures.items()}
+    return {name: round(value, 3) for name, value in named.items() if np.isfinite(value)}
+
+
+def area_under_curve(scores: Floats, positive: NDArray[np.bool_]) -> float:
+    """How often a positive scores above a negative; 0.5 is chance, NaN without both kinds."""
+    ranks = np.empty(len(scores))
+    ranks[np.argsort(scores)] = np.arange(1, len(scores) + 1)
+    positives = int(positive.sum())
+    pairs = positives * (len(scores) - positives)
+    return float((ranks[positive].sum() - positives * (positives + 1) / 2) / pairs) if pairs else float("nan")
+
+
+def _dream(
+    model: MDNRNN, rollouts: Rollouts, states: list[Tensor]
+) -> dict[int, tuple[tuple[Tensor, Tensor], Prediction, Tensor]]:
+    """From recorded prefixes on, dreaming means under the recorded actions.
+
+    By steps ahead: which recorded steps (rows, steps) the dreams have come to, what is told there, dreamt latents.
+    """
+    config, length = model.config, rollouts.mu.shape[1]
+    found: dict[int, list[tuple[Tensor, Tensor, Tensor, Tensor]]] = {ahead: [] for ahead in DREAM_STEPS}
+    for start in range(START_EVERY, length - 1, START_EVERY):
+        latent, state = rollouts.mu[:, start], states[start]
+        for ahead in range(1, min(max(DREAM_STEPS), length - 1 - start) + 1):
+            hidden, state = model.advance(torch.cat([latent, rollouts.action[:, start + ahead - 1]], dim=1), state)
+            told = model.predict(hidden)
+            latent = (told.log_weights.exp() * told.means).sum(dim=-1)
+            if config.previous_reward:
+                state = with_reward_label(
+                    model, state, told.reward if config.reward == "value" else (told.reward > 0).float()
+                )
+            if ahead in found:
+                rows = torch.nonzero(rollouts.mask[:, start + ahead])[:, 0]
+                last, _ = model.advance(torch.cat([latent, rollouts.action[:, start + ahead]], dim=1), state)
+                found[ahead].append((rows, torch.full_like(rows, start + ahead), last[rows], latent[rows]))
+    result = {}
+    for ahead, parts in found.items():
+        if parts:
+            rows, steps, hidden, latents = (torch.cat(each) for each in zip(*parts, strict=True))
+            result[ahead] = ((rows, steps), model.predict(hidden), latents)
+    return result
+
+
+def _labels(model: MDNRNN, rollouts: Rollouts) -> dict[str, Tensor]:
+    config, labels = model.config, dict[str, Tensor]()
+    if config.has_reward_head:
+        labels["reward"] = reward_labels(config.reward, rollouts.reward, rollouts.done)
+    if config.done:
+        labels["done"] = done_labels(config, rollouts)
+    return labels
+
+
+def _head(told: Prediction, name: str) -> Tensor:
+    return told.reward if name == "reward" else told.done
+
+
+def _score_head(model: MDNRNN, name: str, told: Tensor, label: Tensor) -> float:
+    if name == "reward" and model.config.reward == "value":
+        return float((told - label).square().mean().sqrt())
+    return area_under_curve(told.cpu().numpy(), label.cpu().numpy() > 0)
+
+
+def _figure_name(model: MDNRNN, name: str) -> str:
+    head, _, ahead = name.partition("_")
+    kind = "rmse" if head == "reward" and model.config.reward == "value" else "auc"
+    return f"{head}_{kind}" + (f"_{ahead}" if ahead else "")

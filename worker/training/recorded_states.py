@@ -1,0 +1,65 @@
+"""Recorded states for a bundle: where a folder's drives were, and what its MDN-RNN remembered there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
+from dreamfleet.worker.training.data.dataset import episode_paths, load_steps
+from dreamfleet.worker.training.data.drive_steps import DriveStep, sample_steps
+from dreamfleet.worker.training.data.rollouts import load_rollouts
+from dreamfleet.worker.training.encode import ENCODED
+from dreamfleet.worker.training.one_thread import on_one_thread
+from dreamfleet.worker.training.teacher_forcing import teacher_force
+from dreamfleet.worker.training.train_mdnrnn import CHECKPOINT
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+
+DRIVES = 32  # that are followed at once: 1000 steps of the default layers' states are 65 MB
+SEED = 0
+
+
+@dataclass(frozen=True)
+class RecordedStates:
+    """States `(N, 2 * latent + state)` in half precision: mu, logvar and the recurrent state before the action.
+
+    So many of them lie shortly before a loss of the road.
+    """
+
+    states: NDArray[np.float16]
+    before_losses: int
+
+
+def compute_recorded_states(folder: Path, count: int) -> RecordedStates:
+    """So many of a folder's encoded drives, by its MDN-RNN, or as many as there are; equal folders give equal ones."""
+    paths, model = episode_paths(folder, ENCODED), MDNRNN(load_config(folder / CHECKPOINT, MDNRNNConfig))
+    load_checkpoint(folder / CHECKPOINT, model, None)
+    drawn = sample_steps([load_steps(path)["reward"] for path in paths], count, np.random.default_rng(SEED))
+    with on_one_thread(), torch.no_grad():
+        rows = [row for part in _batch_by_drive(drawn.all) for row in _states(paths, model, part)]
+    width = 2 * model.config.latent + model.config.state
+    return RecordedStates(np.array(rows, dtype=np.float16).reshape(-1, width), len(drawn.before_losses))
+
+
+def _batch_by_drive(moments: Sequence[DriveStep]) -> Iterator[list[DriveStep]]:
+    """Sorted moments, those of few drives at a time."""
+    drives = [list(each) for _, each in groupby(moments, key=lambda moment: moment.drive)]
+    for start in range(0, len(drives), DRIVES):
+        yield [moment for drive in drives[start : start + DRIVES] for moment in drive]
+
+
+def _states(paths: Sequence[Path], model: MDNRNN, moments: Sequence[DriveStep]) -> Iterator[NDArray[np.float32]]:
+    """The state of each of these moments."""
+    drives = sorted({moment.drive for moment in moments})
+    rollouts = load_rollouts([paths[drive] for drive in drives])
+    _, remembered = teacher_force(model, rollouts)
+    for drive, step in moments:
+        row = drives.index(drive)
+        yield torch.cat([rollouts.mu[row, step], rollouts.logvar[row, step], remembered[step][row]]).numpy()

@@ -1,0 +1,158 @@
+"""The MDN-RNN's step as ONNX nodes: what the policy's graph and the dream's have in common, and the dream itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from onnx import TensorProto
+
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
+
+Weights = Mapping[str, NDArray[np.float32]]
+
+
+class RecurrentGraph:
+    """The LSTM, and the attention before it, of a graph that has a `state` (N, S)."""
+
+    def __init__(self, graph: GraphBuilder, state: str, rnn: Weights, config: MDNRNNConfig) -> None:
+        self._graph, self._rnn, self._config = graph, rnn, config
+        self._step = config.latent + config.actions
+        parts = graph.split(
+            state, config.hidden, config.hidden, int(config.previous_reward), config.window * self._step
+        )
+        self.hidden, self._cell, self._previous, self._window = parts
+        self.attention = ""  # weights (N, window, 1) of the last step
+
+    def advance(self, latent: str, action: str) -> str:
+        """One step: `hidden` becomes the next."""
+        graph, step = self._graph, window_input(self._graph, latent, action, self._config)
+        inputs = [latent, action, self._previous]
+        if self._config.window:
+            _, kept = graph.split(self._window, self._step, (self._config.window - 1) * self._step)
+            self._window = graph.join(kept, step)
+            inputs.append(self._attend())
+        self.hidden, self._cell = lstm(graph, inputs, self.hidden, self._cell, self._rnn)
+        return self.hidden
+
+    def next_state(self, previous: str = "") -> str:
+        """The state behind `advance`, as `MDNRNNConfig.state` lays it out; `previous` is what the reward head tells."""
+        return self._graph.join(self.hidden, self._cell, previous or self._previous, self._window)
+
+    def _attend(self) -> str:
+        graph, rnn, window = self._graph, self._rnn, self._config.window
+        seen = graph.node("Reshape", self._window, graph.shape(-1, window, self._step))
+        keys = graph.node("MatMul", seen, graph.constant(rnn["keys.weight"].T))
+        keys = graph.node("Add", keys, graph.constant(rnn["keys.bias"]))
+        query = graph.node("Unsqueeze", graph.linear(self.hidden, rnn["query.weight"].T), graph.shape(1))
+        scores = graph.node("Tanh", graph.node("Add", keys, query))
+        scores = graph.node("MatMul", scores, graph.constant(rnn["score.weight"].T))
+        self.attention = graph.node("Softmax", scores, axis=1)
+        weighted = graph.node("Mul", self.attention, seen)
+        return str(graph.node("ReduceSum", weighted, graph.shape(1), keepdims=0))
+
+
+def lstm(graph: GraphBuilder, inputs: Sequence[str], hidden: str, cell: str, weights: Weights) -> tuple[str, str]:
+    """A step of an LSTM, whose `weights` are named as torch names them: its next hidden and cell state.
+
+    A matrix product a gate: of one for all, the cuts would copy more than the products save (5 % of a step).
+    """
+    size = weights["lstm.weight_hh_l0"].shape[1]
+    kernel = np.concatenate([weights["lstm.weight_ih_l0"], weights["lstm.weight_hh_l0"]], axis=1)
+    bias = weights["lstm.bias_ih_l0"] + weights["lstm.bias_hh_l0"]
+    rows = [slice(gate * size, (gate + 1) * size) for gate in range(4)]
+    joined = graph.join(*inputs, hidden)
+    enter, forget, candidate, leave = (
+        graph.node(kind, graph.linear(joined, kernel[gate].T, bias[gate]))
+        for kind, gate in zip(("Sigmoid", "Sigmoid", "Tanh", "Sigmoid"), rows, strict=True)
+    )
+    kept = graph.node("Mul", forget, cell)
+    cell = graph.node("Add", kept, graph.node("Mul", enter, candidate))
+    return graph.node("Mul", leave, graph.node("Tanh", cell)), cell
+
+
+def window_input(graph: GraphBuilder, latent: str, action: str, config: MDNRNNConfig) -> str:
+    """What enters the window."""
+    return graph.join(latent, action) if config.window else ""
+
+
+def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
+    """A step of the dream: latent, action and state, and what chance gives, to the next ones.
+
+    Inputs `latent` (N, latent), `action` (N, actions), `state` (N, state), `uniform` and `normal` (N, latent),
+    `temperature` (1,), and with dropout `mask` (N, hidden), which the LSTM's output is multiplied by. Outputs
+    `next_latent`, `next_state`, of heads that exist `reward` (probability or value) and `done` (N,), and with a window
+    `attention` (N, window).
+
+    Sampling (Ha & Schmidhuber 2018): log weights divided by the temperature, deviations times its root. The mixture is
+    the first whose cumulated weight exceeds `uniform`: `Where`s from the first to the last, no Gather.
+    """
+    graph, kind = GraphBuilder("dream"), TensorProto.FLOAT
+    latent, action = graph.add_input("latent", kind, config.latent), graph.add_input("action", kind, config.actions)
+    state = graph.add_input("state", kind, config.state)
+    uniform, normal = graph.add_input("uniform", kind, config.latent), graph.add_input("normal", kind, config.latent)
+    temperature = graph.add_scalar_input("temperature")
+    recurrent = RecurrentGraph(graph, state, rnn, config)
+    hidden = recurrent.advance(latent, action)
+    if config.dropout:
+        hidden = graph.node("Mul", hidden, graph.add_input("mask", kind, config.hidden))
+    order = mixture_major_order(config)
+    # Half precision: the bundle holds the LSTM twice already, and its size has a limit.
+    kernel, bias = graph.weight(rnn["heads.weight"][order].T), graph.constant(rnn["heads.bias"][order])
+    heads = graph.node("Gemm", hidden, kernel, bias)
+    columns = graph.split(
+        heads, *[config.latent] * (3 * config.mixtures), int(config.has_reward_head), int(config.done)
+    )
+    *mixtures, reward, done = columns
+    mean, deviation = _select_mixture(graph, mixtures, uniform, temperature)
+    noise = graph.node("Mul", normal, graph.node("Sqrt", temperature))
+    spread = graph.node("Mul", graph.node("Exp", deviation), noise)
+    graph.add_output(graph.node("Add", mean, spread), "next_latent", kind, config.latent)
+    told = _dreamt_reward_label(graph, reward, config) if config.previous_reward else ""
+    graph.add_output(recurrent.next_state(told), "next_state", kind, config.state)
+    if recurrent.attention:
+        weights = graph.node("Squeeze", recurrent.attention, graph.shape(2))
+        graph.add_output(weights, "attention", kind, config.window)
+    for name, head in (("reward", reward), ("done", done)):
+        if head:
+            value = head if name == "reward" and config.reward == "value" else graph.node("Sigmoid", head)
+            graph.add_output(graph.node("Squeeze", value, graph.shape(1)), name, kind)
+    return graph.build()
+
+
+def mixture_major_order(config: MDNRNNConfig) -> NDArray[Any]:
+    """The heads' rows by (kind, mixture, latent) instead of (kind, latent, mixture): mixtures are then slices."""
+    width = config.mixtures * config.latent
+    rows = np.arange(3 * width).reshape(3, config.latent, config.mixtures).transpose(0, 2, 1).ravel()
+    return np.concatenate([rows, np.arange(3 * width, config.outputs)])
+
+
+def _select_mixture(graph: GraphBuilder, mixtures: Sequence[str], uniform: str, temperature: str) -> tuple[str, str]:
+    """Mean and log deviation (N, latent) of the mixture that `uniform` falls in; `mixtures` are the heads' columns."""
+    count = len(mixtures) // 3
+    logits, means, deviations = mixtures[:count], mixtures[count : 2 * count], mixtures[2 * count :]
+    if count == 1:
+        return means[0], deviations[0]
+    highest = graph.node("Max", *logits)
+    cumulated: list[str] = []
+    for each in logits:
+        weight = graph.node("Exp", graph.node("Div", graph.node("Sub", each, highest), temperature))
+        cumulated.append(graph.node("Add", cumulated[-1], weight) if cumulated else weight)
+    point = graph.node("Mul", uniform, cumulated[-1])
+    mean, deviation = means[0], deviations[0]
+    for index in range(1, count):
+        beyond = graph.node("GreaterOrEqual", point, cumulated[index - 1])
+        mean = graph.node("Where", beyond, means[index], mean)
+        deviation = graph.node("Where", beyond, deviations[index], deviation)
+    return mean, deviation
+
+
+def _dreamt_reward_label(graph: GraphBuilder, reward: str, config: MDNRNNConfig) -> str:
+    """What the next step's previous reward is in the dream: the value, or the likelier label."""
+    if config.reward == "value":
+        return reward
+    positive = graph.node("Greater", reward, graph.constant(np.array(0, np.float32)))
+    return str(graph.node("Cast", positive, to=TensorProto.FLOAT))

@@ -1,0 +1,91 @@
+"""The weights that a bundle's graphs were written from, so that training goes on with a model that came as a bundle.
+
+The inverse of `export`: constants are taken in the order in which it writes them. What it kept in half precision, the
+decoder's weights and the heads', comes back so; written again, all gives the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import numpy_helper
+
+from dreamfleet.common.errors import BundleError
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.mdnrnn_graph import mixture_major_order
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+
+Weights = dict[str, NDArray[np.float32]]
+
+
+def vae_weights(encoder: bytes, decoder: bytes, config: VAEConfig) -> Weights:
+    """Of the encoder's graph and the decoder's, by torch's names.
+
+    `BundleError` with batch normalisation, which is folded into its neighbours, and for graphs of another make.
+    """
+    if config.batch_norm:
+        raise BundleError("its batch normalisation is folded into other weights, so it cannot be trained on")
+    seen, made = _constants(encoder), _constants(decoder)
+    layers = [layer * config.modules_a_layer for layer in range(len(config.channels))]
+    found: Weights = {}
+    for layer in layers:
+        found |= _pair(f"encoder.{layer}", seen)
+    # Divided by 255 as it was written: of all single-precision numbers the nearest product is what it came from.
+    found["encoder.0.weight"] = (found["encoder.0.weight"].astype(np.float64) * 255).astype(np.float32)
+    for name in ("mu", "logvar"):
+        found |= _pair(name, seen, transposed=True)
+    for name in ("dense", *(f"decoder.{layer}" for layer in layers)):
+        found |= _pair(name, made)
+    return found
+
+
+def mdnrnn_weights(dream: bytes, config: MDNRNNConfig) -> Weights:
+    """Of the dream's graph, by torch's names; `BundleError` for a graph of another make."""
+    constants = _constants(dream)
+    found: Weights = {}
+    if config.window:
+        found |= _pair("keys", constants, transposed=True)
+        found |= {f"{name}.weight": _next(constants).T for name in ("query", "score")}
+    gates = [_pair("gate", constants, transposed=True) for _ in range(4)]
+    kernel = np.concatenate([each["gate.weight"] for each in gates])
+    bias = np.concatenate([each["gate.bias"] for each in gates])
+    entering, staying = np.split(kernel, [config.lstm_inputs], axis=1)
+    found |= {"lstm.weight_ih_l0": entering, "lstm.weight_hh_l0": staying}
+    found |= {"lstm.bias_ih_l0": bias, "lstm.bias_hh_l0": np.zeros_like(bias)}
+    back = np.argsort(mixture_major_order(config))
+    heads = _pair("heads", constants, transposed=True)
+    if len(heads["heads.bias"]) != len(back):
+        raise _unknown_layout()
+    return found | {name: values[back] for name, values in heads.items()}
+
+
+def _constants(model: bytes) -> Iterator[NDArray[np.float32]]:
+    """The floating-point constants of a graph in order; whole numbers are shapes."""
+    try:
+        graph = onnx.load_model_from_string(model).graph
+    except Exception as error:  # protobuf's own, which is no dependency of ours
+        raise _unknown_layout() from error
+    for each in graph.initializer:
+        array: NDArray[Any] = numpy_helper.to_array(each)
+        if array.dtype.kind == "f":
+            yield array.astype(np.float32)
+
+
+def _pair(name: str, constants: Iterator[NDArray[np.float32]], *, transposed: bool = False) -> Weights:
+    kernel, bias = _next(constants), _next(constants)
+    return {f"{name}.weight": kernel.T if transposed else kernel, f"{name}.bias": bias}
+
+
+def _next(constants: Iterator[NDArray[np.float32]]) -> NDArray[np.float32]:
+    found = next(constants, None)
+    if found is None:
+        raise _unknown_layout()
+    return found
+
+
+def _unknown_layout() -> BundleError:
+    return BundleError("its graphs are not laid out as this version writes them, so it cannot be trained on")
