@@ -16,7 +16,7 @@ Floats = NDArray[np.float32]
 class Continuous:
     """Outputs in [-1, 1], each scaled, shifted and bounded: `clip(scale * tanh(x) + shift, low, high)`.
 
-    An action has an output of its own unless `outputs_of` says which one each action takes; several may take the same.
+    Each action has its own output unless `output_indices` names one for each; several actions may share an output.
     With `choices`, actions that are known, there is an output for each of them, and the one of the largest is done, of
     equals the first; nothing is squashed then.
     """

@@ -123,7 +123,7 @@ class Bundle:
 
     @property
     def controller_shape(self) -> ControllerShape:
-        """The controllers that this bundle is under: `default_shape` unless `under` said otherwise."""
+        """The shape of this bundle's controllers: `default_shape` unless `with_controllers` chose another."""
         return self._shape or self.default_shape
 
     def shape_of(self, features: str, hidden: int = 0, variant: Variant = DEFAULT_VARIANT) -> ControllerShape:
@@ -161,7 +161,7 @@ class Bundle:
         return Bundle(self.path, self.sha256, self.manifest, shape, variant)
 
     def for_controller(self, controller: Controller) -> Bundle:
-        """This bundle under one controller's shape and variant; errors as of `under`.
+        """This bundle with one controller's shape and variant; errors as of `with_controllers`.
 
         `ControllerError` for a controller of another world model: its parameters mean nothing to this one.
         """

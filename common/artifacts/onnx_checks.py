@@ -58,9 +58,9 @@ class UnsafeModelError(ValueError):
 
 
 def check_model(model: bytes) -> None:
-    """`UnfitError` if an ONNX model reads other files, or is too much to look through.
+    """`UnsafeModelError` if an ONNX model reads other files, or is too much to look through.
 
-    What is no model at all is not judged here; `check_closed` is for those who run it.
+    What is no model at all is not judged here; `check_self_contained` is for those who run it.
     """
     try:
         check_self_contained(model)

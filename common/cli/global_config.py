@@ -83,8 +83,8 @@ def read_config_file(path: Path | None) -> dict[str, Any]:
 def complete_arguments(args: argparse.Namespace, environment: Mapping[str, str] = os.environ) -> None:
     """Complete parsed arguments from the file and the environment, and set how much is logged.
 
-    Afterwards `args` has `site`, where the fleet is said to be (`reached` knows where it is by default), `sources` for
-    `config.load` of a verb's own sections, and `given`: the names that flags gave.
+    Afterwards `args` has `global_config` (`resolve_network` fills in the default addresses of the fleet), `sources` for
+    `config.load` of a verb's own sections, and `given`: the names of the flags that were given.
     """
     given = frozenset(vars(args))
     path = args.config or (Path(environment[f"{PREFIX}CONFIG"]) if environment.get(f"{PREFIX}CONFIG") else None)

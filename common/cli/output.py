@@ -35,7 +35,7 @@ def print_rows(
 ) -> None:
     """Print rows of the same keys under their names: nothing is cut, in a terminal or in a pipe.
 
-    In a terminal a table, the columns in `right` aligned so. Where it is too narrow the columns in `least_first` are
+    In a terminal a table, the columns in `right` aligned so. Where it is too narrow the columns in `drop_order` are
     left out one by one, which is said below; then texts of the last column go on in further lines. In a pipe,
     tab-separated lines.
     """

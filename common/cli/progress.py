@@ -66,7 +66,7 @@ class FittedProgress(Progress):
         return table
 
     def _minimum_width(self, table: Table) -> int:
-        """Columns in which nothing is cut while the bar has `LEAST_BAR`."""
+        """Columns in which nothing is cut while the bar has `MIN_BAR_WIDTH`."""
         drawn = Measurement.get(self._console, self._console.options.update(max_width=WIDEST), table).maximum
         return drawn - (BAR_WIDTH - MIN_BAR_WIDTH) * any(isinstance(each, BarColumn) for each in self.columns)
 

@@ -92,7 +92,7 @@ class Archive:
 
 @contextmanager
 def open_archive(file: BinaryIO, limits: ArchiveLimits) -> Iterator[Archive]:
-    """An archive in an open file; `DamagedError` for whatever is wrong with it, also while it is read."""
+    """An archive in an open file; `DamagedArchiveError` for whatever is wrong with it, also while it is read."""
     try:
         _check_end(file, limits)
         with ZipFile(file) as archive:
@@ -104,7 +104,7 @@ def open_archive(file: BinaryIO, limits: ArchiveLimits) -> Iterator[Archive]:
 
 
 def read_arrays(source: Path | bytes, limits: ArchiveLimits, names: Iterable[str] | None = None) -> Arrays:
-    """The arrays of an `.npz`, or those of these `names`; `OSError` or `DamagedError` says why not."""
+    """The arrays of an `.npz`, or those of these `names`; `OSError` or `DamagedArchiveError` says why not."""
     with _open_source(source, limits) as file, open_archive(file, limits) as archive:
         wanted = [each.removesuffix(NPY) for each in archive.names] if names is None else names
         return {each: parse_array(archive.read(each + NPY), each) for each in wanted}

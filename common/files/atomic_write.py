@@ -1,4 +1,4 @@
-"""What a verb writes where `--out` says: looked at before minutes of work, then whole or not there."""
+"""Files that are written whole or not at all, and the `--out` of verbs: checked before minutes of work."""
 
 from __future__ import annotations
 

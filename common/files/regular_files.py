@@ -1,4 +1,4 @@
-"""Files that are either whole or not there, and files of others, which may be anything."""
+"""Files of others, which may be anything: only regular files are opened, within bounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What our child processes have in common: a terminal's Ctrl-C is their parent's affair, and they die with it."""
+"""Child processes that end with their parent, also when it is killed; Ctrl-C is left to the parent.
+
+`python -m dreamfleet.common.host.parent_death PARENT COMMAND` runs a command that ends so.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many cores this process may use: fewer than the host has where a container or a batch system says so."""
+"""What this process may use: cores, open files, and one thread for each numeric pool."""
 
 from __future__ import annotations
 

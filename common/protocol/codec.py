@@ -1,7 +1,7 @@
 """Strict encoding of the messages: msgpack on the wire, JSON where people and tools read.
 
 A message that is oversize, not msgpack, of another version, lacking or adding a field, of a wrong type, out of range,
-or carrying NaN never becomes an object. `Inbox` counts such messages by reason; nothing is raised past it.
+or carrying NaN never becomes an object. `CountingDecoder` counts such messages by reason; nothing is raised past it.
 """
 
 from __future__ import annotations

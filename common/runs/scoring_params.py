@@ -66,7 +66,7 @@ def scoring_params_at(
     generation: int, settings: RunSettings, history: Sequence[StoredGeneration],
     evaluations: Iterable[StoredEvaluation],
 ) -> ScoringParams:  # fmt: skip
-    """The terms of one `generation`, as `Agenda` tells them."""
+    """The scoring parameters of one `generation`, as `ScheduleState` computes them."""
     return ScheduleState(settings).scoring_params(generation, history, {each.generation: each for each in evaluations})
 
 

@@ -41,8 +41,8 @@ def search_seed(run_seed: int, stage: int) -> int:
 def validation_seeds(episodes: int, first: int = 0) -> tuple[int, ...]:
     """So many validation seeds from the `first` on.
 
-    Every evaluation has those from 0 on, so that its curve is comparable. What chooses between evaluated means has
-    those from `CHOOSING` on, and what is reported of the chosen one those from `CONFIRMING` on: they chose nothing.
+    Every evaluation has those from 0 on, so that its curve is comparable. What chooses between evaluated means uses
+    those from `CHOOSING_OFFSET` on. The reported score uses those from `CONFIRMING_OFFSET` on: they chose nothing.
     """
     return tuple(VALIDATION[first : first + episodes])
 

@@ -19,8 +19,8 @@ class TemperatureSchedule:
     Each evaluation is looked at once, however long the run is.
 
     Each evaluation that lies clearly behind the best one since the last raise multiplies the temperature by the run's
-    heat, up to `HOTTEST`. Only evaluations that the schedule wants count: one that a limit called for depends on when a
-    run was interrupted.
+    heat, up to `MAX_TEMPERATURE`. Only scheduled evaluations count: one that a
+    limit triggered depends on when a run was interrupted.
     """
 
     def __init__(self, settings: RunSettings) -> None:

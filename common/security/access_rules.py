@@ -28,7 +28,7 @@ _COORDINATORS = keys.live_coordinator(_ANY_RUN, "*")
 
 
 def access_control_config(passwords: bool, revoked_seats: Collection[str] = ()) -> dict[str, Any]:
-    """Zenoh's `access_control`; the seats in `barred` may do nothing. With `passwords` subjects are users."""
+    """Zenoh's `access_control`; the seats in `revoked_seats` may do nothing. With `passwords` subjects are users."""
     rules = [
         _rule("trusted", (INGRESS, EGRESS), ALL_MESSAGES, (f"{keys.ROOT}/**",)),
         *_viewer_rules(),

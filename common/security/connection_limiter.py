@@ -2,9 +2,9 @@
 
 Zenoh accepts every connection, holds it until its handshake ends or is out of time, and lets each one that failed cost
 all others 100 ms (https://github.com/eclipse-zenoh/zenoh/issues/2685): a few hundred closed connections keep newcomers
-out for a minute, and once a process has no descriptor left it never gets one back. So where more than `MOST_UNPROVEN`
-connections prove nothing, the kernel lets no packet of a new one through until they are fewer. Whoever is in stays in,
-and a newcomer's kernel tries again by itself. Linux only: elsewhere there is no gate.
+out for a minute, and once a process has no descriptor left it never gets one back. So while more than
+`MAX_UNAUTHENTICATED` connections have not authenticated, the kernel drops the packets of new ones. Open connections
+stay, and a newcomer's kernel tries again by itself. Linux only: elsewhere there is no limit.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[0-9a-fA-F:]+\]|[^:/\s]+):(\d{
 class Network:
     """Where to listen and what to connect to, endpoints such as `tcp/HOST:7447`, and as whom.
 
-    `barred` are the seats that a secured router lets do nothing.
+    `revoked_seats` are the seats that a secured router lets do nothing.
     """
 
     listen: tuple[str, ...] = ()

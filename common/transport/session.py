@@ -43,7 +43,7 @@ __all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_sessio
 def open_session(network: Network, *, timeout: float | None = CONNECT_TIMEOUT) -> zenoh.Session:
     """A router where `network.listen` is given, else a client; `ConnectionFailedError` after `timeout` seconds.
 
-    It is a `NotLetInError` where somebody listens who does not let this side in, and can be seen to.
+    It is a `HandshakeRejectedError` where somebody listens who does not let this side in, and can be seen to.
 
     Once open, a client reconnects by itself for ever, at any of its addresses. Zenoh's own first attempt never leaves
     the first one, and blocks in native code where no signal is heard: so whoever wants to wait calls again, and the one

@@ -26,7 +26,7 @@ MOST_CONNECTIONS = 800  # that are answered: a process may hold some thousand de
 def serve(
     config: DashboardConfig, watcher: Watcher, views: ViewProcesses, runs_dir: Path, on_ready: Callable[[str], None]
 ) -> None:
-    """Serve until SIGINT or SIGTERM; `ready` is told the address once it can be opened."""
+    """Serve until SIGINT or SIGTERM; `on_ready` gets the address once it can be opened."""
     feed = Feed(watcher)
     app = make_app(feed, views, runs_dir, config)
     with _open_socket(config) as listening:

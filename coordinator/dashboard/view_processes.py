@@ -58,7 +58,7 @@ class ViewTarget:
         return cls(run, BEST if BEST in asked else "")
 
     def flags(self, connection_flags: Sequence[str], runs_dir: Path) -> list[str]:
-        """The flags that say so; `place` are those that lead to the fleet."""
+        """The flags that select it; `connection_flags` lead to the fleet."""
         if self.kind == GENERATION:
             return [f"--controller={self.run}", f"--generation={self.name}", f"--runs-dir={runs_dir}"]
         whom = {WORKER: [f"--worker={self.name}"], BEST: ["--best"]}.get(self.kind, [])
@@ -69,7 +69,7 @@ class ViewProcesses:
     """All that is looked at now; used by one event loop."""
 
     def __init__(self, connection_flags: Sequence[str], runs_dir: Path, limit: int) -> None:
-        """`place` are the flags that lead to the fleet; `most` processes at a time, 0: there are none to look at."""
+        """`connection_flags` lead to the fleet; at most `limit` processes at a time, 0: no live views."""
         self._connection_flags, self._runs_dir, self._limit = connection_flags, runs_dir, limit
         self._views: dict[ViewTarget, _ViewProcess] = {}
         self._tasks: set[asyncio.Task[None]] = set()

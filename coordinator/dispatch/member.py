@@ -14,7 +14,7 @@ TRIAL_SECONDS = 60.0  # after which a copy that shows nothing is given up
 
 @dataclass(eq=False)
 class DispatchGroup:
-    """Jobs that a worker was given at one moment, beside so many that it had; `back` of them have come back."""
+    """Jobs that a worker was given at one moment; `returned_count` of them have come back."""
 
     given_at: float
     held_before: int

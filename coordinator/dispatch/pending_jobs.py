@@ -130,7 +130,8 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     def next(self, slots: int, *, idle: bool, drain_background: bool) -> NextJob | None:
         """Take the next job from its queue; `None` where none may go now.
 
-        `slots` is the fleet's, `idle` says whether one of them is; in a `hurry` all slots are for what fills slack.
+        `slots` is the fleet's number of slots, `idle` whether one of them is. With `drain_background` all take
+        background jobs.
         """
         while (next_job := self._next_queue(slots, idle=idle, drain_background=drain_background)) is not None:
             queue, by_share = next_job

@@ -44,7 +44,7 @@ class WorkerSelection:
         self._jobs += name in self._dependable
 
     def pick(self, eligible: Collection[str]) -> str | None:
-        """The worker to give the next job to; `None`: it had better wait for one that is not `able` now."""
+        """The worker to give the next job to; `None` if a worker that is not `eligible` now is worth waiting for."""
         fit = [name for name in eligible if self._finishes_in_time(name)]
         if not fit:
             return self._soonest(eligible)

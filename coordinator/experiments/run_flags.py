@@ -1,4 +1,4 @@
-"""What a run is that another verb begins: read as `coordinator` reads it, before hours of other work go by."""
+"""Run flags of another verb, parsed as `coordinator` parses them, before hours of other work go by."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ RESERVED |= dict.fromkeys(("bundle", "seed", "runs_dir", "listen", "connect", "c
 def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str) -> tuple[RunConfig, LimitsConfig]:
     """What a run is, and when it ends, as its flags, the environment and the file say.
 
-    `sources` are the verb's own, as `settle` left them. `UsageError` for flags that are `whose` to give, that are
-    wrong, or that name no limit.
+    `sources` are those of `verb`, as `complete_arguments` left them. `UsageError` for flags that `verb` gives itself,
+    for wrong ones, and where none sets a limit.
     """
     from dreamfleet.common.cli.command_line import build_parser
     from dreamfleet.coordinator.settings import run_setup

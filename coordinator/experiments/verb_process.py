@@ -17,7 +17,7 @@ STOP_TIMEOUT = 15.0  # seconds that a verb has to leave when asked: an update of
 
 
 def wait(child: VerbProcess, stop: Stop, on_poll: Callable[[], None] = lambda: None) -> None:
-    """Until it has ended; `StoppedError` as soon as `stop` says so, and whatever `look` raises meanwhile."""
+    """Wait until it has ended; `StoppedError` as soon as `stop` is true, and whatever `on_poll` raises meanwhile."""
     while child.popen.poll() is None:
         if stop():
             raise StoppedError("stopped")
@@ -31,12 +31,12 @@ def wait(child: VerbProcess, stop: Stop, on_poll: Callable[[], None] = lambda: N
 def run_for_json(
     words: Sequence[str], log: Path, stop: Stop, on_line: Callable[[str], None] = lambda _line: None
 ) -> Any:
-    """What a verb answers as JSON; the rest is as in `run`."""
+    """What a verb answers as JSON; otherwise as `run_verb`."""
     return json.loads(run_verb(words, log, stop, on_line).splitlines()[-1])
 
 
 def run_verb(words: Sequence[str], log: Path, stop: Stop, on_line: Callable[[str], None] = lambda _line: None) -> str:
-    """What a verb answers; what it says besides goes to `log` as it says it, and to `hear`.
+    """What a verb answers; its progress lines go to `log` and to `on_line` as they come.
 
     A wrong command is a `UsageError`, any other failure a `DreamfleetError`, with its last words.
     """

@@ -24,7 +24,7 @@ class RolloutCollection:
     episodes: int
 
     def work(self, spec: TaskSpec, run_seed: int, run_spec: TaskSpec | None = None) -> list[Work]:
-        """Its jobs; `own` is the run's specification where `spec` is another."""
+        """Its jobs; `run_spec` is the run's specification where `spec` is another."""
         seeds = [collection_seed(run_seed, self.generation, episode) for episode in range(self.episodes)]
         return make_work(spec, "collect", self.generation, 0, self.vector, seeds, run_spec)
 

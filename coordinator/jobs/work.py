@@ -33,7 +33,7 @@ def make_work(
 ) -> list[Work]:  # fmt: skip
     """One job an episode, numbered from `first` on; `seeds` holds one seed an episode.
 
-    `own` is the run's specification where `spec` is another.
+    `run_spec` is the run's specification where `spec` is another.
 
     A job names its temperature, horizon, patience and whether it is driven only where they are not the run's own.
     """

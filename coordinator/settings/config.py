@@ -287,7 +287,7 @@ def _check_normalisation(options: str, observations: int) -> None:
 
 
 def _arguments(flag: str, texts: Sequence[str], example: str) -> dict[str, Any]:
-    """The values of a flag's KEY=VALUE texts by their keys; `such` is one of them."""
+    """The values of a flag's KEY=VALUE texts by their keys; `example` is one of them."""
     arguments = [_argument(flag, text, example) for text in texts]
     if len(dict(arguments)) < len(arguments):
         raise UsageError(f"{flag}: a KEY stands there twice")

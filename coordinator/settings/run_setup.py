@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.config import Table, add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags
@@ -13,9 +12,6 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.coordinator.settings.schedule import find_schedule, split_first_stage
-
-if TYPE_CHECKING:
-    pass
 
 SUMMARY = "start a run: CMA-ES decides, workers score"
 

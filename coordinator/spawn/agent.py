@@ -71,7 +71,7 @@ class Channel:
         return data
 
     def wait_for_request(self, seconds: float = TICK) -> bool:
-        """Wait so long, or until something is asked, which is then true; `GoneError` if nobody is there to ask."""
+        """Wait for a request; whether one came. `DisconnectedError` if the other side has closed the connection."""
         if not self._waiting and select.select([0], [], [], seconds)[0]:
             self._read()
         return bool(self._waiting)

@@ -34,9 +34,9 @@ def end(hosts: Sequence[Host], *, all_workers: bool, now: bool, keep: bool) -> l
 def bring_up(
     hosts: Sequence[Host], fleet_address: FleetAddress, on_statuses: OnStatuses, on_log_line: OnLogLine | None
 ) -> list[HostStatus]:
-    """Have a worker run on each host; with `show`, or where it lives by a tunnel, until it ends or Ctrl-C.
+    """Have a worker run on each host; with `on_log_line`, or where it lives by a tunnel, until it ends or Ctrl-C.
 
-    `tell` is given the rows when all are up, `show` lines of their logs.
+    `on_statuses` is given the rows when all are up, `on_log_line` lines of their logs.
     """
     with stop_on_signals() as stop, ExitStack() as stack:
         remote_hosts = _open_remote_hosts(hosts, fleet_address, stack, on_log_line or _ignore_line)

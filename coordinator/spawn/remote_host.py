@@ -84,7 +84,7 @@ class RemoteHost:
         return self._status(started["outcome"], started)
 
     def follow(self) -> HostStatus | None:
-        """Show the worker's log until it ends, which is told; `None` if `leave` was called meanwhile."""
+        """Show the worker's log until it ends, which is told; `None` if `stop_following` was called meanwhile."""
         followed = self._ask("follow", name=self.host.name)
         return self._status("ended", followed) if followed["ended"] else None
 

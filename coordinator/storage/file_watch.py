@@ -31,7 +31,7 @@ class FileWatch:
     """The files of one coordinator's life: its folder, its journal and that one's log, its bundle. Close it."""
 
     def __init__(self, journal: Journal, bundle: ServedBundle | None, resume_command: Callable[[Path], str]) -> None:
-        """`again` is the command that goes on with the run in a folder."""
+        """`resume_command` gives the command that continues the run in a folder."""
         self._resume_command = resume_command
         self._journal = journal
         self._bundle = bundle

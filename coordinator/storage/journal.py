@@ -168,7 +168,7 @@ class Journal:
         own = self._stamp in (None, _stamp(self.path))
         with _journal_errors(self.path):
             self._connection.commit()
-        if own:  # else somebody wrote there since the last commit, which `overwritten` looks into
+        if own:  # else somebody wrote there since the last commit, which `is_overwritten` looks into
             self._stamp = _stamp(self.path)
 
     def fact(self, key: str) -> str | None:

@@ -59,7 +59,7 @@ def serve_new_run(
     args: argparse.Namespace, base: Table, start: StartPoint | None,
     adjust: Callable[[RunConfig], RunConfig] = lambda config: config,
 ) -> int:  # fmt: skip
-    """Serve a new run, whose settings are those of `base` where nothing else is said, once they were `looked_at`."""
+    """Serve a new run: its settings over those of `base`, passed through `adjust`."""
     config, limits = load_run_config(args, base)
     config = adjust(config)
     return serve_request(args, build_request(args, args.run_name, config, limits, {}, start))
@@ -105,7 +105,7 @@ def serve_request(
     args: argparse.Namespace, request: RunRequest, before: int | None = None,
     on_ended: Callable[[], ExitReport] = ExitReport,
 ) -> int:  # fmt: skip
-    """Serve until the run ends, and say how; of a run that ended, what `judge` finds too."""
+    """Serve until the run ends and report how; `on_ended` adds to the report of a run that ended."""
     from dreamfleet.coordinator.service.main import serve_run
 
     make_stderr_nonblocking()

@@ -1,4 +1,4 @@
-"""One life of a coordinator: the product's `Run` and `Exchange`, turned as `Service` turns them, on a simulated disk.
+"""One life of a coordinator: `Run` and `WorkerProtocol`, driven as `Service` drives them, on a simulated disk.
 
 The only module that knows how the coordinator's parts are driven; what their books hold is read in `books.py`.
 """

@@ -1,4 +1,4 @@
-"""One life of a worker: the product's `Membership`, `Backlog`, `Outbox` and `Uploads`, as `JoinedRun` turns them.
+"""One life of a worker: the product's `Membership`, `Backlog`, `Outbox` and `UploadQueue`, as `RunSession` turns them.
 
 The only module that knows how the worker's parts are driven. Its slots are simulated: a turn takes virtual time, and
 gives what `truth.py` says that its vectors and seeds give.

@@ -1,4 +1,4 @@
-"""How far a training has come, as its checkpoint keeps it."""
+"""How far a training has come, and its reports of episodes."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ WORLD = World(
     frames_per_second=50,
     action_names=("steer", "gas", "brake"),
     dream_reward=DreamReward(gain=3.5, cost=0.1),  # a tile gives 1000 / N, of a track's N tiles: 3.5 on average
-    stray="off_road",  # `OffRoad` says so
+    stray="off_road",  # `OffRoadInfo` says so
     threshold=gymnasium.spec(ENVIRONMENT).reward_threshold,
     finish="lap_finished",  # gymnasium says so as an episode ends; one that runs out of time says nothing
 )

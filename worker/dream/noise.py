@@ -67,7 +67,7 @@ class EpisodeNoise:
         return DreamStart(mu + np.exp(0.5 * logvar) * normal, memory)
 
     def draw_block(self) -> Draw:
-        """The noise of the next `PIECE` steps, a row each."""
+        """The noise of the next `BLOCK_STEPS` steps, a row each."""
         latent, hidden, rate = self._chance
         uniform = self._random.random((BLOCK_STEPS, latent), dtype=np.float32)
         normal = self._random.standard_normal((BLOCK_STEPS, latent), dtype=np.float32)

@@ -35,7 +35,7 @@ class DreamWorld:
     def __init__(
         self, bundle: Bundle, temperature: float, world: World | None = None, recorded: float = 0.0
     ) -> None:  # fmt: skip
-        """`world` is the bundle's own; found by its name if it is not given. `recorded` is a share of `Beginnings`."""
+        """`world` is the bundle's own; found by its name if it is not given. `recorded` is a share of `StartStates`."""
         check_temperature(temperature)
         if DREAM_GRAPH not in bundle.manifest.parts:
             raise BundleError(f"{bundle.path.name} is from before dreams: build it again with `dreamfleet bundle`")

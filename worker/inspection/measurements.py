@@ -63,7 +63,7 @@ def likeness(
     episodes: int,
     on_drive: OnCount,
 ) -> list[RareFrequency]:
-    """How often dreams come to what is rare on so many drives; `UsageError` as of `dream_losses`."""
+    """How often dreams come to what is rare on so many drives; `UsageError` as of `measure_dream_losses`."""
     controller = _dream_controller(bundle, driving)
     drives = []
     for drive in islice(_drives(bundle, driving, config), episodes):

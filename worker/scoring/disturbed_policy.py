@@ -25,7 +25,7 @@ class DisturbedPolicy:
         watching_mind: RecurrentState | None = None,
         bursts: ActionBursts | None = None,
     ) -> None:
-        """`watching` is another mind than the hand's that looks on, if one does."""
+        """`watching_mind` is a second recurrent state that observes the drive; `None`: there is none."""
         self._actor, self._disturbance, self._bursts = actor, disturbance, bursts
         minds = [watching_mind, None if actor.mind is watching_mind else actor.mind]
         self._minds = [each for each in minds if each is not None]

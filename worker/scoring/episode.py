@@ -27,7 +27,7 @@ class EpisodeConfig:
     idle_cost: float = 0.0  # the world's: charged for each step that is cut off
     time_cost: float = 0.0  # charged for each step until the course is finished, or the horizon
     finish: str = ""  # the world's
-    stray_cost: float = 0.0  # charged for each step off the course, of the first `STRAYS`
+    stray_cost: float = 0.0  # charged for each step off the course, of the first `MAX_STRAYS`
     stray: str = ""  # the world's
 
 
@@ -59,7 +59,7 @@ def run_episode(
     observation, _ = environment.reset(seed=episode_config.seed)
     if begin is not None:
         observation = begin(environment, observation)
-    # Of a `Rewarded` policy; to ask `isinstance` of a protocol takes 70 microseconds, as long as some tasks' steps.
+    # Of a `RewardAwarePolicy`: `isinstance` of a protocol takes 70 microseconds, as long as some tasks' steps.
     report_reward: Callable[[float], None] | None = getattr(policy, "reward", None)
     idle, over = 0, False
     for step in range(1, episode_config.horizon + 1):
@@ -87,7 +87,7 @@ def score(
 ) -> Score:
     """The episode's fitness: the sum of its rewards, in step order, in double precision.
 
-    `rollout` keeps what happens, and `see` is shown each moment.
+    `rollout` records the episode, and `on_transition` gets each step.
 
     An episode that patience cuts is charged what standing still would have cost up to the horizon, so that cut and
     uncut candidates compare. Time costs up to the horizon too, unless the course is finished: to crash saves nothing.

@@ -26,7 +26,7 @@ MAX_PARAMETER = 0.25  # parameter of the controllers: their actions are neither 
 
 
 class HostClassProbe:
-    """The digest of what was computed so far; as an `Onlooker` it takes in each step that it is shown."""
+    """The digest of what was computed so far; as a `StepObserver` it adds each step."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
@@ -47,7 +47,7 @@ class HostClassProbe:
         for moment in run_episode(environment, watched, EpisodeConfig(SEED, steps)):
             seen.append(moment.seen)
             self.add_value((moment.seen, moment.reward, moment.ended))
-        outputs: Callable[[Any], Any] = getattr(policy, "outputs", policy.act)  # of a `Choosing` one
+        outputs: Callable[[Any], Any] = getattr(policy, "outputs", policy.act)  # of a `PolicyWithOutputs` one
         for shift in range(PROBE_CONTROLLERS):
             policy.begin(np.roll(parameters, shift))
             for each in seen:

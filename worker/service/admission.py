@@ -56,7 +56,7 @@ def request_admission(
 ) -> Admission | None:
     """Say hello to `run`, or to the only live one; `None` if nobody answers, `RefusedError` if the answer is no.
 
-    `joined` is the uid of the run that this worker is in.
+    `joined_run_uid` is the uid of the run that this worker is in.
 
     A run that asks for a task which the request does not announce is refused in turn: its word imports nothing here.
     In a `secured` fleet it is said under this worker's own name.
@@ -106,7 +106,7 @@ def _is_reply_of(reply: HelloReply, run: str | None) -> bool:
 
 
 def find_run_with_fewest_slots(session: zenoh.Session, excluded: Collection[str] = ()) -> str | None:
-    """The live run that works with the fewest slots; of equals the first by name. Those in `without` are left out."""
+    """The live run that works with the fewest slots; of equals the first by name. Those in `excluded` are left out."""
     found = []
     for payload in query_all(session, [keys.status("*")], HELLO_TIMEOUT):
         with suppress(ValueError, KeyError, TypeError):  # what answers need not be of this version

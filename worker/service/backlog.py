@@ -60,8 +60,8 @@ class Backlog:
     def add_batch(self, batch: JobBatch, in_slots: Collection[bytes] = ()) -> list[tuple[Job, str]]:
         """Queue a batch's jobs once; those whose digest is not theirs come back with what is wrong.
 
-        Those that a slot has in hand (`held`, by digest) are not queued: a coordinator that was killed as it opened a
-        generation gives its jobs again in its next life.
+        Jobs that a slot has already (`in_slots`, by digest) are not queued: a coordinator that was killed while it
+        opened a generation gives its jobs again in its next life.
         """
         if not self.seen < batch.number <= self.seen + MAX_BATCHES_AHEAD or batch.number in self._received_ahead:
             return []

@@ -35,9 +35,9 @@ def serve_jobs(
     pipe: Connection[Any, Any], steps: Any, abandoned: Any, is_watched: Any, spec: TaskSpec, bundle: Path | None,
     allowed_tasks: tuple[str, ...], parent: int,
 ) -> None:  # fmt: skip
-    """Score jobs from the pipe until it closes. `steps`, `abandoned` and `shown` are shared with the parent.
+    """Score jobs from the pipe until it closes. `steps`, `abandoned` and `is_watched` are shared with the parent.
 
-    Nothing is imported for a task that is not among the `announced` ones.
+    Nothing is imported for a task that is not among `allowed_tasks`.
     """
     exit_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker decides; Ctrl-C reaches the whole group

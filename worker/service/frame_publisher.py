@@ -24,7 +24,7 @@ FRAME_OVERHEAD = 1024  # bytes of a frame beside its picture and what a world mo
 
 
 class FramePublisher:
-    """The publisher of a worker's frames; `hear` is called in Zenoh's thread as viewers come or go."""
+    """The publisher of a worker's frames; `on_viewers_changed` is called in Zenoh's thread as viewers come or go."""
 
     def __init__(
         self, session: zenoh.Session, run: str, identity: str, on_viewers_changed: Callable[[Any], None]

@@ -41,7 +41,7 @@ class SampledFrame:
 
 
 class FrameSampler:
-    """An onlooker who samples the present while `wanted`, and tells what he sees."""
+    """An observer that samples steps while `is_watched`, and sends them."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class FrameSampler:
         clock: Callable[[], float] = perf_counter,
         cpu_time: Callable[[], float] = thread_time,
     ) -> None:
-        """`spent` are the processor's seconds: what others take of a busy host is no cost of showing."""
+        """`cpu_time` counts this thread's processor seconds: what others take of a busy host is no cost of sampling."""
         self._send, self._is_watched, self._clock, self._cpu_time = send, is_watched, clock, cpu_time
         self._group, self._next_at = 0, 0.0
 

@@ -7,7 +7,7 @@ owes an answer. To say hello once too often costs a message; to be forgotten wou
 
 A worker leaves when it was told to (the first time it drains: what runs is finished and delivered), when its lifetime
 is over (it drains too), when the run ends with its workers, or, where it was asked to, when it has seen no coordinator
-for `GONE` seconds.
+for `COORDINATOR_GONE_AFTER` seconds.
 """
 
 from __future__ import annotations

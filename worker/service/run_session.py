@@ -1,7 +1,7 @@
 """A worker's time in one run: it takes jobs, has them scored, and delivers until each result has its verdict.
 
 One owner thread and one queue; Zenoh's callbacks and the slots' readers only enqueue. What is decided lies in pure
-parts (`Membership`, `Backlog`, `Outbox`, `Uploads`); here they meet the clock, the session and the slots.
+parts (`Membership`, `Backlog`, `Outbox`, `UploadQueue`); here they meet the clock, the session and the slots.
 """
 
 from __future__ import annotations

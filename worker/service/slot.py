@@ -64,9 +64,9 @@ class Slot:
         memory_limit: int = 0,
         restore_bundle: Callable[[], object] = lambda: None,
     ) -> None:
-        """`announced` are the tasks that its worker lets itself be asked for; `memory_limit` in bytes; 0: none.
+        """`allowed_tasks` are the tasks that a run may ask of this worker; `memory_limit` in bytes; 0: none.
 
-        `renew` sees that `bundle` is there and whole, after a child that could not start: others write into the cache.
+        `restore_bundle` makes `bundle` whole again after a child that could not start: others write into the cache.
         """
         self.number = number
         self.ready = False

@@ -35,7 +35,7 @@ class SlotPool:
         memory_limit: int,
         restore_bundle: Callable[[], object] = lambda: None,
     ) -> None:
-        """`RefusedError` for a task that is not `announced`; `memory_limit` in bytes a slot; 0: none."""
+        """`RefusedError` for a task that is not among `allowed_tasks`; `memory_limit` in bytes a slot; 0: none."""
         check_task_allowed(spec.task, allowed_tasks)
         self._task = spec.task
         self._width = find_task(spec.task).width

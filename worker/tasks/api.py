@@ -112,9 +112,9 @@ class StepObserver(Protocol):
 
 @dataclass(frozen=True)
 class DreamReward:
-    """What a dreamt step is worth where the MDN-RNN foretells no reward itself: `gain * told - cost`.
+    """What a dreamt step is worth where the MDN-RNN predicts no reward itself: `gain * value - cost`.
 
-    `told` is what the head for the reward's label tells, or, of `survival`, whether the dream goes on.
+    `value` is the output of the head for the reward's label, or, for `survival`, whether the dream goes on.
     """
 
     gain: float

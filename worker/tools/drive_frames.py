@@ -83,7 +83,7 @@ class FilmedPolicy:
 
 
 class FramePainter:
-    """Draws frames of one drive, all of one size, and hands them to `take`."""
+    """Draws frames of one drive, all of one size, and passes them to `on_frame`."""
 
     def __init__(
         self, environment: gymnasium.Env[Any, Any], world: World, seed: int, on_frame: Callable[[Frame], None],

@@ -42,8 +42,8 @@ def load_checkpoint(
 ) -> dict[str, Any] | None:
     """Put a checkpoint back and return its progress; `None` if there is none yet.
 
-    Of the configuration, what is `free` may be more than the checkpoint's model has: rows that it adds to a tensor
-    begin as the new model has them, the tensor's moments at zero.
+    Fields in `extensible` may add to what the checkpoint's model has: the rows that they add to a tensor start as in
+    the new model, and that tensor's moments at zero.
     """
     if not path.exists():
         return None
@@ -112,7 +112,7 @@ def _drop_parameters(moments: Mapping[str, torch.Tensor], parameters: set[int]) 
 
 
 def check_config(path: Path, config: Any, extensible: frozenset[str] = frozenset()) -> None:
-    """`DatasetError` names what a checkpoint's model has otherwise; what is `free` may have come newly."""
+    """`DatasetError` names what a checkpoint's model has otherwise; what is `extensible` may have come newly."""
     stored, wanted = asdict(load_config(path, type(config))), asdict(config)
     if any(stored[name] for name in extensible):  # what is there stays what it is
         extensible = frozenset()

@@ -100,7 +100,7 @@ def make_targets(world: World, columns: int) -> list[PredictionTarget]:
 def find_subspace(
     bundle: Bundle, paths: Sequence[Path], on_progress: Callable[[int], None], views: int = 0
 ) -> SubspaceResult:
-    """The subspace of these drives for the default controllers of a world model; `told` hears how many are followed.
+    """The subspace of these drives for a world model's default controllers; `on_progress` gets how many are followed.
 
     `views` directions of [z, h] that foretell [z, h] are features too, as many at most as foretell anything.
 

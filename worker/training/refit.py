@@ -141,7 +141,7 @@ class SplitSums:
 def refit(
     controller: Controller, own: Bundle, bundle: Bundle, paths: Sequence[Path], on_progress: Callable[[int], None]
 ) -> RefitResult:
-    """The controller of the world model `own` for `bundle`, by these drives; `told` hears how many are followed.
+    """The controller of the world model `own` for `bundle`, by these drives; `on_progress` gets how many are followed.
 
     It is left as it is where that one sees and remembers as its own does, to the bit.
 

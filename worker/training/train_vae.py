@@ -39,7 +39,7 @@ ReportProgress = Callable[[int, str], None]
 
 
 class VAELossValues(NamedTuple):
-    """Of a VAE, as `Loss` has them."""
+    """Of a VAE, as `VAELoss` has them."""
 
     weighted: float
     plain: float

@@ -1,4 +1,4 @@
-"""How a training ended: early, or in the midst of an update."""
+"""A training as a verb runs it: its progress bar, how it ended, its figures."""
 
 from __future__ import annotations
 

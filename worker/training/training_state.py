@@ -30,7 +30,7 @@ class TrainingState:
     ) -> None:  # fmt: skip
         """`episodes` to train on, in all; `other` is a checkpoint to begin from where `path` has none.
 
-        `new`: what `path` has is not gone on with, and replaced. What is `free` of the configuration, as for
+        `new`: what `path` has is not gone on with, and replaced. What is `extensible` of the configuration, as for
         `load_checkpoint`, is so of `other`, and of what `path` has while it has made no update.
         """
         if new and other is not None and other.resolve() == path.resolve():
@@ -101,7 +101,7 @@ class TrainingState:
         save_checkpoint(path or self._path, self._model, self.optimiser, self.progress)
 
     def finish_update(self, validate: Callable[[], float]) -> None:
-        """End an update: where it is due, `look` at held-out rollouts and save; the best, if patience is over.
+        """End an update: where it is due, `validate` on held-out rollouts and save; the best, if patience is over.
 
         The last checkpoint is written last and once: a kill before it leads to the same files again.
         """

@@ -36,7 +36,7 @@ class ChoiceMemory:
         return np.concatenate([last, last - before], axis=1)
 
     def choose(self, state: Floats, decide_anew: Callable[[], Floats]) -> Floats:
-        """The choice of each row `(N, actions)`: `anew` where it is time to, else the one that is held."""
+        """The choice of each row `(N, actions)`: `decide_anew` where it is time to, else the one that is held."""
         if not self.columns:
             return decide_anew()
         due = state[:, -1:] == 0

@@ -53,7 +53,7 @@ class Trials:
         _write_settings(path, {**kept, "data": data})
 
     def do(self, trial: Trial, on_step: Callable[[str], None]) -> TrialResult:
-        """Do what is left of it; `before` hears each part as it begins."""
+        """Do what is left of it; `on_step` is called as each part begins."""
         self._link_data(trial)
         model = self._model_path(trial)
         if not path_exists(model):

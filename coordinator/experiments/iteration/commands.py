@@ -74,7 +74,7 @@ class Commands:
         return (*self.train(1, model), "--summary")
 
     def check_trainings(self) -> tuple[Words, ...]:
-        """`tried` of both models of the world model that the iteration goes on from: drives are of the same preset."""
+        """Check the training flags of both models of the world model that the iteration starts from."""
         return tuple(self.check_training(model) for model in (VAE, MDNRNN))
 
     def encode(self, number: int) -> Words:

@@ -39,7 +39,7 @@ class Iteration:
         stop: Stop,
         network_flags: Words = (),
     ) -> None:
-        """`reached` are the flags of its command that no ledger keeps: where workers come to, and how."""
+        """`network_flags` are flags of its command that no ledger keeps: where workers connect, and how."""
         self.ledger = ledger
         self._resume_command = shell_command("iterate", "--data", layout.root, *network_flags)
         self._layout, self._config, self._local_fleet, self._stop = layout, config, local_fleet, stop
@@ -70,9 +70,9 @@ class Iteration:
         on_finished: Callable[[FinishedPhase], None],
         on_line: Callable[[str], None],
     ) -> None:
-        """Do what is left; `before` hears of each phase as it begins, `after` when it is in the ledger.
+        """Do what is left; `on_begin` is called as a phase begins, `on_finished` when it is in the ledger.
 
-        `hear` is told each line of what a phase's verbs say of how far they are.
+        `on_line` gets each progress line of a phase's verbs.
         """
         while (phase := self._plan.next(self.ledger.finished)) is not None:
             on_begin(phase)

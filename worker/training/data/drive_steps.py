@@ -43,7 +43,7 @@ class SampledSteps:
 def find_road_losses(rewards: Floats) -> list[int]:
     """Steps at which a drive of rewards `(T,)` lost the road, as they alone tell it.
 
-    From such a step on none is positive for `LASTING` steps at least, and the one before it is.
+    From such a step on none is positive for `LOSS_STEPS` steps at least, and the one before it is.
     """
     paid = np.flatnonzero(rewards > 0)
     unpaid = np.diff(paid, append=len(rewards)) - 1
