@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
         }
         settings = {**config_values(stored.settings, stored.bundle_path), **present}
         if not scoring_params.stage.whole:
-            settings["searched"] = stored_subspace(stored.fact(SUBSPACE_FACT), stored.settings, stored.path)
+            settings["loaded_subspace"] = stored_subspace(stored.fact(SUBSPACE_FACT), stored.settings, stored.path)
     if {"environment", "normalise"} & args.given:
         settings.pop("task_options", None)  # described anew, and refused if that makes another world of it
     if "optimiser" in args.given and "optimiser_options" not in args.given:
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _adapt_to_subspace(config: RunConfig, before: dict[str, Any], sigma: float) -> RunConfig:
     """The fork's configuration, of which the source's step `sigma` means nothing in another subspace."""
-    loaded_subspace, old = config.loaded_subspace, before.get("searched")
+    loaded_subspace, old = config.loaded_subspace, before.get("loaded_subspace")
     if (loaded_subspace and loaded_subspace.sha256) == (old and old.sha256):
         return config
     stages = config.stages

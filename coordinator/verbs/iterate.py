@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 SUMMARY = "make world models and evolve in their dreams in turn, each learning from what the last one's means drove"
 EXTRAS = ("train", "views")
 PACKAGES = ("gymnasium", "matplotlib", "onnx", "onnxruntime", "safetensors", "torch")
-VARYING = ("preset", "schedule", "bundle", "searched")  # to the rounds' runs, of all settings
+VARYING = ("preset", "schedule", "bundle", "loaded_subspace")  # to the rounds' runs, of all settings
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

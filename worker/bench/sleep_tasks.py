@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dreamfleet.worker.tasks.api import Assignment, Continuous, Task, World
 
 SLEEP_SECONDS = 0.05
-SLEEP_TASK, NULL_TASK = (f"{__name__}:{name}" for name in ("Naps", "Nulls"))
+SLEEP_TASK, NULL_TASK = (f"{__name__}:{name}" for name in ("SleepTask", "NullTask"))
 
 
 class SleepEnvironment(gymnasium.Env[Any, Any]):

@@ -138,8 +138,8 @@ class Scorer:
     def close(self) -> None:
         """Release the environments."""
         self._environment.close()
-        if (shown := self.__dict__.get("_shown")) is not None:  # nobody may have looked on
-            shown.close()
+        if (watched := self.__dict__.get("_watched_environment")) is not None:  # made when somebody first watches
+            watched.close()
 
     def _run_episode(
         self,
