@@ -128,3 +128,12 @@ def test_another_packages_world_is_not_drawn_and_one_that_cannot_be_drawn_is_sho
     monkeypatch.setattr(CartPoleEnv, "render", lambda self: 1 / 0)
     _, seen = watched_and_not(Scorer(spec), [("score", parameters(spec.controller.size), 2**20)])
     assert {glimpse.picture for _, glimpse in seen} == {None}
+
+
+def test_the_environment_of_a_watched_drive_is_closed_with_the_scorer():
+    task = find_task("gym:CartPole-v1")
+    scorer = Scorer(TaskSpec(task.name, "", 50, 0, controller=shape_of(task.describe({}))))
+    closed = []
+    scorer._watched_environment.close = lambda: closed.append(True)
+    scorer.close()
+    assert closed == [True]
