@@ -1,12 +1,12 @@
 # Two commands on a fresh machine: `make demo` and `make test`. Both make .venv and install what they need.
 PYTHON ?= python3
-VENV := .venv
+VENV ?= .venv
 BIN := $(VENV)/bin
 SUPPLY := .venv-supply
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
-.PHONY: demo test slow setup check wheel long box2d-py simulate chaos sanitize bundle worker-size stranger reproduce \
+.PHONY: demo test test-newest slow setup check wheel long box2d-py simulate chaos sanitize bundle worker-size stranger reproduce \
   reproduce-evolution lock audit sbom structure clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
@@ -17,6 +17,13 @@ test: $(VENV)/.dev  ## every test that ends within seconds: under ten minutes
 
 slow: $(VENV)/.dev  ## those that take longer, each under two minutes; what lands has passed both
 	$(BIN)/pytest -m "slow and not long" --numprocesses 2 --dist worksteal $(ARGS)
+
+NEWEST ?= $(shell deploy/newest_python.sh)
+test-newest:  ## a short part of the tests on the newest Python that is here, in an environment of its own
+	@if [ -z "$(NEWEST)" ]; then echo "neither Python 3.13 nor 3.12 is here: nothing was run"; \
+	else $(MAKE) test VENV=.venv-newest PYTHON=$(NEWEST) ARGS="$(or $(ARGS),$(SHORT))"; fi
+# What another version of Python breaks first: syntax, dataclasses, threads and processes, pickles, warnings, one run.
+SHORT := tests/common tests/coordinator tests/worker/service tests/worker/scoring tests/test_structure.py
 
 setup: $(VENV)/.dev  ## everything that development needs
 
@@ -102,4 +109,4 @@ structure:  ## figures of the structure: rooms, floors, imports between rooms, f
 	$(PYTHON) deploy/structure.py $(ARGS)
 
 clean:
-	rm -rf $(VENV) $(SUPPLY) .venv-box2d-py build dist *.egg-info
+	rm -rf $(VENV) $(SUPPLY) .venv-box2d-py .venv-newest build dist *.egg-info

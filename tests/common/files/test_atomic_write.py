@@ -1,12 +1,16 @@
 """What `--out` names is looked at before the work, and is whole or not there."""
 
 import os
-from contextlib import suppress
+import tempfile
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import pytest
 
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
+
+NOBODY = 65534
 
 
 def test_a_folder_is_made_and_a_file_is_whole(tmp_path):
@@ -38,11 +42,26 @@ def test_a_device_or_pipe_stays_what_it_is(tmp_path):
     assert link.is_symlink()
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_nobody_may_write_in_is_said_before_the_work(tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(UsageError, match="cannot be written in"):
-        check_output_path(tmp_path / "tiny.json")
+@contextmanager
+def without_root():
+    """Root may write anywhere, so a test that needs a refusal gives up root's rights for a moment."""
+    user = os.getuid()
+    os.setresuid(NOBODY if user == 0 else user, NOBODY if user == 0 else user, user)
+    try:
+        yield
+    finally:
+        os.setresuid(user, user, user)
+
+
+def test_a_read_only_folder_is_reported_before_the_work():
+    with tempfile.TemporaryDirectory() as name:  # not tmp_path, which another user may not enter
+        folder = Path(name)
+        folder.chmod(0o777)
+        with without_root():
+            check_output_path(folder / "tiny.json")
+        folder.chmod(0o555)
+        with without_root(), pytest.raises(UsageError, match="cannot be written in"):
+            check_output_path(folder / "tiny.json")
 
 
 def test_what_fails_half_way_leaves_what_was_there(tmp_path):
