@@ -104,7 +104,7 @@ def test_each_may_do_what_its_role_says_and_the_run_is_none_the_worse(processes,
     assert (processes.runs / "safe" / "journal.sqlite").stat().st_mode & 0o077 == 0
 
 
-def test_who_is_not_of_the_fleet_is_not_let_in_and_is_told_why(access, endpoint, tmp_path):
+def test_a_stranger_to_the_fleet_is_refused_with_the_reason(access, endpoint, tmp_path):
     other = Access(tmp_path / "other")
     good, elsewhere = read_join_file(access.path("viewer")), f"tls/127.0.0.2:{free_port()}"
     expired = access.authority.issue(
@@ -142,7 +142,7 @@ def test_a_worker_that_is_not_let_in_says_why_once_and_tries_again(access, endpo
         assert [each.result() for each in serving] == [None, None]
 
 
-def test_a_plain_port_that_a_join_file_names_is_told_from_one_where_nobody_is(access):
+def test_a_plain_port_and_a_closed_port_give_different_errors_for_a_join_file(access):
     plain, nobody = f"127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
     served = open_session(Network(listen=(f"tcp/{plain}",)))
     with served, pytest.raises(HandshakeRejectedError, match="started without --join"):

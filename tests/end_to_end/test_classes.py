@@ -89,7 +89,7 @@ def test_hosts_that_compute_the_same_are_of_one_class_whatever_they_say_of_thems
 
 
 @pytest.mark.slow
-def test_a_strict_run_refuses_another_class_and_goes_on_strict_until_it_is_told_otherwise(processes, settings):
+def test_a_strict_run_refuses_another_class_and_stays_strict_when_resumed(processes, settings):
     coordinator = processes.coordinator(*settings, "--generations", 1, "--strict")
     first = own(processes)
     assert coordinator.finish()[0] == 0
@@ -110,7 +110,7 @@ def test_a_strict_run_refuses_another_class_and_goes_on_strict_until_it_is_told_
 
 
 @pytest.mark.slow
-def test_status_runs_show_and_list_tell_of_what_classes_the_results_are(processes, settings):
+def test_status_runs_show_and_list_name_the_classes_of_results(processes, settings):
     coordinator = processes.coordinator(*settings, "--generations", 1000)
     odd = own(processes, inside=ODD)
     coordinator.wait_for("generation 0: mean")

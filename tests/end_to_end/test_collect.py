@@ -1,4 +1,4 @@
-"""A run keeps drives of its own mean: what lies on disk, whoever drove and whoever died."""
+"""A run keeps drives of its own mean: the same files on disk, with any workers and any losses."""
 
 import hashlib
 import io
@@ -50,7 +50,7 @@ def resume(processes, name):
     )  # fmt: skip
 
 
-def test_the_drives_are_a_function_of_the_run_whoever_makes_them(processes, settings):
+def test_the_drives_are_a_function_of_the_run_and_not_of_the_worker(processes, settings):
     seen = []
     for name, workers in (("one", 1), ("three", 3)):
         coordinator = processes.coordinator(*settings, "--task", tasks.TOY, name=name)

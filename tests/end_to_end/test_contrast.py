@@ -25,7 +25,7 @@ def data(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_contrast_that_was_stopped_goes_on_and_tells_kinds_apart(processes, data, tmp_path):
+def test_a_stopped_contrast_continues_and_compares_the_kinds(processes, data, tmp_path):
     words = ("contrast", "--data", data, "--out", tmp_path / "out", "--seeds", 1, *SMALL)
     first = processes.start(*words)
     first.wait_for("plain-1 is finished")
@@ -36,9 +36,9 @@ def test_a_contrast_that_was_stopped_goes_on_and_tells_kinds_apart(processes, da
 
     code, out, err = processes.call(*words, "--json")
     assert code == 0, err
-    told = json.loads(out)
-    assert [each["kind"] for each in told["trials"]] == ["plain", "attentive"]
-    for each in told["trials"]:
+    answer = json.loads(out)
+    assert [each["kind"] for each in answer["trials"]] == ["plain", "attentive"]
+    for each in answer["trials"]:
         model = Bundle.open(tmp_path / "out" / f"{each['kind']}-1" / f"{each['kind']}-1.zip").manifest
         assert model.models["mdnrnn"]["window"] == (2 if each["kind"] == "attentive" else 0)
         assert each["quality"]["nats_per_dimension"] == model.provenance["quality"]["nats_per_dimension"]

@@ -42,7 +42,7 @@ def settings(random_bundle):
 
 @contextmanager
 def dashboard(processes, *flags, runs=None):
-    """Its process, and the address that it told."""
+    """Its process, and the address that it printed."""
     started = processes.start(
         "dashboard", "--connect", processes.endpoint, "--runs-dir", runs or processes.runs, *flags
     )
@@ -232,7 +232,7 @@ def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, 
         page.wait_for_selector("text=This cannot be shown")
         page.goto(f"{started.address}#/run/..%2F..%2Fetc")
         page.wait_for_selector("text=the dashboard answered 404")
-        without_absence(page)  # a browser tells of each 404
+        without_absence(page)  # a browser logs each 404
 
 
 def test_an_empty_runs_folder_says_how_a_run_is_started(page):
@@ -310,7 +310,7 @@ def test_five_thousand_generations_and_five_hundred_workers_are_painted_in_no_ti
         assert (ended - began) / (updates - painted) < 100, "milliseconds an update"
 
 
-def test_another_coordinators_words_are_told_and_end_nothing(browser, processes):
+def test_another_coordinators_refusal_is_shown_and_ends_nothing(browser, processes):
     strange = snapshot(3)
     broken = dataclasses.replace(
         strange, status=dataclasses.replace(strange.status, recent=(), generations=2**60, uptime=float("inf"))
@@ -337,7 +337,7 @@ def test_the_token_is_asked_for_and_opens_the_page(browser, processes):
         page.click("button")
         wait(page, "no coordinator")
         assert TOKEN not in page.url
-        without_absence(page)  # a browser tells of each 401
+        without_absence(page)  # a browser logs each 401
 
 
 def test_what_cannot_be_served_is_one_line(processes):
@@ -375,7 +375,7 @@ def test_it_leaves_at_once_although_pages_are_open(processes):
             urllib.request.urlopen(started.address, timeout=DEADLINE)
 
 
-def told(port, request, deadline=DEADLINE):
+def send_to(port, request, deadline=DEADLINE):
     """What the server says to these bytes until it closes the connection, or the head alone of what goes on."""
     with socket.create_connection(("127.0.0.1", port), timeout=deadline) as connection:
         connection.sendall(request)
@@ -404,7 +404,7 @@ def test_clients_that_are_no_browsers_neither_stop_it_nor_see_more(processes):
             (b"GET //etc/passwd HTTP/1.1" + host + b"\r\n", b"404"),
             (b"GET /view?run=%00%0d%0aX:1 HTTP/1.1" + host + b"\r\n", b"400"),
         ):
-            said = told(port, request)
+            said = send_to(port, request)
             assert said.split()[1:2] == [code], (request[:60], said[:200])
             assert b"root:" not in said
         assert all(each.recv(1) == b"" for each in half), "half a request is not waited for"

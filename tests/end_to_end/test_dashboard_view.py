@@ -46,8 +46,8 @@ def dashboard(processes, *flags):
 
 def children(process):
     """The processes that it has started."""
-    told = Path(f"/proc/{process.popen.pid}/task/{process.popen.pid}/children").read_text()
-    return [int(each) for each in told.split()]
+    listed = Path(f"/proc/{process.popen.pid}/task/{process.popen.pid}/children").read_text()
+    return [int(each) for each in listed.split()]
 
 
 def say(page, text, part="view-told"):

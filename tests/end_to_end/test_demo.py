@@ -56,8 +56,8 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         best = max((real, dream), key=lambda run: run.confirmation().mean).name
         found = [run.confirmation() for run in (real, dream)]
         confirmed = [f"{each.mean:.0f} ± {each.error:.0f} ({each.episodes})" for each in found]
-        told = Controller.load((real if best == "demo" else dream).controller_path).provenance
-    assert told["confirmed"]
+        provenance = Controller.load((real if best == "demo" else dream).controller_path).provenance
+    assert provenance["confirmed"]
     assert f"run {best}'s" in out.replace("\n", " ")
     assert all(score in out for score in confirmed), out
     for made in (f"{best}/drive.mp4", "demo/fitness.png", "demo-dream/fitness.png"):

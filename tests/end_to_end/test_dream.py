@@ -56,7 +56,7 @@ def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bund
 
 
 @pytest.mark.slow
-def test_dreams_that_begin_at_recorded_states_are_the_same_whoever_dreams(processes, tmp_path):
+def test_dreams_from_recorded_states_are_the_same_on_every_worker(processes, tmp_path):
     bundle = write_random_bundle(tmp_path / "b.zip", recorded=states(20))
     for name, workers, flags in (("alone", 1, ("--recorded", 0.5)), ("two", 2, ("--recorded", 0.5)), ("plain", 1, ())):
         coordinator = begin(processes, bundle, name, *flags)
@@ -101,9 +101,9 @@ def begin_heated(processes, bundle, name):
 def heated_outcome(processes, name):
     with open_run(processes.runs, name) as run:
         places = [(g, i) for g in range(HEATED_GENERATIONS) for i in range(POPULATION)]
-        told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
+        scores = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
         temperatures = [scoring_params_of(run, g).spec.temperature for g in range(HEATED_GENERATIONS)]
-        return told, run.evaluations(), temperatures
+        return scores, run.evaluations(), temperatures
 
 
 def test_a_heated_run_whose_coordinator_is_killed_raises_at_the_same_generations(processes, random_bundle):
@@ -185,18 +185,18 @@ def test_a_run_that_dreams_then_mixes_then_drives_gives_the_same_bits_through_ki
             "coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint,
         )  # fmt: skip
     assert coordinator.finish()[0] == 0
-    told = []
+    scores = []
     for name in ("calm", "night"):
         with open_run(processes.runs, name) as run:
             places = [(g, i) for g in range(len(DRIVEN)) for i in range(POPULATION)]
-            told.append([(run.fitness(*place), [each.steps for each in run.results(*place)]) for place in places])
+            scores.append([(run.fitness(*place), [each.steps for each in run.results(*place)]) for place in places])
             efforts = [each.effort for each in run.efforts() if not each.confirming]
             assert sum(each.driven + each.dreamt for each in efforts) == sum(each.steps for each in run.history())
             for generation, driven in enumerate(DRIVEN):
                 results = [each for i in range(POPULATION) for each in run.results(generation, i)]
                 wanted = sum(each.steps for each in results if each.episode < driven)
                 assert sum(each.effort.driven for each in run.efforts() if each.generation == generation) == wanted
-    assert told[0] == told[1]
+    assert scores[0] == scores[1]
     for generation in range(1, len(DRIVEN)):
         candidate = ("--candidate", f"{generation}/3")
         code, out, err = processes.call("replay", "night", "--runs-dir", processes.runs, *candidate)

@@ -36,16 +36,16 @@ def said_of(coordinator):
 
 
 def closed(coordinator):
-    """Generations that it told of."""
+    """How many generations its output reports as closed."""
     return sum(": mean" in line for line in coordinator.lines)
 
 
 def goes_on(processes, coordinator, said, name="test"):
-    """By the very words that were said, with every generation that was told."""
-    told = closed(coordinator)
+    """The command that the error names continues the run, with every generation that was reported."""
+    generations = closed(coordinator)
     command = said.split("go on with: ")[1].strip()
     with subprocess.Popen(
-        f"{command} --generations {told + 1} --listen {processes.endpoint}", shell=True, stdout=subprocess.PIPE,
+        f"{command} --generations {generations + 1} --listen {processes.endpoint}", shell=True, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, env=environment(processes.cache),
     ) as again:  # fmt: skip
         processes.worker("--task", tasks.SLOW_TOY, "--run", name)
@@ -56,7 +56,7 @@ def goes_on(processes, coordinator, said, name="test"):
     lines = [line for line in coordinator.lines if ": mean" in line]
     for line, (number, mean) in zip(lines, history, strict=False):
         assert f"generation {number}: mean {mean}," in line
-    assert len(history) == told + 1
+    assert len(history) == generations + 1
 
 
 @pytest.mark.parametrize("lost", [("journal.sqlite",), ("journal.sqlite-wal",), ("journal.sqlite", "journal.sqlite-wal",
@@ -129,8 +129,10 @@ def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
     assert "controller.npz" in coordinator.lines[-1]
     assert "Traceback" not in "".join(coordinator.lines)
     (folder / "controller.npz").rmdir()
-    told = closed(coordinator)
-    again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--generations", told)
+    generations = closed(coordinator)
+    again = processes.start(
+        "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--generations", generations
+    )
     assert again.finish()[0] == 0
 
 

@@ -58,7 +58,7 @@ class Newcomer:
             self._started.append(subprocess.Popen(command, **self._how, stdout=out, stderr=out, start_new_session=True))
 
     def rows(self, *words, code=0):
-        """What a verb tells of each host."""
+        """The rows that a verb prints, by host."""
         done = subprocess.run([self._bin / "dreamfleet", *map(str, words), "--json"], **self._how, check=False,
                               capture_output=True, timeout=PATIENCE)  # fmt: skip
         assert done.returncode == code, done.stderr
@@ -114,11 +114,13 @@ def test_three_hosts_score_soon_after_one_command_and_another_leaves_nothing(
 
         began = time.monotonic()
         up = newcomer.rows("up", file)
-        told = time.monotonic() - began
+        printed_after = time.monotonic() - began
         await_that(lambda: status(network).slots == len(NAMES) * SLOTS, "the fleet is not whole")
         await_that(lambda: status(network).throughput.environment_steps, "nobody scores")
         took = time.monotonic() - began
-        log.info("%s, %s: up %.0f s, scoring after %.0f s", source, "joined" if secured else "open", told, took)
+        log.info(
+            "%s, %s: up %.0f s, scoring after %.0f s", source, "joined" if secured else "open", printed_after, took
+        )
         assert {row["state"] for row in up.values()} == {"started"}
         assert took < SOON
         assert {row["state"] for row in newcomer.rows("down", file).values()} == {"left"}
@@ -158,12 +160,12 @@ def test_a_wrong_key_a_full_disk_and_no_python_are_rows_of_their_own_while_anoth
             f'[[host]]\naddress = "good"\n[[host]]\naddress = "locked"\nssh = "ssh -F {stranger}"\n'
             f'[[host]]\naddress = "full"\nremote_dir = "{disk.path}/fleet"\n[[host]]\naddress = "bare"\n'
         )
-        told = newcomer.rows("up", file, code=1)
+        rows = newcomer.rows("up", file, code=1)
         file.unlink()
-        assert {name: row["state"] for name, row in told.items()} == {
+        assert {name: row["state"] for name, row in rows.items()} == {
             "good": "started", "locked": "failed", "full": "failed", "bare": "failed",
         }  # fmt: skip
         remedies = {"locked": "load the key into ssh-agent", "full": "--remote-dir", "bare": "install one"}
-        assert {name: why for name, why in remedies.items() if why not in told[name]["what"]} == {}
+        assert {name: why for name, why in remedies.items() if why not in rows[name]["what"]} == {}
         newcomer.rows("down", "good", "--ssh", hosts.ssh, "--now")
     assert list(good.home.iterdir()) == []

@@ -122,7 +122,7 @@ def test_it_is_learnt_from_zero_on_two_workers_and_one_gives_the_same_bits(proce
         "evaluate", "--controller", name, "--runs-dir", processes.runs, "--episodes", 50, "--json", timeout=300
     )
     assert code == 0, err
-    told = json.loads(out)
-    print(f"{name}: {told['mean']:.1f}, standard error {told['std'] / 50**0.5:.1f}, 50 unseen seeds")  # noqa: T201
-    assert told["mean"] > wanted
+    answer = json.loads(out)
+    print(f"{name}: {answer['mean']:.1f}, standard error {answer['std'] / 50**0.5:.1f}, 50 unseen seeds")  # noqa: T201
+    assert answer["mean"] > wanted
     assert evolve(processes, "alone", 1, *settings) == two

@@ -104,20 +104,20 @@ def undisturbed(one_thread, tmp_path_factory):
 
 
 def test_each_round_makes_a_model_from_all_drives_and_evolves_in_its_dream(undisturbed):
-    layout, told, err = undisturbed
+    layout, answer, err = undisturbed
     ledger = IterationLedger.load(layout.ledger)
     assert list(ledger.finished) == PHASES
-    assert [each["drives"] for each in told["rounds"]] == [3, 6]
+    assert [each["drives"] for each in answer["rounds"]] == [3, 6]
     for number in (1, 2):
         bundle = Bundle.open(layout.bundle(number))
         assert bundle.manifest.provenance["episodes"] == 3 * number
-        assert bundle.sha256 == told["rounds"][number - 1]["sha256"]
+        assert bundle.sha256 == answer["rounds"][number - 1]["sha256"]
         assert {"reconstruction_error", "nats_per_dimension"} <= bundle.manifest.provenance["quality"].keys()
         with open_run(layout.runs, layout.run_name(number)) as run:
             assert run.spec.task == "dream"
             assert run.spec.bundle == Bundle.open(layout.bundle(ledger.model_round(number))).sha256
             assert run.settings.seed == number
-            assert told["rounds"][number - 1]["score"]["mean"] == max(each.mean for each in run.evaluations())
+            assert answer["rounds"][number - 1]["score"]["mean"] == max(each.mean for each in run.evaluations())
     lines = [line for line in err.splitlines() if line.startswith("round ")]
     assert [tuple(line.split()[1:3]) for line in lines] == [(str(number), name) for number, name in PHASES]
 
@@ -155,9 +155,9 @@ def test_a_gate_that_can_measure_nothing_refuses_nothing_and_says_so(undisturbed
     gate = IterationLedger.load(layout.ledger).entry(2, "gate")
     assert gate.figures["kept"]
     assert "kept: nothing was measured of both" in err
-    told = json.loads(layout.gate_file(2).read_text())
-    assert told["old"] == told["new"]
-    assert told["new"]["probe"]["failed"].startswith("a probe needs two drives on the road at least")
+    answer = json.loads(layout.gate_file(2).read_text())
+    assert answer["old"] == answer["new"]
+    assert answer["new"]["probe"]["failed"].startswith("a probe needs two drives on the road at least")
 
 
 def gate(layout, new, drives=write_drives, **changes):
@@ -217,13 +217,13 @@ def test_the_same_model_loses_the_road_as_often_on_the_same_drives(tmp_path):
 
 
 def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undisturbed, processes):
-    layout, told, _ = undisturbed
+    layout, answer, _ = undisturbed
     before = layout.ledger.read_bytes()
     code, out, err = processes.call("iterate", "--data", layout.root)
     assert code == 0, err
     assert "14 phases are finished" in err
     assert out.splitlines()[0].split("\t")[:3] == ["round", "drives", "frames"]
-    assert f"world model: {told['model']}" in out
+    assert f"world model: {answer['model']}" in out
     assert layout.ledger.read_bytes() == before
     for flags, said in (
         (("--noise", 0.5), "was begun with noise 0.3, not 0.5: leave that out, or begin in another --data"),
@@ -391,12 +391,12 @@ def disturb(processes, layout, phases):
 
 
 def test_killed_it_goes_on_to_the_same_models(undisturbed, processes):
-    whole, told, _ = undisturbed
+    whole, answer, _ = undisturbed
     layout = IterationFolder(processes.folder / "data")
     again = disturb(processes, layout, [Phase(1, "evolve"), Phase(2, "mdnrnn")])
     assert hashes(layout) == hashes(whole)
-    assert [each["sha256"] for each in again["rounds"]] == [each["sha256"] for each in told["rounds"]]
-    assert [each["score"] for each in again["rounds"]] == [each["score"] for each in told["rounds"]]
+    assert [each["sha256"] for each in again["rounds"]] == [each["sha256"] for each in answer["rounds"]]
+    assert [each["score"] for each in again["rounds"]] == [each["score"] for each in answer["rounds"]]
 
 
 @pytest.mark.long

@@ -119,15 +119,15 @@ def test_fifty_views_one_of_which_never_looks_leave_the_run_as_it_is(processes, 
             views[1].next(0.1)
         assert (views[1].status.state, views[1].status.why) == ("ended", "1 generation")
         assert watched.finish()[0] == 0
-    told = []
+    fitnesses = []
     for name in ("plain", "watched"):
         with open_run(processes.runs, name) as journal:
-            told.append([journal.fitness(0, number) for number in range(8)])
+            fitnesses.append([journal.fitness(0, number) for number in range(8)])
             assert journal.result_count() == 8
-    assert told[0] == told[1]
+    assert fitnesses[0] == fitnesses[1]
 
 
-def test_the_verb_streams_to_whoever_reads_it_and_ends_with_him(processes, run):
+def test_the_verb_streams_to_its_reader_and_ends_with_it(processes, run):
     words = command("live", "--connect", processes.endpoint, "--out", "-")
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment(processes.cache)
@@ -141,7 +141,7 @@ def test_the_verb_streams_to_whoever_reads_it_and_ends_with_him(processes, run):
         assert b"Traceback" not in live.stderr.read()
 
 
-def test_the_verb_writes_what_it_saw_when_it_is_told_to_end(processes, run, tmp_path):
+def test_the_verb_writes_its_frames_when_it_is_stopped(processes, run, tmp_path):
     live = processes.start("live", "--connect", processes.endpoint, "--out", tmp_path / "stills", "--json")
     live.wait_for("watching run test")
     while len(list((tmp_path / "stills").glob("*.png"))) < 3:

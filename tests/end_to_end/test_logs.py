@@ -13,14 +13,14 @@ from tests.support.served import snapshot
 
 
 @pytest.mark.slow
-def test_a_fleets_log_is_json_where_it_is_asked_for_and_tells_how_to_start_a_worker(processes, random_bundle):
+def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
         "--task", tasks.TOY, "--generations", 100000, "--log-format", "auto",
     )  # fmt: skip
-    told = json.loads(coordinator.wait_for("no worker is there"))
-    assert told["event"] == "no worker"
-    program, *words = shlex.split(told["command"])
+    record = json.loads(coordinator.wait_for("no worker is there"))
+    assert record["event"] == "no worker"
+    program, *words = shlex.split(record["command"])
     assert program == "dreamfleet"
     worker = processes.start(*words, "--slots", "1", "--task", tasks.TOY)
     closed = json.loads(coordinator.wait_for("generation 0: mean"))
@@ -31,7 +31,7 @@ def test_a_fleets_log_is_json_where_it_is_asked_for_and_tells_how_to_start_a_wor
     assert worker.finish()[0] == 0
 
 
-def test_what_ends_as_it_should_is_not_told_as_a_loss(processes, random_bundle):
+def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
         "--task", tasks.TOY, "--generations", 100000,
@@ -52,7 +52,7 @@ def test_what_ends_as_it_should_is_not_told_as_a_loss(processes, random_bundle):
     assert own.finish()[0] == 0
 
 
-def test_the_story_of_a_killed_workers_jobs_is_told_while_the_run_lives(processes, random_bundle):
+def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
         "--task", tasks.SLOW_TOY, "--generations", 100000,

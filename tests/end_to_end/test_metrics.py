@@ -45,7 +45,7 @@ def test_a_port_that_is_none_is_said_at_once(processes, wrong):
     assert (code, "give a port such as 9108" in err) == (2, True), err
 
 
-def test_the_dashboard_answers_for_every_live_run_whoever_knows_the_token(processes):
+def test_the_dashboard_answers_for_every_live_run_to_holders_of_the_token(processes):
     with serving(processes.endpoint, snapshot(workers=80), snapshot(name="lucid")):
         page = processes.start(
             "dashboard", "--connect", processes.endpoint, "--port", 0, "--token", "correct horse battery"

@@ -69,8 +69,8 @@ def test_of_two_copies_of_one_run_the_one_that_was_continued_last_goes_on(proces
     second = begin(processes, processes.folder / "b", second_at, "--resume", "test")  # its third
     with link(first_at, second_at):
         assert ended(first, second) == [first]
-    told = "".join(first.lines)  # behind it may stand what libraries say as they end
-    assert "serves this very run on this network, in incarnation 3" in told
+    printed = "".join(first.lines)  # behind it may stand what libraries say as they end
+    assert "serves this very run on this network, in incarnation 3" in printed
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A run is had again from its controller's receipt alone, with real processes, to the bit."""
+"""A run is repeated from its controller's provenance alone, with real processes, to the bit."""
 
 import json
 import os
@@ -56,8 +56,8 @@ def test_a_run_is_repeated_to_the_bit_through_a_kill(processes, first, random_bu
     again.end()
     again = processes.start(*words)
     code, out = again.finish()
-    told = json.loads(out)
-    assert (code, told["same"], told["run"]) == (0, True, "kept-again"), told
+    answer = json.loads(out)
+    assert (code, answer["same"], answer["run"]) == (0, True, "kept-again"), answer
     before, after = Controller.load(first), Controller.load(processes.runs / "kept-again" / CONTROLLER)
     assert after.sha256 == before.sha256
     assert after.provenance["validation_mean"] == before.provenance["validation_mean"]
@@ -69,9 +69,9 @@ def test_a_run_is_repeated_to_the_bit_through_a_kill(processes, first, random_bu
 
 def test_a_script_runs_both_sides_and_its_exit_code_says_whether_it_is_the_same(processes, first):
     receipt = Controller.load(first)
-    told = {**receipt.provenance, "settings": {**receipt.provenance["settings"], "seed": 2}}
+    changed = {**receipt.provenance, "settings": {**receipt.provenance["settings"], "seed": 2}}
     moved = processes.folder / "moved.npz"
-    Controller(receipt.shape, receipt.parameters, receipt.task, receipt.bundle, told).save(moved)
+    Controller(receipt.shape, receipt.parameters, receipt.task, receipt.bundle, changed).save(moved)
     done = subprocess.run(
         [sys.executable, ROOT / "deploy" / "reproduce_evolution.py", moved, "--workers", "1", "--port",
          str(processes.port), "--runs-dir", processes.runs, "--task", tasks.TOY],

@@ -101,12 +101,15 @@ def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a
 def test_what_is_printed_for_zenohd_is_the_routers_own_configuration(processes, name):
     code, out, err = processes.call("router", "--config", RECIPES / name, "--print-config")
     assert code == 0, err
-    told, wanted = json.loads(out), tomllib.loads((RECIPES / name).read_text())["router"]
-    assert told["mode"] == "router"
-    assert (told["listen"]["endpoints"], told["connect"]["endpoints"]) == (wanted["listen"], wanted.get("connect", []))
-    told["listen"]["endpoints"] = [f"tcp/127.0.0.1:{free_port()}"]
-    told["connect"]["endpoints"] = []
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(told))):  # unknown keys raise
+    config, wanted = json.loads(out), tomllib.loads((RECIPES / name).read_text())["router"]
+    assert config["mode"] == "router"
+    assert (config["listen"]["endpoints"], config["connect"]["endpoints"]) == (
+        wanted["listen"],
+        wanted.get("connect", []),
+    )
+    config["listen"]["endpoints"] = [f"tcp/127.0.0.1:{free_port()}"]
+    config["connect"]["endpoints"] = []
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))):  # unknown keys raise
         pass
 
 

@@ -1,4 +1,4 @@
-"""A run of several stages with real workers: the same bits through kills, each stage replayed, and told to people."""
+"""A run of several stages with real workers: the same bits through kills, each stage replayed and shown."""
 
 import json
 
@@ -50,10 +50,10 @@ def begin(processes, random_bundle):
 def outcome(processes, name):
     with open_run(processes.runs, name) as run:
         places = [(g, i) for g in range(GENERATIONS) for i in range(SIZES[g])]
-        told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
+        scores = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
         steps = [[each.steps for each in run.results(*place)] for place in places]
         begun = begun_stages(run.settings, run.history(), run.evaluations())
-        return told, steps, run.evaluations(), [each.since for each in begun]
+        return scores, steps, run.evaluations(), [each.since for each in begun]
 
 
 def resume(processes, name, *flags):
@@ -78,8 +78,8 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
         coordinator.end()
         coordinator = resume(processes, "night")
     assert coordinator.finish()[0] == 0
-    told, steps, evaluations, begun = outcome(processes, "calm")
-    assert (told, steps, evaluations, begun) == outcome(processes, "night")
+    scores, steps, evaluations, begun = outcome(processes, "calm")
+    assert (scores, steps, evaluations, begun) == outcome(processes, "night")
     assert begun == BEGUN
     assert steps[0] == [3, 3], "patience cuts what never is rewarded"
     assert {each for candidate in steps[4 * 5 : 4 * 5 + 2 * 7] for each in candidate} == {7}
@@ -104,7 +104,7 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
     assert picture.stat().st_size > 1000
 
 
-def test_a_live_run_tells_its_stage_and_a_fork_begins_with_it(processes, begin):
+def test_a_live_run_shows_its_stage_and_a_fork_begins_with_it(processes, begin):
     coordinator = begin("night")
     worker = processes.worker("--task", tasks.TOY, "--run", "night")
     coordinator.wait_for("generation 4: mean")
@@ -123,7 +123,7 @@ def test_a_live_run_tells_its_stage_and_a_fork_begins_with_it(processes, begin):
     assert forked.finish()[0] == 0
 
 
-def test_a_schedule_is_frozen_with_its_run_and_a_file_that_says_another_is_told(processes, begin):
+def test_a_schedule_is_frozen_with_its_run_and_another_file_is_refused(processes, begin):
     begin("night").end()
     schedule = processes.folder / "stages.toml"
     resumed = ("coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint)

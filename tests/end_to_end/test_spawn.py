@@ -39,8 +39,8 @@ def write_file(processes, hosts, *names, more=""):
     return path
 
 
-def told(processes, *arguments, code=0, patience=DEADLINE):
-    """The rows that a verb tells, by host."""
+def rows_of(processes, *arguments, code=0, patience=DEADLINE):
+    """The rows that a verb prints, by host."""
     done, out, err = processes.call(*arguments, "--json", timeout=patience)
     assert done == code, err
     return {row["host"]: row for row in json.loads(out.splitlines()[-1])["hosts"]}
@@ -65,27 +65,27 @@ def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(proc
     a, b = hosts.add("a"), hosts.add("b")
     coordinator = processes.coordinator(*TOY, "--generations", 10**6)
     file = write_file(processes, hosts, "a", "b", more="tunnel = false")
-    assert {row["state"] for row in told(processes, "up", file, "--check").values()} == {"ready"}
+    assert {row["state"] for row in rows_of(processes, "up", file, "--check").values()} == {"ready"}
     assert not a.root().exists()
 
-    first = told(processes, "up", file)
+    first = rows_of(processes, "up", file)
     assert {name: row["state"] for name, row in first.items()} == {"a": "started", "b": "started"}
     pids = [state(host)["pid"] for host in (a, b)]
     coordinator.wait_for("generation 1: mean")
     await_that(lambda: processes.status()["slots"] == 2, "two workers never joined")
 
-    again = told(processes, "up", file)
+    again = rows_of(processes, "up", file)
     assert {row["state"] for row in again.values()} == {"running"}
     assert "joined run test" in again["a"]["what"]
     assert [state(host)["pid"] for host in (a, b)] == pids
     file.write_text(file.read_text().replace("slots = 1", "slots = 2", 1))
-    changed = told(processes, "up", file)
+    changed = rows_of(processes, "up", file)
     assert {name: row["state"] for name, row in changed.items()} == {"a": "replaced", "b": "running"}
 
-    assert {row["state"] for row in told(processes, "down", file).values()} == {"left"}
+    assert {row["state"] for row in rows_of(processes, "down", file).values()} == {"left"}
     assert not any(runs(pid) for pid in pids)
     assert [list(host.home.iterdir()) for host in (a, b)] == [[], []]
-    assert {row["state"] for row in told(processes, "down", "a", "b", "--ssh", hosts.ssh).values()} == {"nothing"}
+    assert {row["state"] for row in rows_of(processes, "down", "a", "b", "--ssh", hosts.ssh).values()} == {"nothing"}
 
 
 def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_the_command(processes, hosts):
@@ -97,7 +97,7 @@ def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_t
     pid = state(a)["pid"]
     coordinator.wait_for("generation 1: mean")
 
-    refused = told(processes, *spawn, code=1)["a"]
+    refused = rows_of(processes, *spawn, code=1)["a"]
     assert "by the tunnel of another command" in refused["what"]
 
     command.popen.send_signal(signal.SIGINT)
@@ -144,7 +144,7 @@ def test_two_commands_at_once_start_one_worker(processes, hosts):
     states = [json.loads(each.finish()[1])["hosts"][0]["state"] for each in both]
     assert sorted(states) == ["running", "started"]
     pid = state(a)["pid"]
-    told(processes, "down", file, "--now")
+    rows_of(processes, "down", file, "--now")
     assert not runs(pid)
 
 
@@ -173,7 +173,7 @@ def test_each_thing_that_stands_in_the_way_is_said_and_the_others_come_up(proces
     rows += f'[[host]]\naddress = "mute"\nssh = "{hosts.ssh} -o ConnectTimeout=2"\n'
     file = tmp_path / "hosts.toml"
     file.write_text(f'[spawn]\ntunnel = false\nssh = "{hosts.ssh}"\nslots = 1\n{rows}')
-    found = told(processes, "up", file, code=1)
+    found = rows_of(processes, "up", file, code=1)
     assert found.pop("good")["state"] == "started"
     assert {row["state"] for row in found.values()} == {"failed"}
     reasons = {
@@ -182,7 +182,7 @@ def test_each_thing_that_stands_in_the_way_is_said_and_the_others_come_up(proces
         "lost": "no such host", "mute": "cannot be reached",
     }  # fmt: skip
     assert {name: why for name, why in reasons.items() if why not in found[name]["what"]} == {}
-    told(processes, "down", "good", *words(hosts), "--now")
+    rows_of(processes, "down", "good", *words(hosts), "--now")
 
 
 def test_ctrl_c_while_hosts_are_brought_up_ends_the_command_and_not_what_others_hold(processes, hosts, tmp_path):
@@ -203,25 +203,25 @@ def test_a_full_disk_and_a_folder_that_cannot_be_written_are_said(processes, hos
         if disk is None:
             pytest.skip("mounting a disk needs root")
         flags = ("--no-tunnel", "--slots", 1, "--remote-dir", disk.path / "fleet")
-        room = told(processes, "spawn", "a", "--ssh", hosts.ssh, *flags, code=1)["a"]["what"]
+        room = rows_of(processes, "spawn", "a", "--ssh", hosts.ssh, *flags, code=1)["a"]["what"]
         assert "an environment takes" in room
         disk.fill()
-        full = told(processes, "spawn", "a", *words(hosts, *flags), code=1)["a"]["what"]
+        full = rows_of(processes, "spawn", "a", *words(hosts, *flags), code=1)["a"]["what"]
         assert "no space left" in full
         assert "--remote-dir" in full
         disk.free()
-    denied = told(processes, "spawn", "a", *words(hosts, "--no-tunnel", "--remote-dir", "/proc/fleet"), code=1)["a"]
+    denied = rows_of(processes, "spawn", "a", *words(hosts, "--no-tunnel", "--remote-dir", "/proc/fleet"), code=1)["a"]
     assert "cannot be written" in denied["what"] or "/proc/fleet" in denied["what"]
 
 
 def test_a_worker_that_ends_at_once_says_why_and_a_number_in_anothers_hands_is_left_alone(processes, hosts):
     a = hosts.add("a")
-    bad = told(processes, "spawn", "a", *words(hosts, "--no-tunnel", "--worker-flags=--nonsense"), code=1)["a"]
+    bad = rows_of(processes, "spawn", "a", *words(hosts, "--no-tunnel", "--worker-flags=--nonsense"), code=1)["a"]
     assert "--nonsense" in bad["what"]
     bystander = processes.worker()
     path = a.root() / "workers" / "a" / "worker.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "pid": bystander.popen.pid}))
-    told(processes, "down", "a", *words(hosts), "--now")
+    rows_of(processes, "down", "a", *words(hosts), "--now")
     assert bystander.popen.poll() is None
     assert list(a.home.iterdir()) == []
 
@@ -261,10 +261,10 @@ def test_three_hosts_install_from_wheels_alone_one_of_them_after_it_was_killed_a
         assert code == 1
         assert "try `ssh x` by hand" in out
 
-        found = told(processes, "up", file, patience=900)
+        found = rows_of(processes, "up", file, patience=900)
         assert {name: row["state"] for name, row in found.items()} == {"x": "started", "y": "running", "z": "running"}
         coordinator.wait_for("generation 1: mean", timeout=600)
-        told(processes, "down", file, patience=900)
+        rows_of(processes, "down", file, patience=900)
         assert [list(host.home.iterdir()) for host in there] == [[], [], []]
 
 
@@ -285,10 +285,10 @@ def test_a_join_file_is_handed_over_by_no_command_line_for_its_reader_alone(proc
     watched = tmp_path / "python"
     watched.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/words\nexec {sys.executable} "$@"\n')
     watched.chmod(0o755)
-    told(processes, "spawn", "a", "--ssh", hosts.ssh, "--remote-python", watched, "--join", join)
+    rows_of(processes, "spawn", "a", "--ssh", hosts.ssh, "--remote-python", watched, "--join", join)
     there = a.root() / "workers" / "a" / "join"
     assert there.read_bytes() == join.read_bytes()
     assert there.stat().st_mode & 0o777 == 0o600
     assert "PRIVATE" not in (tmp_path / "words").read_text()
-    told(processes, "down", "a", *words(hosts))
+    rows_of(processes, "down", "a", *words(hosts))
     assert list(a.home.iterdir()) == []

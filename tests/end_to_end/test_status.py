@@ -55,7 +55,7 @@ def test_the_last_panel_shows_the_final_state(processes, settings):
     assert "\ntest: ended: 2 generations; " in out
 
 
-def test_a_watcher_of_a_run_that_is_stopped_is_told_that_it_was_left_open(processes, settings):
+def test_watching_a_stopped_run_reports_that_it_is_not_ended(processes, settings):
     coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
     with Client((processes.endpoint,)) as client:
         watched = client.watch("test", 0.05)

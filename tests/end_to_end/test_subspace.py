@@ -76,10 +76,10 @@ def test_the_same_bits_through_kills_and_again_by_the_receipt(processes, begin, 
             0.2,
         )
     assert coordinator.finish()[0] == 0
-    told = candidates(processes, "night")
-    assert (told == candidates(processes, "calm")).all()
+    asked = candidates(processes, "night")
+    assert (asked == candidates(processes, "calm")).all()
     shape = random_bundle.controller_shape
-    away = told - np.linspace(-1, 1, shape.size)
+    away = asked - np.linspace(-1, 1, shape.size)
     dimension = SearchSpace(subspace, shape).dimension
     inside, outside = away[:3].reshape(15, -1), away[3:].reshape(15, -1)
     assert np.linalg.matrix_rank(inside, tol=1e-4) <= dimension < shape.size

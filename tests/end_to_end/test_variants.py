@@ -40,8 +40,8 @@ def outcome(processes, name):
     """Every candidate with its fitness, and what is reported."""
     with open_run(processes.runs, name) as run:
         places = [(g, i) for g in range(GENERATIONS) for i in range(POPULATION)]
-        told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
-        return told, np.load(run.controller_path)["parameters"].tobytes()
+        scores = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
+        return scores, np.load(run.controller_path)["parameters"].tobytes()
 
 
 @pytest.mark.parametrize("kind", RUNS)

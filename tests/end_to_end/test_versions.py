@@ -1,4 +1,4 @@
-"""Workers and coordinators of other versions: who speaks this protocol works along, who does not is told what to do.
+"""Workers and coordinators of other versions: those of this protocol work together, others get a remedy.
 
 An older worker is played by messages as the first version of this protocol wrote them (`tests/common/golden`), of which
 nothing changes but numbers and names: no codec of today's has a hand in it.
@@ -120,7 +120,7 @@ def test_a_worker_of_this_protocols_first_version_is_welcomed_given_jobs_and_its
     assert (share.results, share.host_class) == (GENERATIONS * POPULATION, class_from_fingerprint(fingerprint()))
 
 
-def test_a_worker_joins_if_this_protocol_is_among_those_that_it_speaks_and_else_is_told_what_to_do(processes):
+def test_a_worker_joins_if_it_speaks_this_protocol_and_else_gets_a_remedy(processes):
     coordinator = processes.coordinator(*SETTINGS)
     with old_worker(processes) as worker, Client((processes.endpoint,)) as client:
         for first, last in ((1, 1), (3, 4), (2**60, 2**62)):
@@ -132,7 +132,7 @@ def test_a_worker_joins_if_this_protocol_is_among_those_that_it_speaks_and_else_
             await_that(lambda why=reply["why"]: client.status().refused == {"old": why}, "its status does not say so")
         for first, last in ((1, 2), (2, 3), (2, 2)):
             assert worker.hello(protocol_min=first, protocol_max=last)["accepted"]
-        await_that(lambda: not client.status().refused, "it is told as refused, and is not")
+        await_that(lambda: not client.status().refused, "the status does not list it as refused")
 
 
 def await_that(happens, why):
