@@ -81,6 +81,7 @@ def test_slurm_starts_a_worker_that_drains_before_its_limit(processes, coordinat
     assert start(DEPLOY / "slurm" / "workers.sh", *worker_words(processes), **told, **near).wait(DEADLINE) == 0
 
 
+@pytest.mark.slow
 def test_dask_has_a_worker_beside_each_of_its_own(processes, coordinator, start, cluster_environment):
     from distributed import LocalCluster
 

@@ -24,6 +24,7 @@ def small(tmp_path):
     return write_random_bundle(tmp_path / "small.zip", vae=eyes, rnn=memory)
 
 
+@pytest.mark.slow
 def test_it_learns_in_the_dream_and_is_judged_on_real_tracks(small):
     words = (sys.executable, SCRIPT, "--steps", "12000", "--episodes", "1", "--bundle", small.path)
     one = {**os.environ, "OMP_NUM_THREADS": "1"}

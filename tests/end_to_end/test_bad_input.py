@@ -150,6 +150,7 @@ def test_a_controller_of_another_shape(processes, tmp_path):
     complains(processes, "record", "--controller", path, "--out", "drive.avi", says="ends in .mp4")
 
 
+@pytest.mark.slow
 def test_a_worker_or_viewer_without_a_coordinator(processes):
     complains(processes, "status", "--connect", processes.endpoint, says="nobody answers at")
     complains(processes, "worker", "--connect", "nowhere", says="write it as tcp/HOST:PORT")

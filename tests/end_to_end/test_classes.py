@@ -81,6 +81,7 @@ def test_a_strangers_hello_keeps_nobody_out_of_a_strict_run(processes, settings)
     assert coordinator.finish()[0] == 0
 
 
+@pytest.mark.slow
 def test_hosts_that_compute_the_same_are_of_one_class_whatever_they_say_of_themselves(processes, settings, stranger):
     classes = one_after_the_other(processes, (*settings, "--strict"), stranger, lambda: own(processes))
     assert classes.description == "one class: to the bit"

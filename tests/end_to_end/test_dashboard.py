@@ -143,6 +143,7 @@ def test_a_run_that_is_paused_says_why_and_one_that_is_left_how_to_go_on(page, p
     wait(page, "--resume test", "sentence")
 
 
+@pytest.mark.slow
 def test_the_dashboard_may_die_and_come_back(browser, processes, settings):
     processes.coordinator(*settings, "--generations", 1000)
     port = free_port()

@@ -58,6 +58,7 @@ def coordinator(processes, bundle, task, generations, *more):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_run_ends_although_nobody_reads_what_its_processes_log(processes, random_bundle, frozen):
     run = frozen(*coordinator(processes, random_bundle, tasks.TOY, 5))
     worker = frozen(*WORKER, tasks.TOY, "--connect", processes.endpoint, "--exit-when-done", "--log-level", "debug")
@@ -71,6 +72,7 @@ def test_a_task_that_prints_without_end_scores_although_nobody_reads_it(processe
     assert run.wait(DEADLINE) == 0
 
 
+@pytest.mark.slow
 def test_who_is_not_read_still_hears_that_it_shall_leave(processes, random_bundle, frozen):
     run = frozen(*coordinator(processes, random_bundle, tasks.SLOW_TOY, 1000))
     worker = frozen(*WORKER, tasks.SLOW_TOY, "--connect", processes.endpoint)

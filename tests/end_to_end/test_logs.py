@@ -31,6 +31,7 @@ def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, random_bun
     assert worker.finish()[0] == 0
 
 
+@pytest.mark.slow
 def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
@@ -52,6 +53,7 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
     assert own.finish()[0] == 0
 
 
+@pytest.mark.slow
 def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,

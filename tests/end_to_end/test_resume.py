@@ -66,6 +66,7 @@ def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept(processes, setti
     assert json.loads(out)["ended"] == "3 generations"
 
 
+@pytest.mark.slow
 def test_a_limit_that_has_passed_ends_at_once_and_names_no_controller_that_is_not_there(processes, settings):
     stopped(processes, settings)
     code, out, _ = processes.call(

@@ -4,6 +4,7 @@ import os
 import signal
 
 import numpy as np
+import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 
@@ -48,6 +49,7 @@ def run_with_a_death(processes):
     return outcome(processes, "three")
 
 
+@pytest.mark.slow
 def test_one_worker_and_three_of_which_one_is_killed_give_the_same_bits(processes):
     alone, three = run_alone(processes), run_with_a_death(processes)
     assert alone == three

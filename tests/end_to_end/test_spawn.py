@@ -61,6 +61,7 @@ def runs(pid):
     return bool(process_start(pid))  # a dead process whose parent has not heard of it runs no more
 
 
+@pytest.mark.slow
 def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(processes, hosts):
     a, b = hosts.add("a"), hosts.add("b")
     coordinator = processes.coordinator(*TOY, "--generations", 10**6)

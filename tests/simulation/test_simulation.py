@@ -61,6 +61,7 @@ def test_a_fleet_that_nobody_disturbs_wastes_next_to_nothing():
         assert outcome.scored <= 1.01 * outcome.counted + tried
 
 
+@pytest.mark.slow
 def test_what_fails_is_cut_down_to_the_faults_that_it_takes():
     mutant = MUTANTS["fleet_keeps_the_leases_of_a_worker_that_joins_again"]
     number, failed = mutant.find(seed=1, most=600)

@@ -133,7 +133,7 @@ DREAMT = {"score": 0.01, "evaluate": 1.0}
         (1, 1, 256, CUT, 1, 32),
         (1, 2, 2048, DREAMT, 256, 10),
         (2, 8, 512, CUT, 1, 40),
-        (125, 8, 2500, EVEN, 1, 100),
+        pytest.param(125, 8, 2500, EVEN, 1, 100, marks=pytest.mark.slow),
     ],
     ids=["two slots", "one slot", "one slot, cut", "dreams", "sixteen slots", "a thousand slots"],
 )

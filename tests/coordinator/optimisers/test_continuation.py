@@ -10,7 +10,7 @@ from dreamfleet.coordinator.optimisers.registry import known_optimisers
 
 OWN = "tests.support.optimisers:ParentsAndChildren"
 OPTIMISERS = [(name, "diagonal") for name in (*known_optimisers(), OWN)] + [("cma", "full")]
-SIZES = [(2, 4), (3, 64), (12, 5), (31, 7), (50, 16)]
+SIZES = [(2, 4), (3, 64), (12, 5), (31, 7), pytest.param(50, 16, marks=pytest.mark.slow)]
 EVERY_OPTIMISER = pytest.mark.parametrize(("optimiser", "covariance"), OPTIMISERS)
 
 

@@ -207,6 +207,7 @@ def test_an_old_journal_that_a_hello_froze_is_free_again(bench):
     assert bench.run.worker_protocol.host_class is None
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     order=st.lists(

@@ -78,6 +78,7 @@ def blocks_of(folder, bundle, generations):
     return [median(run.cost() for _ in range(BLOCK)) for _ in range(generations // BLOCK)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "generations",
     [1_000, pytest.param(100_000, marks=[pytest.mark.long, pytest.mark.timeout(3600)])],

@@ -73,6 +73,7 @@ def file(trained, tmp_path):
     "layers", [LAYERS, AgentConfig(picture=96, choices="notebook", heads="softmax", channels=(4,), kernels=(8,),
                                    strides=(8,), hidden=16)]
 )  # fmt: skip
+@pytest.mark.slow
 def test_it_chooses_what_the_network_chooses_all_episode_long(layers, tmp_path):
     networks = networks_of(layers, 1)
     agent = make_agent(export_agent(keep(tmp_path, networks)))

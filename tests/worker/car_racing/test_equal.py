@@ -30,6 +30,7 @@ def test_random_driving_looks_the_same(seed):
     assert compare(seed, 160, random_action) is None
 
 
+@pytest.mark.slow
 @needs_native
 def test_evolved_driving_looks_the_same():
     act = make_random_controller(find_bundle("tiny"))
@@ -59,6 +60,7 @@ def test_wider_instructions_change_no_bit(width):
     assert all(map(np.array_equal, *seen))
 
 
+@pytest.mark.slow
 @needs_native
 def test_leaving_the_field_looks_the_same():
     def straight_out(_step, _picture, _random):

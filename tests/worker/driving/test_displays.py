@@ -5,6 +5,8 @@ import subprocess
 import sys
 from importlib.util import find_spec
 
+import pytest
+
 from tests.support.processes import DEADLINE, ROOT
 
 WITHOUT_A_SCREEN = """
@@ -62,6 +64,7 @@ def test_driving_opens_no_display(tmp_path):
     assert run(DRIVING_UNSEEN + WHAT_IS_LOADED, tmp_path) == "[]"
 
 
+@pytest.mark.slow
 def test_a_process_that_drew_through_mesa_trains(tmp_path):
     """The real triton where torch brought it, else one that ends the process as the real one does."""
     if find_spec("triton") is None:

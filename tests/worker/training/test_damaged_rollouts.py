@@ -27,6 +27,7 @@ def read(path):
     load_arrays(path, "driver")
 
 
+@pytest.mark.slow
 def test_damaged_drives(tmp_path, watched):
     whole = write_drive(tmp_path, 0, steps=3).read_bytes()
     path, count = tmp_path / "d.npz", 0

@@ -88,6 +88,7 @@ def made(folder):
     return sorted(path.name for path in folder.iterdir() if path.name != "episodes")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("updates", "rate"), [(8, 1e-12), (4, 1e-3)])  # the first ends early
 def test_a_kill_at_any_write_of_a_checkpoint_leads_to_the_same_files(drives, tmp_path, monkeypatch, updates, rate):
     config, writes = replace(SHORT, updates=updates, rate=rate, patience=2, keep_every=3), []

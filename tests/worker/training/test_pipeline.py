@@ -167,7 +167,9 @@ def made(folder, preset):
     return Bundle.open(folder / f"{preset}.zip")
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize(
+    "name", ["tiny", *(pytest.param(name, marks=pytest.mark.slow) for name in SHARES if name != "tiny")]
+)
 def test_a_share_of_a_preset_becomes_a_bundle_of_its_own_layers(name, tmp_path, capsys):
     assert call("--data", tmp_path, "--preset", name, "--scale", SHARES[name], *FEW, "--json") == 0
     told = json.loads(capsys.readouterr().out)
@@ -180,6 +182,7 @@ def test_a_share_of_a_preset_becomes_a_bundle_of_its_own_layers(name, tmp_path, 
     assert PolicyStep(bundle).zero_state(1).shape == (1, preset.mdnrnn_layers.state)
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_stopped_to_the_same_bundle(tmp_path, monkeypatch, capsys):
     flags = ("--preset", "article", "--scale", "0.0001", *FEW)
     assert call("--data", tmp_path / "whole", *flags) == 0
