@@ -168,7 +168,7 @@ def made(folder, preset):
 
 
 @pytest.mark.parametrize(
-    "name", ["tiny", *(pytest.param(name, marks=pytest.mark.slow) for name in SHARES if name != "tiny")]
+    "name", [pytest.param(name, marks=() if name == "tiny" else pytest.mark.slow) for name in PRESETS]
 )
 def test_a_share_of_a_preset_becomes_a_bundle_of_its_own_layers(name, tmp_path, capsys):
     assert call("--data", tmp_path, "--preset", name, "--scale", SHARES[name], *FEW, "--json") == 0
