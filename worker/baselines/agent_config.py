@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 from dreamfleet.common.artifacts.actions import FIVE_CHOICES
 from dreamfleet.common.artifacts.trained_agent import MAX_FRAME_SKIP
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 
 MOST_PARAMETERS = 50_000_000  # a network that is exported is read within bounds
@@ -19,11 +20,6 @@ CHOICES: dict[str, tuple[tuple[float, ...], ...]] = {
 }
 
 
-def said(default: Any, text: str) -> Any:
-    """A field with its default and what `--help` says of it."""
-    return field(default=default, metadata={"help": text})
-
-
 @dataclass(frozen=True)
 class AgentConfig:
     """Layers, pictures and choices: all that drives again what has learnt.
@@ -32,16 +28,16 @@ class AgentConfig:
     (arXiv:1511.06581).
     """
 
-    picture: int = said(64, "height and width of what it sees: 64, or 96 for the whole observation")
-    choices: Literal["gymnasium", "notebook"] = said(
+    picture: int = option(64, "height and width of what it sees: 64, or 96 for the whole observation")
+    choices: Literal["gymnasium", "notebook"] = option(
         "gymnasium", "its five actions: steering 0.6, gas 0.2, brake 0.8 as gymnasium has them, or 1 each (notebook)"
     )
-    frame_skip: int = said(1, "steps for which a choice is held")
-    channels: tuple[int, ...] = said((32, 64, 64), "of each convolution")
-    kernels: tuple[int, ...] = said((8, 4, 3), "of each convolution")
-    strides: tuple[int, ...] = said((4, 2, 1), "of each convolution")
-    hidden: int = said(512, "units of the LSTM")
-    heads: Literal["linear", "softmax"] = said(
+    frame_skip: int = option(1, "steps for which a choice is held")
+    channels: tuple[int, ...] = option((32, 64, 64), "of each convolution")
+    kernels: tuple[int, ...] = option((8, 4, 3), "of each convolution")
+    strides: tuple[int, ...] = option((4, 2, 1), "of each convolution")
+    hidden: int = option(512, "units of the LSTM")
+    heads: Literal["linear", "softmax"] = option(
         "linear", "softmax bounds the advantages, as the notebook does: no return can then be told"
     )
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from dreamfleet.common.errors import MissingExtraError, UsageError
-from dreamfleet.worker.baselines.names import DISCRETE, DRQN
 from dreamfleet.worker.baselines.policies import RandomPolicy
+from dreamfleet.worker.baselines.presets import DISCRETE, DRQN
 from dreamfleet.worker.car_racing.agents import NetworkAgent, PictureAgent
 from dreamfleet.worker.car_racing.preprocessing import RAW
 

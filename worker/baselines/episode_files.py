@@ -10,7 +10,7 @@ from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.archives import ArchiveLimits, read_arrays
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.worker.baselines.replay_buffer import Episode
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
 
 _LIMITS = ArchiveLimits(4 << 30, members=4)
 NAMES = ("picture", "choice", "reward", "terminal")

@@ -12,12 +12,12 @@ from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgen
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.worker.baselines.agent_config import AgentConfig
-from dreamfleet.worker.baselines.names import DRQN
 from dreamfleet.worker.baselines.network import Networks
+from dreamfleet.worker.baselines.presets import DRQN
 from dreamfleet.worker.baselines.progress import parse_progress
 from dreamfleet.worker.baselines.train import CHECKPOINT
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
-from dreamfleet.worker.training.data.world import WORLD, preprocessing_of_size
+from dreamfleet.worker.training.data.dataset import WORLD, preprocessing_of_size
 from dreamfleet.worker.worldmodel.mdnrnn_graph import Weights, lstm
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 

@@ -6,9 +6,9 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.worker.baselines.equations import double_q_target, masked_loss
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 from dreamfleet.worker.baselines.network import Networks, QNetwork
 from dreamfleet.worker.baselines.replay_buffer import TraceBatch
@@ -61,3 +61,20 @@ def q_values_along(network: QNetwork, pictures: Tensor, real: Tensor) -> Tensor:
         memory = network.warm_up(network.features(pictures[:, :burn_in]), real) if burn_in else None
     worth, _ = network(network.features(pictures[:, burn_in:]), memory)
     return torch.as_tensor(worth)
+
+
+def double_q_target(returns: Tensor, discount: Tensor, online: Tensor, target: Tensor) -> Tensor:
+    """Van Hasselt et al. 2016, equation 4: the online network chooses, the target network says what that is worth.
+
+    `returns` and `discount` are `(...)`, as `Returns` has them; `online` and `target` `(..., choices)` are what the two
+    networks tell of the moment behind the rewards. A discount of 0, at a terminal, adds nothing.
+    """
+    best = online.argmax(dim=-1, keepdim=True)
+    return returns + discount * target.gather(-1, best).squeeze(-1)
+
+
+def masked_loss(predicted: Tensor, target: Tensor, mask: Tensor, kind: str) -> Tensor:
+    """The mean of Huber's loss (of a threshold of 1) or of the squared difference, where `mask` is 1."""
+    each = functional.huber_loss if kind == "huber" else functional.mse_loss
+    losses = each(predicted, target, reduction="none") * mask
+    return losses.sum() / torch.clamp(mask.sum(), min=1)

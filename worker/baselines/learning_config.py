@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.baselines.agent_config import said
 
 AT_LEAST_ONE = (
     "episodes", "steps", "batch", "trace", "n_step", "epsilon_episodes", "learn_every", "target_every", "replay",
@@ -22,27 +22,27 @@ NOT_NEGATIVE = ("random_episodes", "patience", "burn_in", "clip", "seed")
 class LearningConfig:
     """Amounts of one training; a decision of the agent is held for its `frame_skip` steps of the environment."""
 
-    episodes: int = said(1000, "to drive in all")
-    random_episodes: int = said(20, "of them at first that are driven at random, and nothing is learnt in")
-    steps: int = said(1000, "of an episode at most, in the environment's steps")
-    patience: int = said(0, "steps without a reward after which an episode is cut; 0: never")
-    batch: int = said(32, "traces an update")
-    trace: int = said(8, "decisions of a trace that are learnt from")
-    burn_in: int = said(4, "decisions before them that only warm the memory")
-    n_step: int = said(1, "rewards that are added up before the rest is foretold")
-    gamma: float = said(0.99, "what a reward is worth a decision later")
-    epsilon_first: float = said(1.0, "share of random choices after the random episodes")
-    epsilon_last: float = said(0.05, "share of random choices in the end")
-    epsilon_episodes: int = said(300, "episodes in which it falls from one to the other")
-    rate: float = said(1e-4, "of Adam")
-    clip: float = said(10.0, "norm of the gradients at most; 0: any")
-    loss: Literal["huber", "squared"] = said("huber", "of the difference from the target")
-    learn_every: int = said(4, "decisions between two updates")
-    target_every: int = said(500, "updates after which the target network becomes the online one")
-    replay: int = said(50_000, "decisions of the latest whole episodes that are learnt from")
-    goal: float = said(900.0, "training is over when the episodes of a report have this mean score")
-    report_every: int = said(5, "episodes between two reports")
-    seed: int = said(0, "makes the training")
+    episodes: int = option(1000, "to drive in all")
+    random_episodes: int = option(20, "of them at first that are driven at random, and nothing is learnt in")
+    steps: int = option(1000, "of an episode at most, in the environment's steps")
+    patience: int = option(0, "steps without a reward after which an episode is cut; 0: never")
+    batch: int = option(32, "traces an update")
+    trace: int = option(8, "decisions of a trace that are learnt from")
+    burn_in: int = option(4, "decisions before them that only warm the memory")
+    n_step: int = option(1, "rewards that are added up before the rest is foretold")
+    gamma: float = option(0.99, "what a reward is worth a decision later")
+    epsilon_first: float = option(1.0, "share of random choices after the random episodes")
+    epsilon_last: float = option(0.05, "share of random choices in the end")
+    epsilon_episodes: int = option(300, "episodes in which it falls from one to the other")
+    rate: float = option(1e-4, "of Adam")
+    clip: float = option(10.0, "norm of the gradients at most; 0: any")
+    loss: Literal["huber", "squared"] = option("huber", "of the difference from the target")
+    learn_every: int = option(4, "decisions between two updates")
+    target_every: int = option(500, "updates after which the target network becomes the online one")
+    replay: int = option(50_000, "decisions of the latest whole episodes that are learnt from")
+    goal: float = option(900.0, "training is over when the episodes of a report have this mean score")
+    report_every: int = option(5, "episodes between two reports")
+    seed: int = option(0, "makes the training")
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from dreamfleet.worker.baselines.agent_config import AgentConfig
-from dreamfleet.worker.baselines.equations import duelling
 
 Memory = tuple[Tensor, Tensor]
 """Hidden and cell state `(1, N, hidden)`."""
@@ -69,3 +68,11 @@ class Networks(nn.Module):
     def update_target(self) -> None:
         """Let the target be what the online network is."""
         self.target.load_state_dict(self.online.state_dict())
+
+
+def duelling(value: Tensor, advantage: Tensor) -> Tensor:
+    """Wang et al. 2016, equation 9: Q(s, a) = V(s) + A(s, a) - mean over a of A(s, a).
+
+    `value` is `(..., 1)`, `advantage` and what comes back `(..., choices)`.
+    """
+    return value + advantage - advantage.mean(dim=-1, keepdim=True)

@@ -8,6 +8,8 @@ from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 
+RANDOM, DISCRETE, DRQN = NAMES = ("random", "random-discrete", "drqn")
+
 
 @dataclass(frozen=True)
 class BaselinePreset:

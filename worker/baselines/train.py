@@ -37,9 +37,9 @@ from dreamfleet.worker.car_racing.agents import NO_PARAMETERS
 from dreamfleet.worker.car_racing.native_check import make_car_racing
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, run_episode
 from dreamfleet.worker.training.checkpoint import load_checkpoint, save_checkpoint
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
-from dreamfleet.worker.training.data.world import preprocessing_of_size
-from dreamfleet.worker.training.one_thread import on_one_thread
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
+from dreamfleet.worker.training.data.dataset import preprocessing_of_size
+from dreamfleet.worker.training.torch_setup import on_one_thread
 from dreamfleet.worker.training.training_state import disable_triton_after_mesa, resume_command
 
 CHECKPOINT, CURVE, LOCK = "drqn.safetensors", "drqn.jsonl", "drqn.lock"

@@ -9,7 +9,7 @@ import numpy as np
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.bench.matrix_products import Size, fastest, product_cases
-from dreamfleet.worker.bench.timing import TimedCall, time_alternately
+from dreamfleet.worker.bench.measurement import TimedCall, time_alternately
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.tasks.api import Episode
 

@@ -17,7 +17,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.messages import Intervals, Job, TaskSpec
 from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.worker.bench.timing import TimedCall, time_alternately
+from dreamfleet.worker.bench.measurement import TimedCall, time_alternately
 from dreamfleet.worker.scoring.episode import score
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service.admission import Admission

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.worker.bench.timing import TimedCall
+from dreamfleet.worker.bench.measurement import TimedCall
 from dreamfleet.worker.worldmodel.inference import open_graph
 
 Floats = NDArray[np.float32]

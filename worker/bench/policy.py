@@ -6,7 +6,7 @@ import numpy as np
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.worker.bench.matrix_products import fastest, product_cases
-from dreamfleet.worker.bench.timing import TimedCall, time_alternately
+from dreamfleet.worker.bench.measurement import TimedCall, time_alternately
 from dreamfleet.worker.worldmodel.inference import PolicyStep
 
 MATRIX = 768  # large enough to be all arithmetic, small enough for many blocks

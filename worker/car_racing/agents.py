@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.artifacts.onnx_checks import check_self_contained
 from dreamfleet.common.artifacts.trained_agent import NETWORK, TrainedAgent
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.worker.car_racing.frame_skip_policy import FrameSkipPolicy
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS, find_preprocessing
 from dreamfleet.worker.car_racing.task import WORLD, CarRacingTask, make_reference_environment
 from dreamfleet.worker.tasks.api import Policy, World
-from dreamfleet.worker.worldmodel.inference import open_graph
+from dreamfleet.worker.worldmodel.inference import open_untrusted_graph
 
 Floats = NDArray[np.float32]
 NO_PARAMETERS = np.zeros(0, np.float32)  # the parameters of who has none
@@ -100,8 +99,7 @@ class NetworkPolicy(FrameSkipPolicy):
         manifest = trained.manifest
         super().__init__(manifest.choices, manifest.frame_skip)
         try:
-            check_self_contained(trained.network)
-            self._run = open_graph(trained.network, threads=1).run
+            self._run = open_untrusted_graph(trained.network).run
         except Exception as error:  # the runtime's errors share no public base
             raise _unusable_network_error(error) from error
         self._zero = np.zeros((1, manifest.state), np.float32)

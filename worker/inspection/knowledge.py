@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.inspection.disturbed_rollouts import OFF, DisturbedDrive
-from dreamfleet.worker.inspection.estimate import Estimate
-from dreamfleet.worker.inspection.probe import LinearProbe, NetworkProbe, Probe, folds, other_rows
+from dreamfleet.worker.inspection.probe import Estimate, LinearProbe, NetworkProbe, Probe, folds, other_rows
 
 Floats = NDArray[np.float64]
 Fit = Callable[[Floats, Floats], Probe]

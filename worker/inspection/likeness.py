@@ -18,8 +18,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.inspection.disturbed_rollouts import OFF, DisturbedDrive
 from dreamfleet.worker.inspection.drive_dreams import DreamSegment, DriveDreamer
-from dreamfleet.worker.inspection.estimate import Estimate
-from dreamfleet.worker.inspection.probe import LinearProbe, folds, other_rows
+from dreamfleet.worker.inspection.probe import Estimate, LinearProbe, folds, other_rows
 from dreamfleet.worker.inspection.road_losses import FOLDS
 
 Floats = NDArray[np.float64]

@@ -48,10 +48,7 @@ def probe(
     bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig, episodes: int, on_drive: OnCount
 ) -> Knowledge:
     """What the world model holds of the truth on so many drives."""
-    drives = []
-    for drive in islice(_drives(bundle, driving, config), episodes):
-        drives.append(drive)
-        on_drive(len(drives))
+    drives = _first_drives(bundle, driving, config, episodes, on_drive)
     return cross_validate_probes(drives, config.opening)
 
 
@@ -65,10 +62,7 @@ def likeness(
 ) -> list[RareFrequency]:
     """How often dreams come to what is rare on so many drives; `UsageError` as of `measure_dream_losses`."""
     controller = _dream_controller(bundle, driving)
-    drives = []
-    for drive in islice(_drives(bundle, driving, config), episodes):
-        drives.append(drive)
-        on_drive(len(drives))
+    drives = _first_drives(bundle, driving, config, episodes, on_drive)
     return alike(drives, bundle, controller, config.opening, dreams.dreams, dreams.temperature)
 
 
@@ -98,3 +92,13 @@ def _dream_controller(bundle: Bundle, driving: DriverChoice) -> Controller:
 def _drives(bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig) -> Iterator[DisturbedDrive]:
     mind = RecurrentState(driving.observing_model(bundle))
     return witness(bundle, mind, driving.hands(bundle, mind), config)
+
+
+def _first_drives(
+    bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig, episodes: int, on_drive: OnCount
+) -> list[DisturbedDrive]:
+    drives = []
+    for drive in islice(_drives(bundle, driving, config), episodes):
+        drives.append(drive)
+        on_drive(len(drives))
+    return drives

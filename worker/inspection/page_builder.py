@@ -18,10 +18,10 @@ from dreamfleet.common.runs.stages import begun_stages, join_distinct
 from dreamfleet.worker.dream.parallel_dream import can_dream
 from dreamfleet.worker.inspection import curve_sections, mdnrnn_sections, vae_sections
 from dreamfleet.worker.inspection.encoded_rollout import DriveConfig, EncodedRollout, record_drive
-from dreamfleet.worker.inspection.own_pictures import own_pictures
 from dreamfleet.worker.inspection.page import Page, Section
 from dreamfleet.worker.inspection.tables import measured_rows
 from dreamfleet.worker.inspection.training_curves import MODELS, TrainingCurves, load_trainings
+from dreamfleet.worker.inspection.vae_sections import own_pictures
 from dreamfleet.worker.inspection.vae_view import CHECKPOINT, VAEView, held_out_drive
 
 PAGE = "index.html"
@@ -209,9 +209,7 @@ def manifest_facts(bundle: Bundle) -> list[tuple[str, str]]:
         ("attention window", str(model.get("window", 0) or "none")),
         ("recorded states", str(bundle.recorded_count or "none")),
     ]
-    rows += [
-        (name, str(provenance[name])) for name in ("episodes", "frames", "held_out_episodes") if name in provenance
-    ]
+    rows += [(name, str(provenance[name])) for name in DRIVEN if name in provenance]
     if isinstance(quality, dict):
         rows += [(f"quality: {name}", _with_unit(name, value)) for name, value in quality.items()]
     measured = provenance.get("measured", [])

@@ -139,3 +139,19 @@ def folds(drives: int, most: int = 4) -> list[list[int]]:
 def other_rows(fold: Sequence[int], drives: int) -> list[int]:
     """The rows that are not in a fold."""
     return sorted(set(range(drives)) - set(fold))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value and its standard error."""
+
+    value: float
+    error: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Estimate:
+        """The mean of two values at least."""
+        return cls(float(np.mean(values)), float(np.std(values, ddof=1) / len(values) ** 0.5))
+
+    def __str__(self) -> str:
+        return f"{self.value:.2f} ± {self.error:.2f}"

@@ -35,9 +35,15 @@ from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
-from dreamfleet.worker.training.data.dataset import episode_paths, load_arrays, split_held_out
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
-from dreamfleet.worker.training.data.world import WORLD, find_world, preprocessing_of_size
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
+from dreamfleet.worker.training.data.dataset import (
+    WORLD,
+    episode_paths,
+    find_world,
+    load_arrays,
+    preprocessing_of_size,
+    split_held_out,
+)
 from dreamfleet.worker.training.encode import ENCODED, latents_encoder_hash
 from dreamfleet.worker.training.recorded_states import compute_recorded_states
 from dreamfleet.worker.worldmodel.export import (

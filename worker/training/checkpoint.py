@@ -19,7 +19,7 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.stop_signals import signals_deferred
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.common.serialization.validation import MalformedError, from_plain
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
 
 T = TypeVar("T")
 

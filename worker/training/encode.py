@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.data.dataset import (
     check_pictures,
     check_whole,
@@ -25,9 +26,8 @@ from dreamfleet.worker.training.data.dataset import (
     load_arrays,
     load_pictures,
     load_steps,
+    preprocessing_of_size,
 )
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
-from dreamfleet.worker.training.data.world import preprocessing_of_size
 from dreamfleet.worker.training.train_vae import CHECKPOINT
 from dreamfleet.worker.worldmodel.export import export_encoder
 from dreamfleet.worker.worldmodel.inference import open_graph

@@ -26,7 +26,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.tasks.api import World
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.training.data.drive_steps import FIRST_START, on_road_mask
-from dreamfleet.worker.training.refit import (
+from dreamfleet.worker.training.drive_regression import (
     HELD_OUT_EVERY,
     DriveArrays,
     FeatureExtractor,

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dreamfleet.common.files.tensorboard import open_event_file
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
 
 AddPoint = Callable[..., None]  # `point(update=120, error=0.3)`
 

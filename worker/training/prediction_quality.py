@@ -10,8 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels, load_rollouts
-from dreamfleet.worker.training.teacher_forcing import teacher_force, with_reward_label
+from dreamfleet.worker.training.data.rollouts import (
+    Rollouts,
+    done_labels,
+    load_rollouts,
+    teacher_force,
+    with_reward_label,
+)
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction, reward_labels
 
 DREAM_STEPS = (1, 10, 50)  # steps of dreaming

@@ -2,14 +2,47 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.presets import check_preset
+from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.training.data.collect_config import CollectConfig
-from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.worldmodel import mdnrnn_config, vae_config
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+
+
+def required(text: str) -> Any:
+    """A field without a default, and the text that `--help` shows."""
+    return field(metadata={"help": text})
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One model's training: Adam at `rate`, `updates` of `batch` pictures or episodes."""
+
+    updates: int = required("updates in all, those that are made already among them")
+    batch: int = required("pictures, or drives, of an update")
+    rate: float = required("Adam's learning rate")
+    clip: float = option(1.0, "norm of the gradients at most; 0: any")
+    seed: int = option(0, "makes the training: first weights, batches and chance follow from it")
+    decay: float = option(1.0, "of the rate, an epoch: as many updates as show every recorded frame or drive once")
+    patience: int = option(0, "validations without a better held-out loss before training ends; 0: never")
+    validate_every: int = option(200, "updates after which held-out drives are looked at, and a checkpoint is written")
+    keep_every: int = option(
+        0, "updates after which a checkpoint stays beside the last one, as vae.000400.safetensors; 0: none"
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("updates", "batch", "validate_every"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        if self.keep_every < 0:
+            raise UsageError(f"--keep-every must be at least 1, or 0 for none, not {self.keep_every}")
+        if not (self.rate > 0 and self.clip >= 0 and 0 < self.decay <= 1 and self.patience >= 0 and self.seed >= 0):
+            raise UsageError("--rate must be positive, --decay in (0, 1], --clip, --patience and --seed not negative")
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
 from dreamfleet.worker.training.data.dataset import episode_paths, load_steps
 from dreamfleet.worker.training.data.drive_steps import DriveStep, sample_steps
-from dreamfleet.worker.training.data.rollouts import load_rollouts
+from dreamfleet.worker.training.data.rollouts import load_rollouts, teacher_force
 from dreamfleet.worker.training.encode import ENCODED
-from dreamfleet.worker.training.one_thread import on_one_thread
-from dreamfleet.worker.training.teacher_forcing import teacher_force
+from dreamfleet.worker.training.torch_setup import on_one_thread
 from dreamfleet.worker.training.train_mdnrnn import CHECKPOINT
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig

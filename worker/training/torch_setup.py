@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # Of glibc's malloc.h: what to set, and to what.
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4
@@ -33,3 +35,16 @@ def _keep_freed_memory() -> None:
     mallopt(M_MMAP_MAX, 0)
     mallopt(M_TRIM_THRESHOLD, LARGEST)
     mallopt(M_TOP_PAD, GROWTH)
+
+
+@contextmanager
+def on_one_thread() -> Iterator[None]:
+    """Inside, bits do not depend on a host's cores, and steps too small to share take a fraction of the time."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

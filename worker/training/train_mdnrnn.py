@@ -18,7 +18,7 @@ from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels, load
 from dreamfleet.worker.training.encode import ENCODED, encodes_mirrored, latents_encoder_hash
 from dreamfleet.worker.training.loss_curve import AddPoint, open_loss_curve
 from dreamfleet.worker.training.prediction_quality import foresight
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.train_vae import ReportProgress
 from dreamfleet.worker.training.training_state import TrainingState
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss, reward_labels, reward_loss

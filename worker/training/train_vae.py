@@ -23,7 +23,7 @@ from dreamfleet.worker.training.data.dataset import (
     split_held_out,
 )
 from dreamfleet.worker.training.loss_curve import AddPoint, open_loss_curve
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.training_state import TrainingState
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig

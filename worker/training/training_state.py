@@ -18,7 +18,7 @@ from dreamfleet.worker.training.checkpoint import (
     load_progress,
     save_checkpoint,
 )
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 
 
 class TrainingState:

@@ -16,6 +16,7 @@ from dreamfleet.common.printable import one_line
 from dreamfleet.common.serialization.validation import MalformedError, from_plain
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import save_checkpoint
+from dreamfleet.worker.training.data.data_folder import explain_folder_errors
 from dreamfleet.worker.training.encode import encoder_hash
 from dreamfleet.worker.worldmodel.export import export_decoder, export_dream, export_encoder
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
@@ -39,10 +40,8 @@ def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:
         vae, rnn = _rebuild_models(bundle)
     except (BundleError, MalformedError, UsageError, RuntimeError, ValueError, TypeError, SafetensorError) as error:
         raise BundleError(f"{bundle.path}: {one_line(str(error))}") from error
-    try:
+    with explain_folder_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
     try:
         _save(paths[0], vae)
         _save(paths[1], rnn, vae=encoder_hash(folder))

@@ -12,8 +12,8 @@ from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.agents import find_baseline
-from dreamfleet.worker.baselines.names import DISCRETE, DRQN, NAMES, RANDOM
 from dreamfleet.worker.baselines.network import Networks
+from dreamfleet.worker.baselines.presets import DISCRETE, DRQN, NAMES, RANDOM
 from dreamfleet.worker.baselines.train import CHECKPOINT
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tools import agent_evaluator

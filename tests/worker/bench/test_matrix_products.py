@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.host.resource_limits import POOLS
-from dreamfleet.worker.bench.command import print_figures
 from dreamfleet.worker.bench.matrix_products import LIBRARIES, fastest, product_cases, product_graph
+from dreamfleet.worker.bench.measurement import print_figures
 from dreamfleet.worker.worldmodel.inference import open_graph
 
 

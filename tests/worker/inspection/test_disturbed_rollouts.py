@@ -13,7 +13,7 @@ from dreamfleet.worker.scoring.actors import ControllerActor, make_controller_ac
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.training.data.world import known_drivers
+from dreamfleet.worker.training.data.collect_config import known_drivers
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from dreamfleet.worker.inspection.estimate import Estimate
 from dreamfleet.worker.inspection.knowledge import explained_variance
-from dreamfleet.worker.inspection.probe import LinearProbe, NetworkProbe, folds, other_rows
+from dreamfleet.worker.inspection.probe import Estimate, LinearProbe, NetworkProbe, folds, other_rows
 
 
 @pytest.fixture

@@ -10,8 +10,14 @@ from dreamfleet.worker.inspection import likeness, probe
 from dreamfleet.worker.inspection.disturbed_rollouts import OFF, DisturbedDriveConfig, witness
 from dreamfleet.worker.inspection.drive_dreams import DreamSegment, DriveDreamer
 from dreamfleet.worker.inspection.knowledge import cross_validate_probes
-from dreamfleet.worker.inspection.road_losses import CALM, RoadLossConfig, collect_losing_drives, compare
-from dreamfleet.worker.inspection.road_probe import RoadOutcome, RoadProbe
+from dreamfleet.worker.inspection.road_losses import (
+    CALM,
+    RoadLossConfig,
+    RoadOutcome,
+    RoadProbe,
+    collect_losing_drives,
+    compare,
+)
 from dreamfleet.worker.inspection.tables import knowledge_rows, loss_rows
 from dreamfleet.worker.scoring.actors import ControllerActor
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState

@@ -13,7 +13,7 @@ from dreamfleet.worker.inspection.page_builder import InspectionSubject, write_p
 from dreamfleet.worker.inspection.training_curves import load_trainings, merge_points
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.verbs import inspect as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig

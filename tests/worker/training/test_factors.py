@@ -15,7 +15,7 @@ from dreamfleet.worker.training.assemble import assemble, make_manifest
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.data.rollouts import load_rollouts
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.verbs import train_vae as verb
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig

@@ -10,8 +10,8 @@ from dreamfleet.common.artifacts.actions import Continuous, Discrete
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.tasks.api import World
+from dreamfleet.worker.training.drive_regression import DriveArrays, FeatureExtractor
 from dreamfleet.worker.training.fit_subspace import PredictionTarget, find_subspace, make_targets
-from dreamfleet.worker.training.refit import DriveArrays, FeatureExtractor
 from dreamfleet.worker.verbs import subspace as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig

@@ -15,7 +15,7 @@ from dreamfleet.worker.training import checkpoint, train_mdnrnn, train_vae, trai
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.loss_curve import append_point
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.training_cli import run_training
 from dreamfleet.worker.training.training_state import numbered_path
 from dreamfleet.worker.verbs import train_vae as verb

@@ -11,13 +11,11 @@ from dreamfleet.common.cli.presets import NAMES
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.data.collect_config import CollectConfig
+from dreamfleet.worker.training.data.data_folder import check_seed, load_preset, resolve_preset, store_preset
 from dreamfleet.worker.training.data.dataset import load_arrays
-from dreamfleet.worker.training.data.dataset_preset import check_seed, load_preset, resolve_preset, store_preset
-from dreamfleet.worker.training.data.rollouts import Rollouts, load_rollouts, model_inputs
+from dreamfleet.worker.training.data.rollouts import Rollouts, load_rollouts, model_inputs, teacher_force
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.presets import PRESETS
-from dreamfleet.worker.training.teacher_forcing import teacher_force
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.verbs import collect
 from dreamfleet.worker.verbs import train_mdnrnn as mdnrnn_verb
 from dreamfleet.worker.verbs import train_vae as vae_verb

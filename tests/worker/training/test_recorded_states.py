@@ -13,7 +13,7 @@ from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.verbs import bundle as verb
 from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig

@@ -11,7 +11,8 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.car_racing_variants import DEFAULT_VARIANT, Variant
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
-from dreamfleet.worker.training.refit import DriveArrays, FeatureExtractor, LeastSquaresSums, output_bounds, refit
+from dreamfleet.worker.training.drive_regression import DriveArrays, FeatureExtractor, LeastSquaresSums
+from dreamfleet.worker.training.refit import output_bounds, refit
 from dreamfleet.worker.verbs import refit as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig

@@ -14,8 +14,7 @@ from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config, load_progress, load_weights
 from dreamfleet.worker.training.data.rollouts import load_rollouts
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.presets import PRESETS
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.training.training_state import select_device, summarise_model
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import ADDABLE_HEADS, MDNRNNConfig

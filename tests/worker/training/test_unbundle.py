@@ -14,7 +14,7 @@ from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import export_graphs
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
 from dreamfleet.worker.training.encode import encode, encoder_hash
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.unbundle import unbundle
 from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Sequence
+import shutil
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
@@ -14,6 +15,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DatasetError, DreamfleetError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.parent_death import exit_with_parent, signals_blocked
@@ -23,21 +25,20 @@ from dreamfleet.worker.scoring.rollout import Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
 from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
-from dreamfleet.worker.training.data.collect_config import CollectConfig
-from dreamfleet.worker.training.data.dataset import check_pictures
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
+from dreamfleet.worker.training.data.collect_config import CollectConfig, source_policies
+from dreamfleet.worker.training.data.data_folder import explain_folder_errors, explain_write_errors
+from dreamfleet.worker.training.data.dataset import (
+    check_pictures,
+    episode_path,
+    existing_episodes,
+    find_world,
+    load_arrays,
+    load_pictures,
+    load_steps,
+    preprocessing_of,
+    preprocessing_of_size,
+)
 from dreamfleet.worker.training.data.pilot import Pilot
-from dreamfleet.worker.training.data.world import find_world, preprocessing_of_size, source_policies
-
-
-def episode_path(folder: Path, number: int) -> Path:
-    """Where an episode lies."""
-    return folder / "episodes" / f"{number:06d}.npz"
-
-
-def existing_episodes(folder: Path) -> list[Path]:
-    """The episodes that are there, by number."""
-    return sorted((folder / "episodes").glob("[0-9]*.npz"))
 
 
 def missing_numbers(folder: Path, config: CollectConfig) -> list[int]:
@@ -56,10 +57,8 @@ def collect(folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pil
     for pilot in pilots:
         pilot.check(preprocessing_of_size(config.picture).name)
     numbers = missing_numbers(folder, config)
-    try:
+    with explain_folder_errors(folder):
         (folder / "episodes").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
     if not numbers:
         return
     pin_thread_pools()
@@ -123,3 +122,40 @@ def _driver(
     drivers = find_world().drivers
     name = list(drivers)[number % len(drivers)] if config.driver == ALL_DRIVERS else config.driver
     return name, DriverPolicy(drivers[name](random))
+
+
+def import_rollouts(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
+    """Copy the rollouts that the data set lacks; yields the frames of each. Which it has, their bytes tell.
+
+    `DatasetError` before anything is copied if not all pictures, the data set's among them, are of one preprocessing.
+    """
+    there = existing_episodes(folder)
+    kinds = {preprocessing_of(path): path for path in (*there, *rollouts)}
+    if len(kinds) > 1:
+        told = " and ".join(f"{kind!r} ({path})" for kind, path in kinds.items())
+        raise DatasetError(f"a data set's pictures are of one kind, and these are {told}; choose another --data")
+    sizes = {path.stat().st_size for path in rollouts if path.exists()}
+    known = {hash_file(path) for path in there if path.stat().st_size in sizes}
+    number = int(there[-1].stem) + 1 if there else 0
+    for path in rollouts:
+        frames = _check(path)
+        if (identity := hash_file(path)) in known:
+            continue
+        known.add(identity)
+        with (
+            explain_folder_errors(folder),
+            path.open("rb") as source,
+            atomic_write(episode_path(folder, number)) as target,
+        ):
+            shutil.copyfileobj(source, target)
+        number += 1
+        yield frames
+
+
+def _check(path: Path) -> int:
+    """Frames of a drive; whatever a worker sent lies there, so it is looked at before anything trains on it."""
+    frames = len(load_pictures(path))
+    load_arrays(path, "driver")
+    if len(load_steps(path)["reward"]) != frames:
+        raise DatasetError(f"{path} holds {frames} pictures and another number of actions or rewards; delete it")
+    return frames

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+
+import numpy as np
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.tasks.api import Policy, TaskWithPolicies
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS
+from dreamfleet.worker.training.data.dataset import WORLD, find_world, preprocessing_of_size
 
 MAX_NOISE = 10.0  # noise, in halves of an action's range
 
@@ -32,8 +37,6 @@ class CollectConfig:
     )
 
     def __post_init__(self) -> None:
-        from dreamfleet.worker.training.data.world import known_drivers, preprocessing_of_size
-
         for name in ("episodes", "steps"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} must be at least 1, not {getattr(self, name)}")
@@ -50,3 +53,14 @@ class CollectConfig:
         if not 0 <= self.spells <= 1:
             raise UsageError(f"--spells must be from 0 to 1, not {self.spells}")
         preprocessing_of_size(self.picture)
+
+
+def source_policies(world: str = WORLD) -> Mapping[str, Callable[[np.random.Generator], Policy]]:
+    """The random policies that drive as those of a source do, by name; a world may have none."""
+    task = find_world(world)
+    return task.policies if isinstance(task, TaskWithPolicies) else {}
+
+
+def known_drivers(world: str = WORLD) -> tuple[str, ...]:
+    """Who may drive at random, by name."""
+    return (*find_world(world).drivers, *source_policies(world))

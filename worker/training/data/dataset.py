@@ -8,15 +8,44 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.archives import ArchiveLimits, Arrays, DamagedArchiveError, open_archive, read_arrays
 from dreamfleet.common.files.regular_files import open_regular
-from dreamfleet.worker.training.data.world import find_world, preprocessing_of_size
+from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask
+from dreamfleet.worker.tasks.registry import find_task
 
+WORLD = "car-racing"  # of data sets that do not say another
 POOL_EPISODES = 48  # whose frames are shuffled together
 POOL_FRAMES = 16_000  # of them at most, or one episode: 200 MB of 64x64, 440 MB of 96x96
 VALIDATION_EVERY = 20  # every 20th episode is held out, whole
 LIMITS = ArchiveLimits(512 << 20)  # bytes of an episode: 19,000 pictures of 96x96
+
+
+def find_world(name: str = WORLD) -> RecordableTask:
+    """The task of that name; `UsageError` if nothing can be collected in it."""
+    task = find_task(name)
+    if not isinstance(task, RecordableTask):
+        raise UsageError(f"task {name!r} has no drivers and pictures to collect: docs/tasks.md tells what it takes")
+    return task
+
+
+def preprocessing_of_size(size: int, world: str = WORLD) -> Preprocessing:
+    """The world's preprocessing whose pictures are so many pixels wide; `UsageError` if there is none."""
+    known = find_world(world).preprocessings.values()
+    for each in known:
+        if each.size == size:
+            return each
+    raise UsageError(f"pictures are {' or '.join(str(each.size) for each in known)} pixels wide, not {size}")
+
+
+def episode_path(folder: Path, number: int) -> Path:
+    """Where an episode lies."""
+    return folder / "episodes" / f"{number:06d}.npz"
+
+
+def existing_episodes(folder: Path) -> list[Path]:
+    """The episodes that are there, by number."""
+    return sorted((folder / "episodes").glob("[0-9]*.npz"))
 
 
 def episode_paths(folder: Path, kind: str = "episodes") -> list[Path]:

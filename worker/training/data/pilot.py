@@ -12,7 +12,7 @@ from dreamfleet.worker.scoring.action_bursts import ActionBursts
 from dreamfleet.worker.scoring.actors import ControllerActor
 from dreamfleet.worker.scoring.disturbance import Disturbance
 from dreamfleet.worker.scoring.disturbed_policy import DisturbedPolicy
-from dreamfleet.worker.training.data.world import WORLD, find_world
+from dreamfleet.worker.training.data.dataset import WORLD, find_world
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 

@@ -1,8 +1,11 @@
-"""The preset that a data set was begun with: its folder keeps it, and a later verb that forgets it is told."""
+"""The folder of a data set: the preset and seed that it was begun with, and what cannot be written there."""
 
 from __future__ import annotations
 
+import errno
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from dreamfleet.common.cli.presets import check_preset
@@ -22,11 +25,8 @@ def store_preset(folder: Path, preset: str, seed: int) -> None:
     """
     path = folder / NAME
     if not path.exists() and not any((folder / "episodes").glob("[0-9]*.npz")):
-        try:
-            with atomic_write(path) as file:
-                file.write(json.dumps({"preset": preset, "seed": seed}).encode())
-        except OSError as error:
-            raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
+        with explain_folder_errors(folder), atomic_write(path) as file:
+            file.write(json.dumps({"preset": preset, "seed": seed}).encode())
 
 
 def load_preset(folder: Path) -> str | None:
@@ -65,3 +65,28 @@ def resolve_preset(folder: Path, given: str | None) -> str:
             f"drives, add flags or train in a folder of its own that leads to {folder / 'episodes'}"
         )
     return chosen
+
+
+FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+@contextmanager
+def explain_folder_errors(folder: Path) -> Iterator[None]:
+    """Raise an `OSError` as a `DatasetError` that asks for another data folder than `folder`."""
+    try:
+        yield
+    except OSError as error:
+        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
+
+
+@contextmanager
+def explain_write_errors(path: Path) -> Iterator[None]:
+    """What cannot be written at `path` is a `DatasetError` that says what is kept and how to go on."""
+    try:
+        yield
+    except OSError as error:
+        raise DatasetError(
+            f"cannot write {path}: {error.strerror}; nothing that was saved before is lost: "
+            f"{'make it writable' if error.errno in FORBIDDEN else 'make room there'}, and the same command (without "
+            "--new, where it had that) goes on"
+        ) from error
