@@ -128,7 +128,7 @@ def compare(
     config: RoadLossConfig,
     driven: DisturbedDriveConfig,
 ) -> list[RoadLossComparison]:
-    """Compare each loss, and stretches without one, with dreams begun there, by probes fitted on other folds' drives."""
+    """Compare losses, and stretches without one, with dreams begun there, by probes fitted on other folds' drives."""
     imagination = DriveDreamer(bundle, controller, config.temperature, config.dreams)
     foreseen = [imagination.predict_next(drive) for drive in drives]
     judges = dict[int, RoadProbe]()

@@ -101,8 +101,9 @@ def own_pictures(vae_view: VAEView, paths: Sequence[Path]) -> Section:
     rows = [("seen", seen), ("decoded", decoded)]
     return Section(
         "own", "Pictures of your own",
-        f"Each as the model sees it, and the decoder's picture of its mean latent. An observation of the world is "
-        f"prepared as on a drive, any other picture cut to its middle square and scaled. Summed squared error: {named}.",
+        "Each as the model sees it, and the decoder's picture of its mean latent. An observation of the world is "
+        "prepared as on a drive, any other picture cut to its middle square and scaled. "
+        f"Summed squared error: {named}.",
         picture_grid(rows, [truncate(path.name, NAME) for path in paths]),
     )  # fmt: skip
 
