@@ -26,14 +26,14 @@ from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, RewardLab
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
-HELD_OUT_EVERY = 5  # every fifth drive tells how well it went
-DRIVES_AT_ONCE = 16  # drives that are followed at once
-PICTURES_AT_ONCE = 100  # that are encoded at once
+HELD_OUT_EVERY = 5  # every fifth drive measures R²
+DRIVES_AT_ONCE = 16
+PICTURES_AT_ONCE = 100  # of the encoder
 
 
 @dataclass(frozen=True)
 class DriveArrays:
-    """T recorded steps: `pictures` (T, side, side, 3), `action` (T, actions), `reward` (T,)."""
+    """A drive of T recorded steps: `pictures` (T, side, side, 3), `action` (T, actions), `reward` (T,)."""
 
     pictures: NDArray[np.uint8]
     action: Floats
@@ -41,7 +41,7 @@ class DriveArrays:
 
 
 class FeatureExtractor:
-    """What a controller of one world model would see while others drive."""
+    """Computes what a controller of a world model would see along recorded drives."""
 
     def __init__(self, bundle: Bundle) -> None:
         self._encoder, self._memory, self._label = Encoder(bundle), DreamStep(bundle), RewardLabel(bundle)
@@ -49,11 +49,11 @@ class FeatureExtractor:
         self._hidden = bundle.manifest.hidden if hidden else 0
 
     def encode_drives(self, drives: Sequence[DriveArrays]) -> Floats:
-        """The latents of their pictures `(N, T, latent)`, zero behind a drive's end."""
+        """The latents of the drives' pictures `(N, T, latent)`, zero after a drive's end."""
         return pad([self._encode(drive.pictures) for drive in drives])
 
     def features(self, drives: Sequence[DriveArrays], latent: Floats) -> Floats:
-        """[z, h], or z alone, before each step `(N, T, features)`; behind a drive's end they mean nothing."""
+        """[z, h], or z alone, before each step `(N, T, features)`; undefined after a drive's end."""
         action, reward = pad([drive.action for drive in drives]), pad([drive.reward for drive in drives])
         state, seen = self._memory.zero_state(len(drives)), []
         for step in range(latent.shape[1]):
@@ -69,16 +69,16 @@ class FeatureExtractor:
 
 @dataclass(frozen=True)
 class LeastSquaresSums:
-    """Everything that least squares ask of inputs X `(steps, inputs)` and targets Y `(steps, outputs)`."""
+    """Sums for least squares on inputs X `(steps, inputs + 1)`, last column ones, and targets Y `(steps, outputs)`."""
 
     steps: int
     inputs: Doubles  # X'X
     cross: Doubles  # X'Y
-    targets: Doubles  # the sums of Y, and of its squares `(2, outputs)`
+    targets: Doubles  # sums of Y and of its squares `(2, outputs)`
 
     @classmethod
     def of(cls, inputs: Floats, targets: Doubles) -> LeastSquaresSums:
-        """Those of some steps; inputs have a last column of ones added."""
+        """Sum over some steps; adds the column of ones to `inputs`."""
         wide = np.concatenate([inputs, np.ones((len(inputs), 1), np.float32)], axis=1).astype(np.float64)
         return cls(len(wide), wide.T @ wide, wide.T @ targets, np.stack([targets.sum(0), (targets**2).sum(0)]))
 
@@ -88,13 +88,13 @@ class LeastSquaresSums:
         )
 
     def solve(self, ridge: float) -> Doubles:
-        """The map `(inputs + 1, outputs)`; the offsets, its last row, are not held small."""
+        """The ridge solution `(inputs + 1, outputs)`; its last row, the offsets, is not penalised."""
         held = np.full(len(self.inputs), ridge * self.steps)
         held[-1] = 0
         return np.asarray(np.linalg.solve(self.inputs + np.diag(held), self.cross), dtype=np.float64)
 
     def r_squared(self, solved: Doubles) -> Doubles:
-        """How much of each target's variance a map tells `(outputs,)`; NaN of one that does not vary."""
+        """R² of each target `(outputs,)` under a solution; NaN for a target that does not vary."""
         missed = self.targets[1] - 2 * (solved * self.cross).sum(0) + (solved * (self.inputs @ solved)).sum(0)
         varies = self.targets[1] - self.targets[0] ** 2 / self.steps
         found: Doubles = np.full_like(varies, np.nan)
@@ -103,26 +103,26 @@ class LeastSquaresSums:
 
 
 class SplitSums:
-    """Sums over drives: of those that a map is fitted to, `used`, and of every fifth, which tells how well it went."""
+    """Sums over drives in two parts: `used` to fit, and `others`, every fifth drive, to measure R²."""
 
     def __init__(self) -> None:
         self.used: LeastSquaresSums | None = None
         self.others: LeastSquaresSums | None = None
 
     def add(self, number: int, sums: LeastSquaresSums) -> None:
-        """Those of the drive of this number, counted from 0."""
+        """Add the sums of drive `number`, counted from 0."""
         side = "others" if number % HELD_OUT_EVERY == HELD_OUT_EVERY - 1 else "used"
         so_far = getattr(self, side)
         setattr(self, side, sums if so_far is None else so_far + sums)
 
 
 def last_drives(folder: Path, count: int) -> list[Path]:
-    """A folder's last drives, so many at most; those of controllers lie behind random ones."""
+    """A folder's last `count` drives at most: controllers' drives are newer than random ones."""
     return episode_paths(folder)[-count:]
 
 
 def check_drives(paths: Sequence[Path], preprocessing: str) -> None:
-    """`DatasetError` for a drive that is not whole, or holds other pictures than a model of these sees."""
+    """`DatasetError` for a damaged drive, or one whose pictures have another preprocessing."""
     check_whole(paths, "picture", "preprocessing", "action", "reward", "ended")
     for path in paths:
         if (found := preprocessing_of(path)) != preprocessing:
@@ -130,7 +130,7 @@ def check_drives(paths: Sequence[Path], preprocessing: str) -> None:
 
 
 def load_in_batches(paths: Sequence[Path], actions: int) -> Iterator[tuple[int, list[DriveArrays]]]:
-    """The drives, few at a time, with the number of the first of them."""
+    """Yield the drives in batches, with the number of each batch's first drive."""
     for first in range(0, len(paths), DRIVES_AT_ONCE):
         yield first, [_load_drive(path, actions) for path in paths[first : first + DRIVES_AT_ONCE]]
 

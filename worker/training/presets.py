@@ -1,4 +1,4 @@
-"""Named amounts of everything that training does, and the models it is done to."""
+"""The presets of whole trainings: amounts of data and updates, and the models' layers."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
 
 def required(text: str) -> Any:
-    """A field without a default, and the text that `--help` shows."""
+    """A field without a default, with the text that `--help` shows."""
     return field(metadata={"help": text})
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One model's training: Adam at `rate`, `updates` of `batch` pictures or episodes."""
+    """How one model is trained: Adam at `rate` for `updates` updates of `batch` pictures or drives."""
 
-    updates: int = required("updates in all, those that are made already among them")
-    batch: int = required("pictures, or drives, of an update")
+    updates: int = required("updates in total, those already made included")
+    batch: int = required("pictures, or drives, per update")
     rate: float = required("Adam's learning rate")
-    clip: float = option(1.0, "norm of the gradients at most; 0: any")
-    seed: int = option(0, "makes the training: first weights, batches and chance follow from it")
-    decay: float = option(1.0, "of the rate, an epoch: as many updates as show every recorded frame or drive once")
+    clip: float = option(1.0, "largest norm of the gradients; 0: no limit")
+    seed: int = option(0, "random seed of the training: of first weights, batches and noise")
+    decay: float = option(1.0, "factor of the rate per epoch, in which each recorded frame or drive is shown once")
     patience: int = option(0, "validations without a better held-out loss before training ends; 0: never")
-    validate_every: int = option(200, "updates after which held-out drives are looked at, and a checkpoint is written")
+    validate_every: int = option(200, "updates between validations on held-out drives, each with a checkpoint")
     keep_every: int = option(
-        0, "updates after which a checkpoint stays beside the last one, as vae.000400.safetensors; 0: none"
+        0, "updates between checkpoints that are kept beside the last one, as vae.000400.safetensors; 0: none"
     )
 
     def __post_init__(self) -> None:
@@ -47,7 +47,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class TrainingPreset:
-    """A whole pipeline."""
+    """The configuration of a whole pipeline: collecting, both trainings, both models' layers."""
 
     name: str
     collect: CollectConfig
@@ -57,16 +57,16 @@ class TrainingPreset:
     mdnrnn_layers: MDNRNNConfig = mdnrnn_config.REWARDED
 
 
-# About 12 minutes of two cores. A VAE that was trained on more, or longer, told pictures apart better and made worse
-# dreams; an MDN-RNN that was made better ones (docs/dreams.md): `iterate` goes on with it and the decoder alone.
+# About 12 minutes on two cores. More data or updates made a VAE distinguish pictures better but dream worse, while an
+# MDN-RNN gained from them (docs/dreams.md): `iterate` continues training the MDN-RNN and the decoder alone.
 TINY = TrainingPreset(
     name="tiny",
     collect=CollectConfig(episodes=620, steps=300),
     vae=TrainConfig(updates=1500, batch=100, rate=5e-4, clip=0),
     mdnrnn=TrainConfig(updates=800, batch=32, rate=1e-3),
 )
-# As the sources have it: ten passes over the frames for the VAE at 1e-4, rollouts from the track's beginning that end
-# with their steps, and gradients and trainings that nothing cuts short.
+# As in the sources: ten passes over the frames for the VAE at a rate of 1e-4, rollouts from the track's beginning that
+# end after `steps`, no gradient clipping and no early stopping.
 NOTEBOOK = TrainingPreset(
     name="notebook",
     collect=CollectConfig(episodes=1000, steps=300, picture=96, driver="uniform", anywhere=0.0, patience=0),
@@ -83,7 +83,7 @@ ARTICLE = TrainingPreset(
     vae_layers=vae_config.ARTICLE,
     mdnrnn_layers=mdnrnn_config.ARTICLE,
 )
-# Plain and attentive compare at equal parameters: `--window 0 --hidden 256` is the plain one.
+# Compares plain and attentive at equal numbers of parameters: `--window 0 --hidden 256` is the plain one.
 ATTENTIVE = TrainingPreset(
     name="attentive",
     collect=CollectConfig(episodes=500, steps=384),
@@ -102,5 +102,5 @@ PRESETS = {preset.name: preset for preset in (TINY, NOTEBOOK, ARTICLE, ATTENTIVE
 
 
 def find_preset(name: str) -> TrainingPreset:
-    """The preset of that name; `UsageError` lists those that exist."""
+    """Return the preset `name`; `UsageError` lists those that exist."""
     return PRESETS[check_preset("training", name)]

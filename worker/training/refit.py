@@ -1,9 +1,9 @@
-"""A controller for another world model: what it chooses on recorded drives, imitated there by least squares.
+"""Refit a controller to another world model: imitate its choices on recorded drives by least squares.
 
-Weights on [z, h] mean nothing to another encoder's z, and little to an MDN-RNN's h once that has learnt on. So both
-models follow the same drives, and the controller's first layer is fitted on what the new one sees and remembers to what
-it gives on what its own does, before it is squashed: ridge regression, in closed form. Layers above stay as they are.
-It is behavioural cloning (Pomerleau 1991) of a controller by itself, on states that others may have driven to.
+Weights on [z, h] do not fit another encoder's z, nor an MDN-RNN's h after further training. So both models follow the
+same drives, and ridge regression fits the first layer on the new model's [z, h] to the values, before tanh, that the
+old first layer gives on its own model's. Later layers stay as they are. This is behavioural cloning (Pomerleau 1991)
+of the controller, on drives that other drivers may have driven.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from dreamfleet.worker.training.drive_regression import (
     load_in_batches,
 )
 
-RIDGE = 0.01  # against the mean square of a feature, which is below 1 for h and about 1 for what z tells
-TANH_BOUND = 2.5  # tanh has 0.987 there: how much further a value lies makes no action
-BOUND_MARGIN = 0.3  # how far behind its action's bound a value stays: a search can find the way back from there
+RIDGE = 0.01  # relative to a feature's mean square, which is below 1 for h and about 1 for informative latents
+TANH_BOUND = 2.5  # tanh is 0.987 there; larger values change the action little
+BOUND_MARGIN = 0.3  # how far a value may lie beyond its action's bound, so that a search can still move it back
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -40,7 +40,7 @@ Doubles = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RefitResult:
-    """The fitted controller; on how many drives and steps, and R² of each of the first layer's values on others."""
+    """The fitted controller, the drives and steps it was fitted on, and R² per first-layer value on held-out ones."""
 
     controller: Controller
     drives: int
@@ -51,12 +51,12 @@ class RefitResult:
 def refit(
     controller: Controller, own: Bundle, bundle: Bundle, paths: Sequence[Path], on_progress: Callable[[int], None]
 ) -> RefitResult:
-    """The controller of the world model `own` for `bundle`, by these drives; `on_progress` gets how many are followed.
+    """Refit a controller of the world model `own` to `bundle`; `on_progress` gets the number of drives processed.
 
-    It is left as it is where that one sees and remembers as its own does, to the bit.
+    The parameters stay the same if both models have the same encoder and dream graph.
 
-    `ControllerError` if the two worlds or their pictures differ; `DatasetError` if the drives have other pictures or
-    actions or are damaged; `UsageError` if it looks at its own last choices, or if none of them keeps to its road.
+    `ControllerError` if the two worlds or their pictures differ. `DatasetError` for damaged drives or other pictures or
+    actions. `UsageError` if the controller sees its own last choices, or if no drive stays on its road.
     """
     if all(own.read(part) == bundle.read(part) for part in (ENCODER, DREAM_GRAPH)):
         return RefitResult(replace(controller, bundle=bundle.sha256), 0, 0, ())
@@ -95,10 +95,10 @@ def refit(
 
 
 def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles]:
-    """The values of the first layer `(outputs,)` below and above which nothing is told apart.
+    """The lower and upper bounds `(outputs,)` to which the first layer's target values are clipped.
 
-    An action that is cut off at a bound, such as a brake below 0, is the same however far behind it a value lies.
-    Values that are compared, of choices, are told apart wherever they lie.
+    An action that is clipped, such as a brake below 0, does not depend on how far the value lies beyond the bound.
+    Values of discrete choices are compared with each other, so they are not clipped.
     """
     outputs = controller.shape.layers[0][0]
     lowest, highest = np.full(outputs, -TANH_BOUND), np.full(outputs, TANH_BOUND)
@@ -115,7 +115,7 @@ def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles
         for bound, beyond in ((low, -1), (high, 1)):
             squashed = (bound - shift) / scale
             if abs(squashed) >= 1:
-                continue  # tanh never comes there
+                continue  # tanh does not reach it
             rest = math.atanh(squashed)
             if beyond * scale < 0:
                 lowest[output] = max(lowest[output], rest - BOUND_MARGIN)
@@ -125,7 +125,7 @@ def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles
 
 
 def output_names(controller: Controller, own: Bundle) -> tuple[str, ...]:
-    """The outputs of a controller's first layer for people: actions where each has one of its own."""
+    """Names for the outputs of a controller's first layer: the actions' names if they correspond one to one."""
     names, count = find_task(own.manifest.task).world.action_names, controller.shape.layers[0][0]
     plain = controller.variant.is_default or not (
         controller.variant.controls.output_indices or controller.variant.controls.choices

@@ -197,7 +197,7 @@ def rewritten(file, change=lambda about: about, network=None):
         (lambda about: about | {"more": 1}, "wrong fields"),
         (lambda about: about | {"choices": [[1e9, 0, 0]] * 5}, "is no steering, gas and brake"),
         (lambda about: about | {"choices": [[0, 0]] * 5}, "is no steering, gas and brake"),
-        (lambda about: about | {"choices": [[0, 0, 0]] * 4}, "of 4 choices"),
+        (lambda about: about | {"choices": [[0, 0, 0]] * 4}, "for 4 choices"),
         (lambda about: about | {"state": 4}, "cannot be run"),
         (lambda about: about | {"preprocessing": "raw-96"}, "cannot be run"),
         (lambda about: about | {"preprocessing": "sharp-7"}, "car-racing gives box-64 or raw-96"),

@@ -1,4 +1,4 @@
-"""Collecting rollouts: one compressed `.npz` an episode, each a pure function of (seed, number)."""
+"""Collect rollouts, one compressed `.npz` per episode: driven here as pure functions of (seed, number), or imported."""
 
 from __future__ import annotations
 
@@ -42,16 +42,15 @@ from dreamfleet.worker.training.data.pilot import Pilot
 
 
 def missing_numbers(folder: Path, config: CollectConfig) -> list[int]:
-    """Numbers of the episodes that are not there yet."""
+    """The numbers of the episodes that are still missing."""
     return [number for number in range(config.episodes) if not episode_path(folder, number).exists()]
 
 
 def collect(folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pilot] = ()) -> Generator[int, None, None]:
-    """Drive the episodes that are not there yet in `jobs` processes; yields the frames of each as it is written.
+    """Drive the missing episodes in `jobs` processes; yield the frames of each once it is written.
 
-    Random drivers drive them, or these pilots in turn. `DatasetError` or `ControllerError` before anything is driven if
-    what is there has other pictures, or a pilot sees others. Closed early, it waits until those that are being driven
-    are written.
+    Random drivers drive, or `pilots` in turn. Before any drive it raises `DatasetError` if existing episodes have other
+    pictures, and `ControllerError` if a pilot does. When closed early, it waits until running drives are written.
     """
     check_pictures(existing_episodes(folder), config.picture)
     for pilot in pilots:
@@ -89,7 +88,7 @@ def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...]]) -> in
 
 
 def drive_episode(config: CollectConfig, number: int, pilots: Sequence[Pilot] = ()) -> dict[str, NDArray[Any]]:
-    """One episode of T steps: `picture` (T, side, side, 3) before each `action` (T, 3), then `reward` (T,)."""
+    """Drive an episode of T steps: `picture` (T, side, side, 3) before each `action` (T, 3), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
     world = find_world()
     name, policy = _driver(config, number, pilots, random)
@@ -111,7 +110,7 @@ def drive_episode(config: CollectConfig, number: int, pilots: Sequence[Pilot] = 
 def _driver(
     config: CollectConfig, number: int, pilots: Sequence[Pilot], random: np.random.Generator
 ) -> tuple[str, Policy]:
-    """Who drives this episode, by name and as a policy that has begun."""
+    """The driver of this episode: its name, and its policy with the episode begun."""
     if pilots:
         pilot = pilots[number % len(pilots)]
         return DRIVER_NAME, pilot.policy(config.noise, config.spells, int(random.integers(2**63)))
@@ -125,20 +124,20 @@ def _driver(
 
 
 def import_rollouts(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
-    """Copy the rollouts that the data set lacks; yields the frames of each. Which it has, their bytes tell.
+    """Copy the rollouts that the data set lacks, compared by their bytes, under the next numbers; yield their frames.
 
-    `DatasetError` before anything is copied if not all pictures, the data set's among them, are of one preprocessing.
+    `DatasetError` before any copy if the pictures, the data set's included, have different preprocessings.
     """
     there = existing_episodes(folder)
     kinds = {preprocessing_of(path): path for path in (*there, *rollouts)}
     if len(kinds) > 1:
-        told = " and ".join(f"{kind!r} ({path})" for kind, path in kinds.items())
-        raise DatasetError(f"a data set's pictures are of one kind, and these are {told}; choose another --data")
+        found = " and ".join(f"{kind!r} ({path})" for kind, path in kinds.items())
+        raise DatasetError(f"a data set's pictures are of one kind, and these are {found}; choose another --data")
     sizes = {path.stat().st_size for path in rollouts if path.exists()}
     known = {hash_file(path) for path in there if path.stat().st_size in sizes}
     number = int(there[-1].stem) + 1 if there else 0
     for path in rollouts:
-        frames = _check(path)
+        frames = _check_drive(path)
         if (identity := hash_file(path)) in known:
             continue
         known.add(identity)
@@ -152,8 +151,8 @@ def import_rollouts(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
         yield frames
 
 
-def _check(path: Path) -> int:
-    """Frames of a drive; whatever a worker sent lies there, so it is looked at before anything trains on it."""
+def _check_drive(path: Path) -> int:
+    """Check a drive, which an untrusted worker may have sent, and return its number of frames."""
     frames = len(load_pictures(path))
     load_arrays(path, "driver")
     if len(load_steps(path)["reward"]) != frames:

@@ -1,4 +1,4 @@
-"""The folder of a data set: the preset and seed that it was begun with, and what cannot be written there."""
+"""The folder of a data set: the preset and seed it was begun with, and errors of writing there."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ MOST_BYTES = 1000
 
 
 def store_preset(folder: Path, preset: str, seed: int) -> None:
-    """Keep the preset and the seed of a data set that is begun now; one that has rollouts already stays as it is.
+    """Store the preset and the seed of a new data set; do nothing for one that has rollouts already.
 
-    `DatasetError` where nothing can be written.
+    `DatasetError` if it cannot be written.
     """
     path = folder / NAME
     if not path.exists() and not any((folder / "episodes").glob("[0-9]*.npz")):
@@ -30,13 +30,13 @@ def store_preset(folder: Path, preset: str, seed: int) -> None:
 
 
 def load_preset(folder: Path) -> str | None:
-    """The preset of a data set; one from before they were kept, or of no `collect`, has none."""
+    """The preset of a data set; `None` for old data sets, and for those without `collect`."""
     path = folder / NAME
     if not path.exists():
         return None
     try:
-        told = json.loads(read_text(path, MOST_BYTES))["preset"]
-        return check_preset("training", told if isinstance(told, str) else repr(told))
+        stored = json.loads(read_text(path, MOST_BYTES))["preset"]
+        return check_preset("training", stored if isinstance(stored, str) else repr(stored))
     except (OSError, ValueError, KeyError, TypeError, RecursionError, UsageError) as error:
         raise DatasetError(
             f"{path} names no preset ({error}); write the one that collected the data into it"
@@ -44,7 +44,7 @@ def load_preset(folder: Path) -> str | None:
 
 
 def check_seed(folder: Path, seed: int) -> None:
-    """`UsageError` for another seed than the data set was begun with; one from before seeds were kept has none."""
+    """`UsageError` if the data set was begun with another seed; old data sets have stored none."""
     if load_preset(folder) is None:
         return
     own = json.loads(read_text(folder / NAME, MOST_BYTES)).get("seed", seed)
@@ -56,13 +56,13 @@ def check_seed(folder: Path, seed: int) -> None:
 
 
 def resolve_preset(folder: Path, given: str | None) -> str:
-    """The preset that a verb goes by, tiny where none is given; `UsageError` if the data set was begun with another."""
+    """The preset to use: the given one, or tiny; `UsageError` if the data set was begun with another."""
     chosen, own = check_preset("training", given or DEFAULT), load_preset(folder)
     if own not in (None, chosen):
-        told = f"--preset {given} is another" if given else f"without --preset it would be {DEFAULT}"
+        reason = f"--preset {given} is another" if given else f"without --preset it would be {DEFAULT}"
         raise UsageError(
-            f"{folder} was begun with the preset {own}, and {told}: give --preset {own}; for other layers on the same "
-            f"drives, add flags or train in a folder of its own that leads to {folder / 'episodes'}"
+            f"{folder} was begun with the preset {own}, and {reason}: give --preset {own}; for other layers on the "
+            f"same drives, add flags or train in another folder that links to {folder / 'episodes'}"
         )
     return chosen
 
@@ -81,7 +81,7 @@ def explain_folder_errors(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def explain_write_errors(path: Path) -> Iterator[None]:
-    """What cannot be written at `path` is a `DatasetError` that says what is kept and how to go on."""
+    """Raise an `OSError` of writing `path` as a `DatasetError` that says how to resume."""
     try:
         yield
     except OSError as error:

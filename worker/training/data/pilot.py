@@ -18,13 +18,13 @@ from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 @dataclass(frozen=True)
 class Pilot:
-    """A controller and the world model that it was evolved with."""
+    """A controller with the world model that it was evolved with."""
 
     controller: Controller
     bundle: Bundle
 
     def check(self, preprocessing: str) -> None:
-        """`ControllerError` unless it drives the world of data sets, and sees the pictures of this preprocessing."""
+        """`ControllerError` unless its task is the data sets' world and its pictures have this preprocessing."""
         manifest = self.bundle.manifest
         if self.controller.bundle != self.bundle.sha256:
             raise ControllerError(
@@ -37,7 +37,7 @@ class Pilot:
             )
 
     def policy(self, noise: float, bursts: float, seed: int) -> DisturbedPolicy:
-        """It at the wheel of one drive, under a noise and spells that follow from the seed."""
+        """The policy of one drive, with noise and bursts of tried actions by the seed."""
         actions = find_world().world.actions
         if not isinstance(actions, Continuous):
             raise ControllerError(f"{WORLD} has no continuous actions: its drives cannot be disturbed")
