@@ -82,12 +82,12 @@ def test_nothing_is_foretold_behind_a_terminal():
 
 def test_chance_falls_in_a_line_after_the_random_episodes_and_stays():
     config = LearningConfig(random_episodes=50, epsilon_first=0.6, epsilon_last=0.1, epsilon_episodes=100)
-    told = [epsilon_of(config, episode) for episode in (0, 49, 50, 100, 150, 1000)]
-    assert told == pytest.approx([1, 1, 0.6, 0.35, 0.1, 0.1])
+    epsilons = [epsilon_of(config, episode) for episode in (0, 49, 50, 100, 150, 1000)]
+    assert epsilons == pytest.approx([1, 1, 0.6, 0.35, 0.1, 0.1])
 
 
 @pytest.mark.parametrize(("kind", "loss"), [("huber", (0.125 + 2.5) / 2), ("squared", (0.25 + 9) / 2)])
 def test_losses_count_where_something_is_known(kind, loss):
-    told, target, mask = torch.tensor([0.5, 3.0, 99.0]), torch.zeros(3), torch.tensor([1.0, 1.0, 0.0])
-    assert masked_loss(told, target, mask, kind).item() == pytest.approx(loss)
-    assert masked_loss(told, target, torch.zeros(3), kind).item() == 0
+    predicted, target, mask = torch.tensor([0.5, 3.0, 99.0]), torch.zeros(3), torch.tensor([1.0, 1.0, 0.0])
+    assert masked_loss(predicted, target, mask, kind).item() == pytest.approx(loss)
+    assert masked_loss(predicted, target, torch.zeros(3), kind).item() == 0

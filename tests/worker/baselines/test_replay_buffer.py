@@ -11,7 +11,7 @@ REWARDS = [1.0, 2.0, 4.0, 8.0]
 
 
 def episode(number, length, terminal=True):
-    """Its pictures and choices tell the episode and the decision, both from 1."""
+    """An episode whose pictures and choices encode the numbers of episode and decision, both from 1."""
     pictures = np.zeros((length, 2, 2, 3), np.uint8)
     pictures[..., 0], pictures[..., 1] = number, np.arange(1, length + 1)[:, None, None]
     return Episode(pictures, np.arange(1, length + 1), np.full(length, float(number), np.float32), terminal)

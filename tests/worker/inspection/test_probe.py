@@ -28,10 +28,10 @@ def test_weights_say_which_samples_count(features):
 def test_a_network_finds_what_no_line_does_and_the_same_each_time(features):
     targets = np.abs(features[:, :1] - 3)
     linear, layered = (kind.fit(features[:2000], targets[:2000]) for kind in (LinearProbe, NetworkProbe))
-    told = layered.predict(features[2000:])
+    predicted = layered.predict(features[2000:])
     assert explained_variance([targets[2000:]], [linear.predict(features[2000:])])[0].value < 0.1
-    assert explained_variance([targets[2000:]], [told])[0].value > 0.9
-    assert np.array_equal(told, NetworkProbe.fit(features[:2000], targets[:2000]).predict(features[2000:]))
+    assert explained_variance([targets[2000:]], [predicted])[0].value > 0.9
+    assert np.array_equal(predicted, NetworkProbe.fit(features[:2000], targets[:2000]).predict(features[2000:]))
 
 
 @pytest.mark.parametrize("drives", [2, 3, 4, 9])

@@ -90,9 +90,11 @@ def test_a_dream_begins_at_real_latents(random_bundle, tmp_path, initial, said):
 )
 def test_damaged_recorded_states_are_one_clear_line(random_bundle, tmp_path, recorded, said):
     parts = {**parts_of(random_bundle), RECORDED_STATES: recorded}
-    with pytest.raises(BundleError, match=rf"b\.zip: recorded_states\.npy .*{said}.*; build the bundle again") as told:
+    with pytest.raises(
+        BundleError, match=rf"b\.zip: recorded_states\.npy .*{said}.*; build the bundle again"
+    ) as caught:
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_graphs_of_other_sizes_than_the_manifest_says_are_refused(random_bundle, tmp_path):

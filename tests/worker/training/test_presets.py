@@ -159,7 +159,7 @@ def test_a_data_set_from_before_presets_were_kept_stays_without_one(tmp_path):
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"preset": 5}', '{"preset": "dream"}', "[" * 900])
-def test_a_damaged_note_of_the_preset_is_told_in_a_line(tmp_path, content):
+def test_a_damaged_preset_file_is_reported_in_a_line(tmp_path, content):
     (tmp_path / "preset.json").write_text(content)
     with pytest.raises(DatasetError, match="names no preset"):
         resolve_preset(tmp_path, None)

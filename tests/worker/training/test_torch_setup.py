@@ -21,8 +21,8 @@ print(os.environ["OMP_WAIT_POLICY"], layer.weight.grad.double().sum().item().hex
 
 
 @pytest.fixture
-def told(monkeypatch):
-    """What the C library was told."""
+def allocator_calls(monkeypatch):
+    """The calls of the C library's allocator settings."""
     calls = []
     for name in [each for each in os.environ if each.startswith(("MALLOC_", "OMP_WAIT"))]:
         monkeypatch.delenv(name)
@@ -31,16 +31,16 @@ def told(monkeypatch):
     os.environ.pop("OMP_WAIT_POLICY", None)
 
 
-def test_threads_that_wait_sleep_and_the_heap_keeps_what_is_freed(told):
+def test_threads_that_wait_sleep_and_the_heap_keeps_what_is_freed(allocator_calls):
     torch_setup.configure_process()
-    assert (os.environ["OMP_WAIT_POLICY"], told) == ("PASSIVE", ["keep"])
+    assert (os.environ["OMP_WAIT_POLICY"], allocator_calls) == ("PASSIVE", ["keep"])
 
 
-def test_what_the_user_set_stays(told, monkeypatch):
+def test_what_the_user_set_stays(allocator_calls, monkeypatch):
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
     monkeypatch.setenv("MALLOC_ARENA_MAX", "2")
     torch_setup.configure_process()
-    assert (os.environ["OMP_WAIT_POLICY"], told) == ("ACTIVE", [])
+    assert (os.environ["OMP_WAIT_POLICY"], allocator_calls) == ("ACTIVE", [])
 
 
 def test_a_system_without_such_a_heap_is_left_alone(monkeypatch):

@@ -60,7 +60,7 @@ def test_the_vae_goes_on_to_the_same_weights_as_without_a_stop(encoded, tmp_path
 
 
 @pytest.mark.parametrize("after", [1, 3])  # neither is an update after which the held-out rollouts are looked at
-def test_told_to_stop_it_keeps_every_update_and_goes_on_to_the_same_weights(encoded, tmp_path, after):
+def test_a_stopped_training_keeps_every_update_and_resumes_to_the_same_weights(encoded, tmp_path, after):
     (tmp_path / "episodes").symlink_to(encoded / "episodes")
     made = []
     with pytest.raises(
@@ -72,7 +72,7 @@ def test_told_to_stop_it_keeps_every_update_and_goes_on_to_the_same_weights(enco
     assert equal(encoded / train_vae.CHECKPOINT, tmp_path / train_vae.CHECKPOINT)
 
 
-def test_an_mdnrnn_that_is_told_to_stop_goes_on_to_the_same_weights(encoded, tmp_path):
+def test_a_stopped_mdnrnn_resumes_to_the_same_weights(encoded, tmp_path):
     whole, parts = (tmp_path / name for name in ("whole", "parts"))
     for folder in (whole, parts):
         folder.mkdir()

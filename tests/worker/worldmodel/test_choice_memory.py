@@ -76,8 +76,8 @@ def test_a_controller_acts_by_its_formula_in_the_dream_and_in_reality(random_bun
     seen = [real.latent, given["state"][:, :256]] if features == "zh" else [real.latent]
     if variant.feedback == "last":
         last, before = given["state"][:, -7:-4], given["state"][:, -4:-1]
-        told = [variant.controls.to_outputs(each) for each in (last, before)]
-        seen += [told[0], told[0] - told[1]]
+        outputs = [variant.controls.to_outputs(each) for each in (last, before)]
+        seen += [outputs[0], outputs[0] - outputs[1]]
     for row, value in enumerate(np.concatenate(seen, axis=1)):
         expected = act(bundle.controller_shape, parameters[row], value, variant.controls)
         np.testing.assert_allclose(real.action[row], expected, atol=1e-5)
