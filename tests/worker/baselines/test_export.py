@@ -1,4 +1,4 @@
-"""An exported agent drives as the network that was trained does, without torch; any other file is refused."""
+"""An exported agent drives like the trained network, without torch; any other file is refused."""
 
 import hashlib
 import json
@@ -43,7 +43,7 @@ def short(monkeypatch):
 
 
 def networks_of(layers, seed=0):
-    """Of weights so large that pictures make a difference."""
+    """Networks with weights so large that pictures make a difference."""
     torch.manual_seed(seed)
     networks = Networks(layers).eval()
     for each in networks.online.parameters():

@@ -1,4 +1,4 @@
-"""Baselines are judged, and recorded, in gymnasium's own environment, as controllers are."""
+"""Baselines are evaluated and recorded in gymnasium's own environment, like controllers."""
 
 import argparse
 import json

@@ -71,7 +71,7 @@ def test_the_online_network_chooses_and_the_target_network_says_what_it_is_worth
     assert double_q_target(torch.tensor([1.0]), torch.tensor([0.5]), online, target).tolist() == [1 + 0.5 * 3]
 
 
-def test_nothing_is_foretold_behind_a_terminal():
+def test_no_value_follows_a_terminal():
     returns = n_step(np.array([1.0, 2.0, 4.0, 8.0]), terminal=True, gamma=0.5, n=1)
     assert returns.discount.tolist() == [0.5, 0.5, 0.5, 0.0]
     assert returns.known.all()

@@ -1,4 +1,4 @@
-"""Traces of replay: each within one episode, and each number where its decision was."""
+"""Traces of the replay buffer stay within one episode and keep each number at its decision; n-step returns."""
 
 import numpy as np
 import pytest

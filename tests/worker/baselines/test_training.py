@@ -1,4 +1,4 @@
-"""The network learns in the real CarRacing, and whatever interrupts it, goes on to the bits that it would have had."""
+"""The network learns in the real CarRacing; an interrupted training resumes to the same bits."""
 
 import argparse
 import json
@@ -34,7 +34,7 @@ FLAGS = (
 
 
 class KilledError(BaseException):
-    """Nothing of ours runs any more."""
+    """Stands for a kill: no handler of the code under test catches it."""
 
 
 def call(*words):
@@ -44,7 +44,7 @@ def call(*words):
 
 
 def state(folder):
-    """All that a training leaves, to the bit."""
+    """The bytes of all files that a training leaves."""
     weights = {name: array.tobytes() for name, array in load_weights(folder / CHECKPOINT).items()}
     kept = {path.name: path.read_bytes() for path in (folder / "replay").iterdir()}
     return weights, load_progress(folder / CHECKPOINT), (folder / CURVE).read_text(), kept

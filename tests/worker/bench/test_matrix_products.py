@@ -1,4 +1,4 @@
-"""The floors of `bench policy` and `bench dream`: no slow library, and no inherited setting, may flatter a step."""
+"""The lower bounds of `bench policy` and `bench dream` ignore slow libraries and inherited settings."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""CarRacing through a world model: gymnasium's own, observed as controllers and dreams observe."""
+"""CarRacing through a world model: gymnasium's environment with the observations of controllers and dreams."""
 
 import gymnasium
 import numpy as np

@@ -1,4 +1,4 @@
-"""What the simulator knows of car and road: on roads of a known shape, and in the real environment."""
+"""The true state of car and road: on roads of a known shape, and in the real environment."""
 
 import math
 
@@ -98,7 +98,7 @@ def test_bends_ahead_are_those_of_the_tracks_own_points(environment):
 
 
 def drive(environment, actions):
-    """Truths of a drive from the start, past the opening."""
+    """The true states of a drive from the start, after the opening zoom."""
     states = []
     for action in actions:
         environment.step(np.array(action, np.float32))

@@ -1,4 +1,4 @@
-"""Drives with the truth beside what a world model held."""
+"""Disturbed drives with the true state beside the world model's."""
 
 from dataclasses import replace
 from itertools import islice

@@ -1,4 +1,4 @@
-"""`inspect --probe` and `inspect --losses`: what is printed, and who may drive."""
+"""`inspect --probe` and `inspect --losses`: what they print, and the allowed drivers."""
 
 import argparse
 import json

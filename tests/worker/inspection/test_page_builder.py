@@ -25,7 +25,7 @@ LOOKS = ["reconstructions", "traversals", "latents", "samples"]
 
 
 class Links(HTMLParser):
-    """Every address that a browser would fetch, and the ids of the sections."""
+    """Collects the addresses that a browser would fetch, and the ids of the sections."""
 
     def __init__(self, text):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Maps from what is held to what is true."""
+"""Probes, cross-validation folds, R² and estimates."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Dreams begun before real losses, judged from the dream itself."""
+"""Dreams begun before real losses of the road, judged by probes on the dream."""
 
 from dataclasses import replace
 

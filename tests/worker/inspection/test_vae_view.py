@@ -1,4 +1,4 @@
-"""A VAE before there is an MDN-RNN or a bundle, and pictures of one's own."""
+"""Pages of a VAE without an MDN-RNN or a bundle, and of the user's own pictures."""
 
 import re
 

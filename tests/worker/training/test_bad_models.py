@@ -1,4 +1,4 @@
-"""Bundles and data sets that are wrong are refused before anything runs, in one clear line."""
+"""Malformed bundles and data sets are refused in one line before anything runs."""
 
 import shutil
 from dataclasses import replace
@@ -180,7 +180,7 @@ def test_a_whole_folder_still_makes_a_bundle(folder):
 
 
 def with_weights_elsewhere(model):
-    """The first initialiser's numbers lie in a file beside the model."""
+    """A model whose first initialiser is stored in another file."""
     tensor = model.graph.initializer[0]
     elsewhere(tensor)
 

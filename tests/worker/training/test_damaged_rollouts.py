@@ -1,4 +1,4 @@
-"""Recorded drives that others collected, damaged in thousands of ways: each is read, or is one line."""
+"""Recorded drives damaged in thousands of ways: each is read, or refused in one line."""
 
 import numpy as np
 import pytest

@@ -12,7 +12,7 @@ CONFIG = MDNRNNConfig(latent=1, hidden=4, done=True, lost=3)
 
 
 def drives(*rewards, ended=False):
-    """Rollouts of these rewards, padded; the last of them ended if it is said so."""
+    """Rollouts with these rewards, padded; `ended` says whether the last one ended."""
     length = max(map(len, rewards))
     reward, mask, done = (np.zeros((len(rewards), length), np.float32) for _ in range(3))
     for row, each in enumerate(rewards):

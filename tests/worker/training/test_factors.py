@@ -1,4 +1,4 @@
-"""Factors weigh the parts of a loss; at 1 nothing is written of them, and what is reported is never weighed."""
+"""Factors weight the parts of a loss; the default 1 is not serialised, and reported losses are unweighted."""
 
 import argparse
 import json

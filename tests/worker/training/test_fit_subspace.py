@@ -1,4 +1,4 @@
-"""Features that foretell what a driver will do and earn."""
+"""A subspace of features that predict a driver's actions and rewards."""
 
 import argparse
 import json
@@ -32,7 +32,7 @@ def bundle(folder):
 
 @pytest.fixture(scope="module")
 def drives(folder):
-    """Drives in which the steering follows what is seen, slowly; each pays every third step."""
+    """Drives in which the steering slowly follows the pictures, with a reward at each third step."""
     paths = []
     for number in range(20):
         path = write_drive(folder / "data", number, steps=120)
@@ -68,7 +68,7 @@ def test_all_windows_are_asked_of_what_goes_both_ways_alone():
     assert len(make_targets(World(Discrete(3)), 3)) == 6
 
 
-def test_its_features_foretell_held_out_drives_and_have_one_size(bundle, drives):
+def test_its_features_predict_held_out_drives_and_have_one_size(bundle, drives):
     found = find_subspace(bundle, drives[:15], ignore)
     subspace = found.subspace
     assert (subspace.bundle, found.drives) == (bundle.sha256, 15)
@@ -93,7 +93,7 @@ def test_views_are_directions_that_predict_the_models_later_state(bundle, drives
     count = len(plain.subspace.names)
     assert wide.subspace.names[:count] == plain.subspace.names
     views = len(wide.subspace.names) - count
-    assert 1 <= views <= 3, "as many as are foretold"
+    assert 1 <= views <= 3, "as many as are predictable"
     assert wide.subspace.names[count:] == tuple(f"view {number} 15-16" for number in range(1, views + 1))
     np.testing.assert_array_equal(wide.subspace.weights[:count], plain.subspace.weights)
     looking, now, then = FeatureExtractor(bundle), [], []
@@ -114,7 +114,7 @@ def test_views_are_directions_that_predict_the_models_later_state(bundle, drives
     assert len(everything.subspace.names) <= count + 10, "no more than [z, h] has"
 
 
-def test_what_foretells_nothing_is_said(bundle, drives, tmp_path):
+def test_unpredictable_drives_are_refused(bundle, drives, tmp_path):
     with pytest.raises(UsageError, match="5 drives of 0 steps that count are too few"):
         find_subspace(bundle, [write_drive(tmp_path / "short", number, steps=30) for number in range(5)], ignore)
     always = [write_drive(tmp_path / "always", number, steps=150) for number in range(10)]

@@ -1,4 +1,4 @@
-"""A training that is interrupted, killed, or without room for its files goes on to the bits that it would have had."""
+"""A training that is interrupted, killed, or out of disk space resumes to the same bits."""
 
 import argparse
 import json
@@ -29,7 +29,7 @@ SHORT = TrainConfig(updates=6, batch=8, rate=1e-3, validate_every=2)
 
 
 class KilledError(BaseException):
-    """Nothing of ours runs any more."""
+    """Stands for a kill: no handler of the code under test catches it."""
 
 
 def ignore(_done, _note):

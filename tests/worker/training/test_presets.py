@@ -1,4 +1,4 @@
-"""Presets are their sources; the folder keeps the one that it was begun with."""
+"""Presets match their sources; a data folder keeps the preset it was begun with."""
 
 import argparse
 import json

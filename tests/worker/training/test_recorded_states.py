@@ -34,7 +34,7 @@ MODELS = {
 
 @pytest.fixture(scope="module")
 def encoded(tmp_path_factory):
-    """Drives of which each second one stays without a reward from step 40 on."""
+    """Drives, each second one without a reward from step 40 on."""
     folder = tmp_path_factory.mktemp("data")
     drives = [write_drive(folder, number, STEPS - number) for number in range(4)]
     train_vae.train_vae(folder, SHORT, ignore, VAEConfig(latent=LATENT, channels=(2, 2, 2, 2)))
@@ -65,7 +65,7 @@ def ignore(_done, _note):
 
 @pytest.fixture
 def trained(encoded, tmp_path):
-    """A folder with these drives and an MDN-RNN of its own."""
+    """A folder with these drives and a trained MDN-RNN."""
 
     def folder(layers):
         made = tmp_path / "data"
@@ -77,7 +77,7 @@ def trained(encoded, tmp_path):
 
 
 def remembered(bundle, folder):
-    """By latents of each step of each drive: them, and what a drive by the bundle's graphs remembers before it."""
+    """The latents of each step of each drive, and the state before it by the bundle's graphs, keyed by the latents."""
     model, label, found = DreamStep(bundle), RewardLabel(bundle), {}
     for path in sorted((folder / "encoded").iterdir()):
         arrays = load_arrays(path, "mu", "logvar", "action", "reward")

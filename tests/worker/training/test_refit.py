@@ -30,7 +30,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def bundles(folder):
-    """Two world models that were trained by nobody, each with eyes and a memory of its own."""
+    """Two random world models with different encoders and MDN-RNNs."""
     return [write_random_bundle(folder / f"{seed}.zip", seed, EYES, MEMORY) for seed in (1, 2)]
 
 
@@ -50,7 +50,7 @@ def ignore(_):
 
 
 def first_values(chosen, bundle, paths):
-    """What its first layer gives on drives `(N, T, outputs)`."""
+    """The outputs of its first layer along drives `(N, T, outputs)`."""
     with_pictures = []
     for path in paths:
         with np.load(path) as drive:

@@ -49,7 +49,7 @@ def test_a_system_without_such_a_heap_is_left_alone(monkeypatch):
 
 
 def test_nothing_that_is_learnt_depends_on_it():
-    """Gradients in a process that was asked, and in one whose environment says otherwise."""
+    """The gradients are equal in a configured process and in one with other settings in its environment."""
     own = {name: text for name, text in os.environ.items() if not name.startswith(("OMP_", "MALLOC_"))}
     other = own | {"OMP_WAIT_POLICY": "ACTIVE", "MALLOC_ARENA_MAX": "2"}
     first, second = (

@@ -114,8 +114,8 @@ def test_a_checkpoint_keeps_its_layers_and_refuses_others(encoded):
         train_vae.train_vae(encoded, SHORT, ignore, replace(LAYERS, latent=5))
 
 
-def test_a_trained_memory_may_be_given_a_head_that_foretells_ends(encoded, tmp_path):
-    """What it knew stays, to the bit; Adam goes on where it was, but for the tensors that grew."""
+def test_a_done_head_can_be_added_to_a_trained_mdnrnn(encoded, tmp_path):
+    """Its weights stay, to the bit; Adam's moments too, except those of extended tensors."""
     before, folder = tmp_path / "before.safetensors", tmp_path / "data"
     shutil.copytree(encoded, folder)
     checkpoint = folder / train_mdnrnn.CHECKPOINT

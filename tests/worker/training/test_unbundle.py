@@ -1,4 +1,4 @@
-"""A bundle's models as what training goes on from."""
+"""Checkpoints from a bundle's models, from which training resumes."""
 
 import json
 from dataclasses import replace

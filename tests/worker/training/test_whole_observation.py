@@ -1,4 +1,4 @@
-"""World models of the whole 96x96 observation: from rollouts in CarRacing to scores, and no mixture of kinds."""
+"""World models of the whole 96x96 observation, from rollouts in CarRacing to scores; kinds cannot be mixed."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def ignore(_done, _note):
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """A data folder that has been through every stage; read only."""
+    """A data folder after all stages; read only."""
     folder = tmp_path_factory.mktemp("data")
     assert list(collect(folder, COLLECT, jobs=1)) == [8, 8, 8]
     train_vae.train_vae(folder, SHORT, ignore, VAE)

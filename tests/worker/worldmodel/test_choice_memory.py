@@ -1,4 +1,4 @@
-"""Controllers of a variant: by their formula, held as long as they say, and the same bits in any batch."""
+"""A variant's controllers follow their formula, repeat choices as configured, and give the same bits in any batch."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -23,7 +23,7 @@ def varied(request, random_bundle):
 
 
 def feed(step, rows, seed=0):
-    """A batch in the middle of its dreams: rows are not all at the same step of what they hold."""
+    """A batch in the middle of dreams whose rows have repeated their choices for different times."""
     random = np.random.default_rng(seed)
     state = random.normal(0, 0.5, (rows, step.state_size)).astype(np.float32)
     state[:, -1] = random.integers(0, 2, rows)

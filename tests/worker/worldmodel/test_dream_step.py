@@ -30,7 +30,7 @@ VARIANTS = {
 
 
 def chance(config, rows=ROWS, seed=0):
-    """What a step takes beside the temperature."""
+    """The inputs of a step besides the temperature."""
     random = np.random.default_rng(seed)
     shapes = {"latent": config.latent, "action": config.actions, "state": config.state}
     feed = {name: random.normal(0, 0.5, (rows, size)).astype(np.float32) for name, size in shapes.items()}
@@ -40,7 +40,7 @@ def chance(config, rows=ROWS, seed=0):
 
 
 def dreamt_in_torch(model, feed, temperature, mask):
-    """The same step by the book: softmax, its running sum, the first beyond `uniform`."""
+    """The same step in torch: softmax, cumulative sum, the first entry beyond `uniform`."""
     config = model.config
     model.heads.weight.data = model.heads.weight.data.half().float()  # as the bundle keeps them
     tensors = {name: torch.from_numpy(each) for name, each in feed.items()}
