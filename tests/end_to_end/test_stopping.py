@@ -7,7 +7,7 @@ import av
 import pytest
 
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
-from dreamfleet.worker.training.data.collect import existing_episodes
+from dreamfleet.worker.training.data.dataset import existing_episodes
 from tests.support import tasks
 from tests.support.drives import write_drives
 

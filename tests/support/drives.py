@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dreamfleet.worker.training.data.collect import episode_path
-from dreamfleet.worker.training.data.world import preprocessing_of_size
+from dreamfleet.worker.training.data.dataset import episode_path, preprocessing_of_size
 
 
 def write_drive(folder, number, steps=12, picture=64):

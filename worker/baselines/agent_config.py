@@ -1,16 +1,17 @@
-"""What the recurrent duelling network is made of and how it drives; apart from it, so that a flag needs no torch."""
+"""The configuration of the recurrent duelling network: layers, pictures, choices. Parsing its flags needs no torch."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 from dreamfleet.common.artifacts.actions import FIVE_CHOICES
 from dreamfleet.common.artifacts.trained_agent import MAX_FRAME_SKIP
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 
-MOST_PARAMETERS = 50_000_000  # a network that is exported is read within bounds
+MOST_PARAMETERS = 50_000_000  # readers of an exported network bound its size
 
 # Steering, gas, brake of each choice, in gymnasium's order: nothing, right, left, gas, brake.
 CHOICES: dict[str, tuple[tuple[float, ...], ...]] = {
@@ -19,30 +20,25 @@ CHOICES: dict[str, tuple[tuple[float, ...], ...]] = {
 }
 
 
-def said(default: Any, text: str) -> Any:
-    """A field with its default and what `--help` says of it."""
-    return field(default=default, metadata={"help": text})
-
-
 @dataclass(frozen=True)
 class AgentConfig:
-    """Layers, pictures and choices: all that drives again what has learnt.
+    """Layers, pictures and choices: all that a trained network needs besides its weights.
 
     The layers are those of Hausknecht & Stone 2015 (arXiv:1507.06527) with the streams of Wang et al. 2016
     (arXiv:1511.06581).
     """
 
-    picture: int = said(64, "height and width of what it sees: 64, or 96 for the whole observation")
-    choices: Literal["gymnasium", "notebook"] = said(
+    picture: int = option(64, "height and width of its pictures: 64, or 96 for the whole observation")
+    choices: Literal["gymnasium", "notebook"] = option(
         "gymnasium", "its five actions: steering 0.6, gas 0.2, brake 0.8 as gymnasium has them, or 1 each (notebook)"
     )
-    frame_skip: int = said(1, "steps for which a choice is held")
-    channels: tuple[int, ...] = said((32, 64, 64), "of each convolution")
-    kernels: tuple[int, ...] = said((8, 4, 3), "of each convolution")
-    strides: tuple[int, ...] = said((4, 2, 1), "of each convolution")
-    hidden: int = said(512, "units of the LSTM")
-    heads: Literal["linear", "softmax"] = said(
-        "linear", "softmax bounds the advantages, as the notebook does: no return can then be told"
+    frame_skip: int = option(1, "steps for which a choice is held")
+    channels: tuple[int, ...] = option((32, 64, 64), "of each convolution")
+    kernels: tuple[int, ...] = option((8, 4, 3), "of each convolution")
+    strides: tuple[int, ...] = option((4, 2, 1), "of each convolution")
+    hidden: int = option(512, "units of the LSTM")
+    heads: Literal["linear", "softmax"] = option(
+        "linear", "softmax bounds the advantages to 0..1, as the notebook does; they then cannot represent returns"
     )
 
     def __post_init__(self) -> None:
@@ -59,13 +55,13 @@ class AgentConfig:
             raise UsageError(f"--frame-skip must be at most {MAX_FRAME_SKIP}, not {self.frame_skip}")
         if self.parameters > MOST_PARAMETERS:
             raise UsageError(
-                f"these layers have {self.parameters:,} parameters, {MOST_PARAMETERS:,} at most are learnt: make "
+                f"these layers have {self.parameters:,} parameters, at most {MOST_PARAMETERS:,} are allowed: make "
                 "--channels, --kernels or --hidden smaller"
             )
 
     @property
     def sides(self) -> tuple[int, ...]:
-        """Height and width of the picture and after each convolution."""
+        """Height (= width) of the picture, then after each convolution."""
         sides = [self.picture]
         for kernel, stride in zip(self.kernels, self.strides, strict=True):
             sides.append((sides[-1] - kernel) // stride + 1)
@@ -73,7 +69,7 @@ class AgentConfig:
 
     @property
     def flat(self) -> int:
-        """Outputs of the last convolution."""
+        """The number of outputs of the last convolution."""
         return int(self.channels[-1] * self.sides[-1] ** 2)
 
     @property
@@ -83,12 +79,12 @@ class AgentConfig:
 
     @property
     def parameters(self) -> int:
-        """Of convolutions and LSTM, which are nearly all, without biases."""
+        """The number of weights of the convolutions and the LSTM, which are nearly all; biases are not counted."""
         layers = zip(self.channel_pairs, self.kernels, strict=True)
         looking = sum(before * after * kernel**2 for (before, after), kernel in layers)
         return int(looking + 4 * self.hidden * (self.flat + self.hidden))
 
     @property
     def table(self) -> tuple[tuple[float, ...], ...]:
-        """Steering, gas and brake of each choice."""
+        """Steering, gas and brake of each choice: `(choices, 3)`."""
         return CHOICES[self.choices]

@@ -1,4 +1,4 @@
-"""The baselines by name, ready to be judged and recorded: random drivers, and a network that was trained."""
+"""Find a baseline by name, to evaluate and record it: the random drivers, and the trained network."""
 
 from __future__ import annotations
 
@@ -11,37 +11,37 @@ from pathlib import Path
 import numpy as np
 
 from dreamfleet.common.errors import MissingExtraError, UsageError
-from dreamfleet.worker.baselines.names import DISCRETE, DRQN
 from dreamfleet.worker.baselines.policies import RandomPolicy
+from dreamfleet.worker.baselines.presets import DISCRETE, DRQN
 from dreamfleet.worker.car_racing.agents import NetworkAgent, PictureAgent
 from dreamfleet.worker.car_racing.preprocessing import RAW
 
 
 @dataclass(frozen=True)
 class RandomAgent(PictureAgent):
-    """One of the random drivers; its chance is the episode's."""
+    """One of the random drivers; the episode's seed is its random seed."""
 
     name: str
 
     @property
     def sha256(self) -> str:
-        """Of its name."""
+        """The SHA-256 of its name, hexadecimal."""
         return hashlib.sha256(self.name.encode()).hexdigest()
 
     @property
     def preprocessing(self) -> str:
-        """It looks at none."""
+        """It ignores pictures, so the raw ones do."""
         return RAW.name
 
     def make_policies(self) -> Callable[[int], RandomPolicy]:
-        """At the wheel, by the chance of each episode."""
+        """Return a function from an episode's seed to a policy."""
         return lambda seed: RandomPolicy(np.random.default_rng(seed), discrete=self.name == DISCRETE)
 
 
 def find_baseline(name: str, data: Path | None) -> PictureAgent:
-    """A baseline by name; the network lies in the folder `data` of its training, and drives as it would exported.
+    """Return the baseline `name`; the network is loaded from `data`, its training's folder, as export would write it.
 
-    `UsageError` where a folder is missing or needless, `DatasetError` for a checkpoint that is damaged or no agent's.
+    `UsageError` for a missing or superfluous folder, `DatasetError` for a damaged or foreign checkpoint.
     """
     if name != DRQN:
         if data is not None:
@@ -51,8 +51,8 @@ def find_baseline(name: str, data: Path | None) -> PictureAgent:
         raise UsageError(f"{DRQN} needs --data: the folder in which `dreamfleet baseline train {DRQN}` keeps it")
     if find_spec("torch") is None:
         raise MissingExtraError(
-            f"{DRQN} needs torch, which is not installed: pip install 'dreamfleet[train]'; what `dreamfleet baseline "
-            "export` wrote needs none: `dreamfleet evaluate --controller FILE`"
+            f"{DRQN} needs torch, which is not installed: pip install 'dreamfleet[train]'; an agent that `dreamfleet "
+            "baseline export` wrote needs no torch: `dreamfleet evaluate --controller FILE`"
         )
     from dreamfleet.worker.baselines.export import export_agent
 

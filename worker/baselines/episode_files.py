@@ -1,4 +1,4 @@
-"""The driven episodes of a training on disk, one file each: what replay is filled from when a training goes on."""
+"""A training's episodes on disk, one file each: a resumed training refills its replay buffer from them."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.archives import ArchiveLimits, read_arrays
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.worker.baselines.replay_buffer import Episode
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
 
 _LIMITS = ArchiveLimits(4 << 30, members=4)
 NAMES = ("picture", "choice", "reward", "terminal")
 
 
 def episode_file(folder: Path, number: int) -> Path:
-    """Where an episode lies."""
+    """The path of an episode's file."""
     return folder / "replay" / f"{number:06d}.npz"
 
 
 def save_episode(folder: Path, number: int, episode: Episode) -> None:
-    """Write an episode, whole or not at all; `DatasetError` where there is no room."""
+    """Write an episode atomically; `DatasetError` if it cannot be written."""
     path = episode_file(folder, number)
     with explain_write_errors(path), atomic_write(path) as file:
         np.savez_compressed(file, **{name: np.asarray(getattr(episode, name)) for name in NAMES})  # type: ignore[arg-type]
 
 
 def load_episode(folder: Path, number: int, picture: int) -> Episode:
-    """Read an episode with pictures of this size; `DatasetError` for a file that is missing, damaged or of another."""
+    """Read an episode whose pictures have this side; `DatasetError` for a missing or damaged file, or another size."""
     path = episode_file(folder, number)
     try:
         arrays = read_arrays(path, _LIMITS, NAMES)
@@ -41,7 +41,7 @@ def load_episode(folder: Path, number: int, picture: int) -> Episode:
 
 
 def delete_episodes_before(folder: Path, first: int) -> None:
-    """Remove the episodes before the `first`."""
+    """Delete the files of the episodes with numbers below `first`."""
     for path in (folder / "replay").glob("[0-9]*.npz"):
         if path.stem < f"{first:06d}":
             path.unlink(missing_ok=True)

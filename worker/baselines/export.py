@@ -1,4 +1,4 @@
-"""What was trained, as an agent that drives without torch."""
+"""Export a trained network as an agent that drives without torch."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgen
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.worker.baselines.agent_config import AgentConfig
-from dreamfleet.worker.baselines.names import DRQN
 from dreamfleet.worker.baselines.network import Networks
+from dreamfleet.worker.baselines.presets import DRQN
 from dreamfleet.worker.baselines.progress import parse_progress
 from dreamfleet.worker.baselines.train import CHECKPOINT
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
-from dreamfleet.worker.training.data.world import WORLD, preprocessing_of_size
+from dreamfleet.worker.training.data.dataset import WORLD, preprocessing_of_size
 from dreamfleet.worker.worldmodel.mdnrnn_graph import Weights, lstm
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 
 
 def export_agent(folder: Path) -> TrainedAgent:
-    """The agent of a training's last checkpoint; `UsageError` where there is none, `DatasetError` for a damaged one."""
+    """Return the agent of a training's last checkpoint; `UsageError` if there is none, `DatasetError` if damaged."""
     path = folder / CHECKPOINT
     if not path.exists():
         raise UsageError(f"no agent at {path}: train one with `dreamfleet baseline train {DRQN} --data {folder}`")
@@ -54,9 +54,10 @@ def export_agent(folder: Path) -> TrainedAgent:
 
 
 def export_network(weights: Weights, config: AgentConfig) -> bytes:
-    """One decision: `picture` (N, side, side, 3) uint8 and `state` (N, 2 x hidden) to `worth` (N, choices), Q(s, a).
+    """Return the ONNX graph of one decision.
 
-    The state is the LSTM's, hidden and cell, zero as an episode begins; `next_state` is that of the next decision.
+    Inputs: `picture` (N, side, side, 3) uint8 and `state` (N, 2 * hidden), the LSTM's hidden and cell state, zero as an
+    episode begins. Outputs: `worth` (N, choices), the Q values, and `next_state` (N, 2 * hidden).
     """
     graph, choices = GraphBuilder("agent"), len(config.table)
     picture = graph.add_input("picture", TensorProto.UINT8, config.picture, config.picture, 3)

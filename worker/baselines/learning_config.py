@@ -1,4 +1,4 @@
-"""How the recurrent duelling network learns."""
+"""The hyperparameters of the recurrent duelling network's training."""
 
 from __future__ import annotations
 
@@ -6,43 +6,43 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.baselines.agent_config import said
 
 AT_LEAST_ONE = (
     "episodes", "steps", "batch", "trace", "n_step", "epsilon_episodes", "learn_every", "target_every", "replay",
     "report_every",
 )  # fmt: skip
-MOST = 2**63 - 1  # of whole numbers: what torch and NumPy take
-MOST_READ = 100_000  # pictures of an update: some 5 GB of 64 pixels, as numbers
+MOST = 2**63 - 1  # largest integer that torch and NumPy take
+MOST_READ = 100_000  # pictures of one update: about 5 GB at 64 pixels, as float32
 NOT_NEGATIVE = ("random_episodes", "patience", "burn_in", "clip", "seed")
 
 
 @dataclass(frozen=True)
 class LearningConfig:
-    """Amounts of one training; a decision of the agent is held for its `frame_skip` steps of the environment."""
+    """Hyperparameters of one training. A decision is one choice of the agent, repeated for `frame_skip` steps."""
 
-    episodes: int = said(1000, "to drive in all")
-    random_episodes: int = said(20, "of them at first that are driven at random, and nothing is learnt in")
-    steps: int = said(1000, "of an episode at most, in the environment's steps")
-    patience: int = said(0, "steps without a reward after which an episode is cut; 0: never")
-    batch: int = said(32, "traces an update")
-    trace: int = said(8, "decisions of a trace that are learnt from")
-    burn_in: int = said(4, "decisions before them that only warm the memory")
-    n_step: int = said(1, "rewards that are added up before the rest is foretold")
-    gamma: float = said(0.99, "what a reward is worth a decision later")
-    epsilon_first: float = said(1.0, "share of random choices after the random episodes")
-    epsilon_last: float = said(0.05, "share of random choices in the end")
-    epsilon_episodes: int = said(300, "episodes in which it falls from one to the other")
-    rate: float = said(1e-4, "of Adam")
-    clip: float = said(10.0, "norm of the gradients at most; 0: any")
-    loss: Literal["huber", "squared"] = said("huber", "of the difference from the target")
-    learn_every: int = said(4, "decisions between two updates")
-    target_every: int = said(500, "updates after which the target network becomes the online one")
-    replay: int = said(50_000, "decisions of the latest whole episodes that are learnt from")
-    goal: float = said(900.0, "training is over when the episodes of a report have this mean score")
-    report_every: int = said(5, "episodes between two reports")
-    seed: int = said(0, "makes the training")
+    episodes: int = option(1000, "total number to drive")
+    random_episodes: int = option(20, "first ones, driven at random and without learning")
+    steps: int = option(1000, "longest episode, in environment steps")
+    patience: int = option(0, "steps without a reward after which an episode is truncated; 0: never")
+    batch: int = option(32, "traces per update")
+    trace: int = option(8, "decisions of a trace that are learnt from")
+    burn_in: int = option(4, "decisions before them that only warm up the LSTM's memory")
+    n_step: int = option(1, "rewards summed before the Q value stands for the rest")
+    gamma: float = option(0.99, "discount of a reward per decision")
+    epsilon_first: float = option(1.0, "share of random choices after the random episodes")
+    epsilon_last: float = option(0.05, "share of random choices at the end")
+    epsilon_episodes: int = option(300, "episodes over which it falls from the first to the last")
+    rate: float = option(1e-4, "Adam's learning rate")
+    clip: float = option(10.0, "largest norm of the gradients; 0: no limit")
+    loss: Literal["huber", "squared"] = option("huber", "of the difference between prediction and target")
+    learn_every: int = option(4, "decisions between two updates")
+    target_every: int = option(500, "updates after which the target network becomes a copy of the online one")
+    replay: int = option(50_000, "capacity of the replay buffer in decisions; it holds whole episodes")
+    goal: float = option(900.0, "training ends when a report's episodes reach this mean score")
+    report_every: int = option(5, "episodes between two reports")
+    seed: int = option(0, "random seed of the training")
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -73,7 +73,7 @@ def _flag(name: str) -> str:
 
 
 def epsilon_of(config: LearningConfig, episode: int) -> float:
-    """The share of random choices in an episode, counted from 0: all at first, then falling in a line to the last."""
+    """The share of random choices in episode `episode` (from 0): 1 at first, then a linear decay to `epsilon_last`."""
     since = episode - config.random_episodes
     if since < 0:
         return 1.0

@@ -1,4 +1,4 @@
-"""The recurrent duelling network: pictures and what was before them to a worth of each choice."""
+"""The recurrent duelling network: from pictures and the memory of earlier ones to a Q value of each choice."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from dreamfleet.worker.baselines.agent_config import AgentConfig
-from dreamfleet.worker.baselines.equations import duelling
 
 Memory = tuple[Tensor, Tensor]
 """Hidden and cell state `(1, N, hidden)`."""
 
 
 class QNetwork(nn.Module):
-    """Convolutions, an LSTM through time, and two streams."""
+    """Convolutions, an LSTM, and the two streams of a duelling network: state value and advantages."""
 
     def __init__(self, config: AgentConfig) -> None:
         super().__init__()
@@ -29,13 +28,13 @@ class QNetwork(nn.Module):
         self.advantage = nn.Linear(config.hidden, len(config.table))
 
     def features(self, pictures: Tensor) -> Tensor:
-        """Of pictures `(N, T, side, side, 3)` in bytes: `(N, T, flat)`."""
+        """Convolve pictures `(N, T, side, side, 3)` uint8 into features `(N, T, flat)`."""
         rows, steps = pictures.shape[:2]
         flat: Tensor = self.look(pictures.flatten(0, 1).permute(0, 3, 1, 2).float() / 255)
         return flat.view(rows, steps, -1)
 
     def forward(self, features: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
-        """What each choice is worth `(N, T, choices)` along features `(N, T, flat)`, and the memory behind them."""
+        """Map features `(N, T, flat)` to Q values `(N, T, choices)`, and the memory after the last step."""
         seen, memory = self.lstm(features, memory)
         advantage = self.advantage(seen)
         if self.config.heads == "softmax":
@@ -43,7 +42,7 @@ class QNetwork(nn.Module):
         return duelling(self.value(seen), advantage), memory
 
     def warm_up(self, features: Tensor, real: Tensor) -> Memory:
-        """The memory behind a burn-in `(N, B, flat)`, without gradients; zero until a row is `real` `(N, B)`."""
+        """The memory after burn-in features `(N, B, flat)`, without gradients; zero while `real` (N, B) is 0."""
         memory = self.zero_memory(len(features), features.device)
         with torch.no_grad():
             for step in range(features.shape[1]):
@@ -52,13 +51,13 @@ class QNetwork(nn.Module):
         return memory
 
     def zero_memory(self, rows: int, device: torch.device | None = None) -> Memory:
-        """The memory as an episode begins."""
+        """The memory at the beginning of an episode."""
         zeros = torch.zeros(1, rows, self.config.hidden, device=device)
         return zeros, zeros
 
 
 class Networks(nn.Module):
-    """The network that learns, and its target: itself as it was a while ago."""
+    """The online network, which learns, and its target network: an earlier copy of it."""
 
     def __init__(self, config: AgentConfig) -> None:
         super().__init__()
@@ -67,5 +66,13 @@ class Networks(nn.Module):
         self.target = copy.deepcopy(self.online).requires_grad_(requires_grad=False)
 
     def update_target(self) -> None:
-        """Let the target be what the online network is."""
+        """Copy the online network's weights to the target network."""
         self.target.load_state_dict(self.online.state_dict())
+
+
+def duelling(value: Tensor, advantage: Tensor) -> Tensor:
+    """Wang et al. 2016 (arXiv:1511.06581), equation 9: Q(s, a) = V(s) + A(s, a) - mean over a of A(s, a).
+
+    `value` is `(..., 1)`, `advantage` and the result are `(..., choices)`.
+    """
+    return value + advantage - advantage.mean(dim=-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Baselines at the wheel: at random, or by the worth that the recurrent network gives each choice."""
+"""The baselines' policies: random actions, or epsilon-greedy by the recurrent network's Q values."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ Floats = NDArray[np.float32]
 
 
 class RandomPolicy:
-    """Each step an action drawn evenly: of the whole range, or one of gymnasium's five."""
+    """Draws each action uniformly: from the whole range, or from gymnasium's five discrete ones."""
 
     def __init__(self, random: np.random.Generator, *, discrete: bool) -> None:
         self._random, self._discrete = random, discrete
 
     def begin(self, parameters: Floats) -> None:
-        """Nothing is remembered."""
+        """Do nothing: it has no memory."""
 
     def act(self, _observation: Any) -> Floats:
-        """Steering, gas and brake `(3,)`."""
+        """Return steering, gas and brake `(3,)`."""
         if self._discrete:
             return np.array(self._random.choice(FIVE_CHOICES.choices), np.float32)
         return self._random.uniform(STEERING_GAS_BRAKE.low, STEERING_GAS_BRAKE.high).astype(np.float32)
 
 
 class QPolicy(FrameSkipPolicy):
-    """The choice of most worth, or with a chance of `epsilon` any: as it learns, on torch.
+    """Epsilon-greedy policy of the network while it learns, on torch.
 
-    The memory goes through time with each decision, also where chance decides; where it always does, nobody looks.
+    The LSTM's memory advances at each decision, random ones included. With `epsilon` 1 the network is not evaluated.
     """
 
     def __init__(self, network: QNetwork, epsilon: float = 0.0, random: np.random.Generator | None = None) -> None:
-        """`random` is needed where `epsilon` is not 0."""
+        """`random` is needed unless `epsilon` is 0."""
         super().__init__(network.config.table, network.config.frame_skip)
         self._network, self._epsilon, self._random = network, epsilon, random
         self._memory: Memory | None = None
 
     def reset_memory(self) -> None:
-        """Nothing is remembered."""
+        """Forget the last episode."""
         self._memory = None
 
     def choose(self, picture: NDArray[np.uint8]) -> int:
-        """The best, or any."""
+        """Return the number of the best choice, or of a random one."""
         best = self._best(picture) if self._epsilon < 1 else 0
         if self._random is not None and self._random.random() < self._epsilon:
             return int(self._random.integers(len(self._network.config.table)))

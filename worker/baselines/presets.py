@@ -1,4 +1,4 @@
-"""Named settings of the recurrent duelling network."""
+"""The names of the baselines, and the presets of the recurrent duelling network."""
 
 from __future__ import annotations
 
@@ -8,19 +8,21 @@ from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 
+RANDOM, DISCRETE, DRQN = NAMES = ("random", "random-discrete", "drqn")
+
 
 @dataclass(frozen=True)
 class BaselinePreset:
-    """What it is, and how it learns."""
+    """A network's layers and the hyperparameters of its training."""
 
     name: str
     agent: AgentConfig
     learning: LearningConfig
 
 
-# The settings of a notebook as they were handed down (docs/sources.md). Its rate, the sizes of its layers and replay,
-# how often it learns and how often its target follows are ours. Its LSTM sees single transitions, its advantages lie
-# between 0 and 1, and full gas spins the car: it stays at about -20 to -60.
+# A notebook's settings (docs/sources.md). It does not give learning rate, layer sizes, replay size, and how often it
+# learns and copies the target: these are ours. Its LSTM sees single transitions, its advantages lie between 0 and 1,
+# and full gas spins the car, so that its score stays at about -20 to -60.
 NOTEBOOK = BaselinePreset(
     name="notebook",
     agent=AgentConfig(picture=96, choices="notebook", heads="softmax", channels=(16, 32, 32), hidden=128),
@@ -40,5 +42,5 @@ PRESETS = {preset.name: preset for preset in (LEARNING, NOTEBOOK)}
 
 
 def find_preset(name: str) -> BaselinePreset:
-    """The preset of that name; `UsageError` lists those that exist."""
+    """Return the preset `name`; `UsageError` lists those that exist."""
     return PRESETS[check_preset("baseline", name)]

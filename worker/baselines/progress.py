@@ -1,4 +1,4 @@
-"""How far a training has come, and its reports of episodes."""
+"""A training's progress, as its checkpoint keeps it, and the reports over groups of episodes."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from dreamfleet.common.serialization.validation import MalformedError, from_plai
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """What is kept of an episode."""
+    """The figures of one driven episode."""
 
     score: float
     steps: Count  # of the environment
     decisions: Count
     epsilon: float
-    loss: float | None  # mean of its updates; `None` where nothing is learnt
+    loss: float | None  # mean of its updates; `None` without any
 
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """Updates and episodes of a training, the first of these that replay holds, and how it learns."""
+    """Updates and episodes of a training, the oldest episode in the replay buffer, and the hyperparameters."""
 
     update: Count
     oldest: Count
@@ -36,7 +36,7 @@ class TrainingProgress:
 
 
 def parse_progress(path: Path, plain: Any) -> TrainingProgress:
-    """The progress that the checkpoint at `path` keeps; `DatasetError` for what is none."""
+    """Parse the progress `plain` of the checkpoint at `path`; `DatasetError` if it is malformed."""
     try:
         found = from_plain(TrainingProgress, plain)
         if found.oldest > len(found.episodes):
@@ -48,11 +48,11 @@ def parse_progress(path: Path, plain: Any) -> TrainingProgress:
 
 @dataclass(frozen=True)
 class TrainingReport:
-    """The episodes up to `episode`, since the last report."""
+    """Means over the episodes since the last report, up to number `episode`."""
 
     episode: int
-    mean: float  # score of these episodes, under their share of random choices
-    most: float
+    mean: float  # score, random choices included
+    most: float  # the best score
     epsilon: float  # of the last one
     loss: float | None
 
@@ -62,13 +62,13 @@ class TrainingReport:
 
 
 def make_reports(records: Sequence[EpisodeRecord], every: int) -> list[TrainingReport]:
-    """A report for each whole group of `every` episodes."""
+    """Return a report for each complete group of `every` episodes."""
     ends = range(every, len(records) + 1, every)
     return [_report(records[end - every : end], end) for end in ends]
 
 
 def is_goal_reached(records: Sequence[EpisodeRecord], every: int, goal: float) -> bool:
-    """Whether the episodes of a report had a mean score of `goal`."""
+    """Whether the mean score of any report is at least `goal`."""
     return any(each.mean >= goal for each in make_reports(records, every))
 
 

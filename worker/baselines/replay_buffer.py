@@ -1,4 +1,4 @@
-"""Replay of episode traces: what was seen, chosen and earned, in the order in which it was."""
+"""The replay buffer: whole episodes, sampled as traces of consecutive decisions."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from dreamfleet.worker.baselines.learning_config import LearningConfig
 
 @dataclass(frozen=True)
 class Episode:
-    """T decisions: `picture` (T, side, side, 3) before each `choice` (T,), the `reward` (T,) until the next one."""
+    """T decisions: `picture` (T, side, side, 3) before each `choice` (T,), `reward` (T,) summed until the next one."""
 
     picture: NDArray[np.uint8]
     choice: NDArray[np.int64]
     reward: NDArray[np.float32]
-    terminal: bool  # the environment ended it; false where it was only cut
+    terminal: bool  # ended by the environment; false if truncated
 
     def __len__(self) -> int:
         return len(self.choice)
@@ -27,21 +27,21 @@ class Episode:
 
 @dataclass(frozen=True)
 class TraceBatch:
-    """N traces of one episode each: B decisions of burn-in, L that are learnt from, n that only follow.
+    """N traces, each from one episode: B decisions of burn-in, L to learn from, n more for the n-step target.
 
-    What lies beyond an episode's ends is zero. A row of the burn-in that is not `real` lies before its beginning.
+    Entries outside the episode are zero; `real` is 0 for a burn-in step before its beginning.
     """
 
     picture: NDArray[np.uint8]  # (N, B + L + n, side, side, 3)
     real: NDArray[np.float32]  # (N, B)
     choice: NDArray[np.int64]  # (N, L)
-    value: NDArray[np.float32]  # (N, L), as the following two as `Returns` has it
+    value: NDArray[np.float32]  # (N, L), as `Returns.value`; likewise `discount`
     discount: NDArray[np.float32]  # (N, L)
-    mask: NDArray[np.float32]  # (N, L): 1 where something is learnt
+    mask: NDArray[np.float32]  # (N, L), `Returns.known` as 0 or 1
 
 
 class ReplayBuffer:
-    """The latest episodes, as many as `config.replay` decisions hold, and one at least."""
+    """The latest whole episodes: at most `config.replay` decisions, but always one episode."""
 
     def __init__(self, config: LearningConfig) -> None:
         self._config = config
@@ -52,7 +52,7 @@ class ReplayBuffer:
         return len(self._episodes)
 
     def add(self, episode: Episode) -> None:
-        """Take in a whole episode; the oldest leave."""
+        """Add a whole episode and drop the oldest ones beyond the capacity."""
         config = self._config
         returns = n_step(episode.reward, episode.terminal, config.gamma, config.n_step)
         self._episodes.append((episode, returns))
@@ -61,7 +61,7 @@ class ReplayBuffer:
             self._decisions -= len(self._episodes.popleft()[0])
 
     def sample(self, random: np.random.Generator) -> TraceBatch | None:
-        """A batch of traces, an episode as likely as it is long; `None` while there is nothing to learn from."""
+        """Sample a batch of traces, episodes in proportion to their length; `None` while no decision has a target."""
         usable = np.array([int(returns.known.sum()) for _, returns in self._episodes])
         if not usable.any():
             return None
@@ -85,7 +85,7 @@ class ReplayBuffer:
 
 
 def slice_padded(array: NDArray[Any], first: int, end: int) -> NDArray[Any]:
-    """Rows `first` to `end` of an episode's array; rows that it does not have are zero."""
+    """Rows `first` to `end` (exclusive) of an episode's array, with zeros for rows outside it."""
     out = np.zeros((end - first, *array.shape[1:]), array.dtype)
     begin, stop = max(first, 0), min(end, len(array))
     out[begin - first : stop - first] = array[begin:stop]
@@ -93,7 +93,7 @@ def slice_padded(array: NDArray[Any], first: int, end: int) -> NDArray[Any]:
 
 
 def first_in_replay(lengths: list[int], most: int) -> int:
-    """Of episodes of these lengths, the first of the latest that hold at most so many decisions; the last one stays."""
+    """Index of the oldest episode to keep: from it on all episodes hold at most `most` decisions. The last is kept."""
     total = 0
     for index in range(len(lengths) - 1, -1, -1):
         total += lengths[index]
@@ -106,18 +106,18 @@ Floats = NDArray[np.float32]
 
 
 class Returns(NamedTuple):
-    """Of an episode of T decisions, each `(T,)`."""
+    """The n-step returns of an episode of T decisions, each field `(T,)`."""
 
-    value: Floats  # discounted rewards of the next n decisions, as far as there are any
-    discount: Floats  # what the best choice behind them is multiplied by; 0 where the episode had ended
-    known: NDArray[np.bool_]  # false where the episode was cut before the n decisions were over
+    value: Floats  # discounted sum of the next n rewards, fewer at the episode's end
+    discount: Floats  # factor of the Q value n decisions later; 0 if the episode is over by then
+    known: NDArray[np.bool_]  # false if the episode was truncated within the n decisions
 
 
 def n_step(reward: NDArray[Any], terminal: bool, gamma: float, n: int) -> Returns:
     """Sutton & Barto 2018, equation 7.1: R_t = r_t + gamma r_t+1 + ... + gamma^(n-1) r_t+n-1, then gamma^n Q(t + n).
 
-    Behind a terminal there is nothing to foretell. Where an episode was only cut, by a limit of steps or by patience,
-    the last n decisions have no successor that was seen, and nothing is learnt from them.
+    After a terminal no Q value follows. If the episode was truncated, by the step limit or by patience, the last n
+    decisions have no recorded successor, so they are not learnt from.
     """
     length = len(reward)
     padded = np.concatenate([np.asarray(reward, np.float64), np.zeros(n)])

@@ -1,4 +1,4 @@
-"""Training the recurrent duelling double network in CarRacing, from rewards alone."""
+"""Train the recurrent duelling double Q network in CarRacing, from rewards alone."""
 
 from __future__ import annotations
 
@@ -37,30 +37,30 @@ from dreamfleet.worker.car_racing.agents import NO_PARAMETERS
 from dreamfleet.worker.car_racing.native_check import make_car_racing
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, run_episode
 from dreamfleet.worker.training.checkpoint import load_checkpoint, save_checkpoint
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
-from dreamfleet.worker.training.data.world import preprocessing_of_size
-from dreamfleet.worker.training.one_thread import on_one_thread
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
+from dreamfleet.worker.training.data.dataset import preprocessing_of_size
+from dreamfleet.worker.training.torch_setup import on_one_thread
 from dreamfleet.worker.training.training_state import disable_triton_after_mesa, resume_command
 
 CHECKPOINT, CURVE, LOCK = "drqn.safetensors", "drqn.jsonl", "drqn.lock"
 
 OnEpisode = Callable[[int, TrainingReport | None], None]
-"""Told the episodes that are driven, and a report where one is due."""
+"""Called after each episode with the number driven, and a report when one is due."""
 
 
 def ignore_episode(_episodes: int, _report: TrainingReport | None) -> None:
-    """Nobody listens."""
+    """Do nothing: the default `OnEpisode`."""
 
 
 def train_drqn(
     folder: Path, layers: AgentConfig, config: LearningConfig, on_episode: OnEpisode = ignore_episode,
     device: torch.device | None = None, stop: Stop = never_stop, new: bool = False,
 ) -> dict[str, float]:  # fmt: skip
-    """Train, or go on, to `config.episodes` or the goal; returns the figures of the training.
+    """Train, or resume, up to `config.episodes` or the goal; return the figures of the training.
 
-    A checkpoint follows each episode, and everything in an episode follows from the seed, its number and the checkpoint
-    before it: whoever is stopped or killed drives the episode again, to the same bits. `StoppedError` if `stop` asks,
-    `UsageError` while another process trains in the folder: the two would drop each other's episodes.
+    A checkpoint is written after each episode, and an episode depends on the seed, its number and the checkpoint before
+    it alone: a resumed training repeats an interrupted episode bit for bit. `StoppedError` if `stop` asks for a stop.
+    `UsageError` while another process trains in the folder: each would delete the other's episodes.
     """
     with folder_lock(folder / LOCK, "training"), on_one_thread():
         training = AgentTraining(folder, layers, config, device, new)
@@ -76,7 +76,7 @@ def train_drqn(
 
 
 class AgentTraining:
-    """Networks, replay and what was driven so far, in memory and on disk."""
+    """The state of a training: networks, replay buffer and episodes, in memory and on disk."""
 
     def __init__(
         self, folder: Path, layers: AgentConfig, config: LearningConfig, device: torch.device | None, new: bool
@@ -87,7 +87,7 @@ class AgentTraining:
         disable_triton_after_mesa()
         self._optimiser = torch.optim.Adam(self._networks.online.parameters(), lr=config.rate)
         self._records: list[EpisodeRecord] = []
-        self._oldest = 0  # the first episode that replay holds
+        self._oldest = 0  # first episode in the replay buffer
         self._replay = ReplayBuffer(config)
         plain = None if new else load_checkpoint(self._path, self._networks, self._optimiser)
         found = None if plain is None else parse_progress(self._path, plain)
@@ -101,24 +101,24 @@ class AgentTraining:
 
     @property
     def episodes(self) -> int:
-        """Driven so far."""
+        """How many episodes are driven so far."""
         return len(self._records)
 
     @property
     def done(self) -> bool:
-        """Whether all episodes are driven, or the goal is reached."""
+        """Whether all episodes are driven or the goal is reached."""
         config = self._config
         return self.episodes >= config.episodes or is_goal_reached(self._records, config.report_every, config.goal)
 
     @property
     def report(self) -> TrainingReport | None:
-        """The report that is due behind the last episode."""
+        """The report due after the last episode, or `None`."""
         due = self.episodes % self._config.report_every == 0
         return make_reports(self._records, self._config.report_every)[-1] if due else None
 
     @property
     def figures(self) -> dict[str, float]:
-        """Of the whole training: episodes, updates, mean of the last report's episodes, best report."""
+        """Figures of the whole training: episodes, updates, mean score of the last report and of the best one."""
         every = self._config.report_every
         means = [each.mean for each in make_reports(self._records, every)] or [self._records[-1].score]
         goal = is_goal_reached(self._records, every, self._config.goal)
@@ -126,7 +126,7 @@ class AgentTraining:
                 "best_mean_score": round(max(means), 2), "goal_reached": goal}  # fmt: skip
 
     def drive(self, stop: Stop) -> None:
-        """Drive the next episode and learn from those before it; it joins them in replay."""
+        """Drive the next episode while learning from earlier ones, then add it to the replay buffer."""
         number, config = self.episodes, self._config
         random = np.random.default_rng([config.seed, number])
         epsilon = epsilon_of(config, number)
@@ -149,7 +149,7 @@ class AgentTraining:
         self._records.append(EpisodeRecord(drive.score, drive.steps, len(episode), epsilon, loss))
 
     def save(self) -> None:
-        """Write the checkpoint, then the curve that follows from it; drop the episodes that nothing needs any more."""
+        """Write the checkpoint, then the curve that follows from it; delete episodes that left the replay buffer."""
         self._oldest = max(self._oldest, self._first_to_keep)
         progress = TrainingProgress(self._learner.updates, self._oldest, tuple(self._records), asdict(self._config))
         save_checkpoint(self._path, self._networks, self._optimiser, asdict(progress))
@@ -191,7 +191,7 @@ class AgentTraining:
 
 
 class EpisodeRecorder:
-    """An episode while it is driven: steps of the environment become decisions of the agent."""
+    """Records an episode while it is driven, grouping environment steps into decisions."""
 
     def __init__(self) -> None:
         self._pictures: list[Any] = []
@@ -202,11 +202,11 @@ class EpisodeRecorder:
 
     @property
     def decisions(self) -> int:
-        """Made so far."""
+        """The number of decisions so far."""
         return len(self._choices)
 
     def see(self, moment: Transition, policy: QPolicy) -> None:
-        """One step; its reward belongs to the decision that is held."""
+        """Record one step; its reward counts for the decision in force."""
         if policy.is_new_decision:
             self._pictures.append(moment.seen)
             self._choices.append(policy.choice)
@@ -217,6 +217,6 @@ class EpisodeRecorder:
 
     @property
     def episode(self) -> Episode:
-        """The whole of it."""
+        """The recorded episode."""
         choices, rewards = np.array(self._choices, np.int64), np.array(self._rewards, np.float32)
         return Episode(np.stack(self._pictures), choices, rewards, self._terminal)

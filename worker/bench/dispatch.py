@@ -1,4 +1,4 @@
-"""Measuring the coordinator: how near to ideal it keeps its slots busy, and how many jobs a second it can judge."""
+"""Benchmark the coordinator: how close to ideal it keeps its slots busy, and how many jobs per second it handles."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from dreamfleet.worker.bench.sleep_tasks import NULL_TASK, SLEEP_SECONDS, SLEEP_
 
 SLOTS = 8
 CANDIDATES = 200
-GENERATIONS = 6  # the first is not counted: workers join in it
-NULL_JOBS = 4096  # a generation: 64 candidates x 64 episodes
+GENERATIONS = 6  # the first is not counted: workers join during it
+NULL_JOBS = 4096  # per generation: 64 candidates x 64 episodes
 RUN_SECONDS = 300.0
 PEER_SECONDS = 120.0
 ROUNDS = -(-CANDIDATES // SLOTS)
@@ -33,7 +33,10 @@ Figures = dict[str, Any]
 
 
 def bench_dispatch(crowd: int) -> Figures:
-    """50 ms jobs on 8 real slots, null jobs on simulated workers, `crowd` of these; peers where installed."""
+    """Measure 50 ms jobs on 8 real slots, null jobs on simulated workers, and installed peers (pool, Dask, Ray).
+
+    `crowd` is a number of simulated workers for a third run; 0: none.
+    """
     naps, null = measure_sleep_jobs(), measure_null_jobs()
     peers: dict[str, Figures | None] = {}
     for name, run in (("pool", pool_peer), ("dask", dask_peer), ("ray", ray_peer)):
@@ -51,21 +54,21 @@ def bench_dispatch(crowd: int) -> Figures:
 
 
 def measure_sleep_jobs() -> float:
-    """The ideal makespan of a generation of 50 ms jobs over the measured one, from real workers."""
+    """The ideal makespan of a generation of 50 ms jobs divided by the measured one, on a real worker."""
     with BenchRun(SLEEP_TASK, CANDIDATES, 1) as run, run.workers("--task", SLEEP_TASK, "--slots", SLOTS):
         run.finish()
         return ROUNDS * SLEEP_SECONDS / run.generation_seconds()
 
 
 def measure_null_jobs() -> Figures:
-    """Jobs a second that cost their workers nothing: two simulated workers of 32 slots each."""
+    """Jobs per second of empty jobs on two simulated workers of 32 slots each, and the coordinator's peak memory."""
     with BenchRun(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(2, 32):
         run.finish()
         return {"jobs_per_second": NULL_JOBS / run.generation_seconds(), "rss_mb": run.peak_mb}
 
 
 def measure_crowd(count: int) -> Figures:
-    """Simulated workers of one slot each join, work and leave."""
+    """Figures of a run in which `count` simulated workers of one slot each join, work and leave."""
     started = time.monotonic()
     with BenchRun(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(count, 1):
         run.finish()
@@ -78,7 +81,7 @@ def measure_crowd(count: int) -> Figures:
 
 
 class BenchRun:
-    """A real coordinator, in a process and a folder of its own, of a run that ends by itself."""
+    """A real coordinator in its own process and folder, with a run that ends after `GENERATIONS` generations."""
 
     def __init__(self, task: str, population: int, episodes: int) -> None:
         with socket.socket() as free:
@@ -103,12 +106,12 @@ class BenchRun:
         self._stack.close()
 
     def workers(self, *arguments: object) -> AbstractContextManager[object]:
-        """A real worker."""
+        """Start a real worker; the context manager stops it."""
         return VerbProcess("worker", "--connect", self.endpoint, *arguments)
 
     @contextmanager
     def crowd(self, count: int, slots: int) -> Iterator[None]:
-        """Simulated workers, in one process."""
+        """Start `count` simulated workers in one process."""
         process = get_context("spawn").Process(
             target=run_simulated_workers, args=(self.endpoint, count, slots), daemon=True
         )
@@ -120,7 +123,7 @@ class BenchRun:
             process.join()
 
     def finish(self) -> None:
-        """Wait for the run's end."""
+        """Wait until the run ends; `DreamfleetError` if it fails or takes too long."""
         deadline = time.monotonic() + RUN_SECONDS
         while self._coordinator.poll() is None:
             self.peak_mb = max(self.peak_mb, _resident_mb(self._coordinator.pid))
@@ -131,7 +134,7 @@ class BenchRun:
             raise DreamfleetError("the run's coordinator failed")
 
     def generation_seconds(self) -> float:
-        """The median makespan of a generation, without the first, in which workers join."""
+        """The median makespan of a generation, in seconds; the first one, in which workers join, is left out."""
         with open_run(Path(self._runs), "bench") as run:
             return statistics.median(each.seconds for each in run.history()[1:])
 
@@ -147,13 +150,13 @@ def _resident_mb(pid: int) -> float:
 
 
 def sleep_job(_index: int) -> int:
-    """A 50 ms job."""
+    """Sleep for 50 ms."""
     time.sleep(SLEEP_SECONDS)
     return 0
 
 
 def null_job(_index: int) -> int:
-    """A null job."""
+    """Do nothing."""
     return 0
 
 
@@ -162,7 +165,7 @@ Peer = Callable[[], AbstractContextManager[Mapper]]
 
 
 def run_peer(peer: Peer) -> Figures | None:
-    """A peer's figures, measured in a process of its own; `None` if it hangs or fails."""
+    """Measure a peer in its own process; `None` if it hangs or fails."""
     ours, theirs = get_context("spawn").Pipe(duplex=False)
     process = get_context("spawn").Process(target=_send_figures, args=(theirs, peer))
     process.start()
@@ -182,9 +185,9 @@ def _send_figures(pipe: Connection[Figures, Any], peer: Peer) -> None:
 
 
 def peer_figures(peer: Peer) -> Figures:
-    """The same two measures of a peer with 8 processes."""
+    """Measure the same two figures of a peer with 8 processes."""
     with peer() as run:
-        run(null_job, 100)  # its processes are up
+        run(null_job, 100)  # starts its processes
         started = time.perf_counter()
         run(sleep_job, CANDIDATES)
         makespan = time.perf_counter() - started
@@ -199,7 +202,7 @@ def peer_figures(peer: Peer) -> Figures:
 
 @contextmanager
 def pool_peer() -> Iterator[Mapper]:
-    """The standard library's pool, a job a message."""
+    """The standard library's pool, one job per message."""
     with get_context("spawn").Pool(SLOTS) as pool:
         yield lambda work, count: pool.map(work, range(count), chunksize=1)
 
@@ -217,7 +220,7 @@ def dask_peer() -> Iterator[Mapper]:
 
 @contextmanager
 def ray_peer() -> Iterator[Mapper]:
-    """A local Ray."""
+    """A local Ray cluster."""
     ray: Any = import_module("ray")
     ray.init(num_cpus=SLOTS, include_dashboard=False, log_to_driver=False)
     try:

@@ -1,4 +1,4 @@
-"""Measuring the dream against its floor and against torch, in one process and alternating blocks."""
+"""Benchmark the dream against its matrix products alone and against torch, in one process and alternating blocks."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import numpy as np
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.bench.matrix_products import Size, fastest, product_cases
-from dreamfleet.worker.bench.timing import TimedCall, time_alternately
+from dreamfleet.worker.bench.measurement import TimedCall, time_alternately
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.tasks.api import Episode
 
 BATCHES = (1, 256, 1024)
-CANDIDATES = 64  # of a batch, where it has room for so many
-TILE = 256  # rows of the floor and of torch's step
+CANDIDATES = 64  # of a batch; fewer in smaller batches
+TILE = 256  # rows of the matrix products and of torch's step
 HORIZON = 64  # steps of a measured dream
 
 
 def bench_dream(bundle: Bundle) -> dict[str, Any]:
-    """Dreamed steps a second by batch, whole: noise, controllers, reward and sums included.
+    """Measure dreamed steps per second by batch size, with noise, controllers, reward and sums.
 
-    `of_floor`: at 256, the time of the step's matrix products alone, at their own sizes, each by the library that is
-    fastest at it on this core, over the time of the whole; activations, chance, sums and Python count nothing.
-    `torch_naive_ratio`: over a step of torch's modules and distributions at 256.
+    `of_floor`: at batch 256, the time of the step's matrix products alone divided by the time of the whole step. Each
+    product runs at its own size in the library that is fastest at it on this core.
+    `torch_naive_ratio`: the time of a step of torch modules and distributions at batch 256, divided by ours.
     """
     dreamer = DreamBatch(bundle, TaskSpec("dream", bundle.sha256, HORIZON, 0, temperature=1.25))
     random = np.random.default_rng(0)
@@ -60,7 +60,7 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
 
 
 def product_sizes(bundle: Bundle) -> tuple[Size, ...]:
-    """The matrix products of one step of `TILE` rows: the LSTM's four gates in one, the heads', the controllers'."""
+    """The sizes of one step's matrix products at `TILE` rows: the LSTM's four gates, the heads, the controllers."""
     manifest = bundle.manifest
     features = manifest.latent + manifest.hidden
     outputs = 3 * int(manifest.models["mdnrnn"]["mixtures"]) * manifest.latent + 1

@@ -1,4 +1,4 @@
-"""Measuring the environment against gymnasium's own, and proving the two equal."""
+"""Benchmark our CarRacing against gymnasium's, and check that the two are equal."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ Policy = Callable[[NDArray[np.uint8]], Any]
 
 
 def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
-    """Whole driven episodes, reset and opening zoom included, of every kind in turn; ratios of medians of time a step.
+    """Time whole episodes of each case in turn, reset and opening zoom included; return ratios of median step times.
 
-    Every kind drives the same actions, which the shipped controller chose on that track beforehand.
+    All cases repeat the same actions, which the shipped controller chose on that track beforehand.
     """
     cases, notes = _cases(bundle)
     times: dict[str, list[float]] = {name: [] for name in cases}
@@ -57,7 +57,7 @@ def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
 
 
 def _cases(bundle: Bundle) -> tuple[dict[str, Callable[[RecordedDrive], float]], list[str]]:
-    """What is measured, by name, and what is not for want of a package."""
+    """The cases to measure by name, and a note for each case that lacks a package."""
     task, assignment = CarRacingTask(), Assignment.of(CarRacingTask.name, bundle)
     cases: dict[str, Callable[[RecordedDrive], float]] = {
         "gymnasium": lambda recorded_drive: seconds_a_step(gymnasium.make("CarRacing-v3"), recorded_drive),
@@ -86,14 +86,14 @@ def _cases(bundle: Bundle) -> tuple[dict[str, Callable[[RecordedDrive], float]],
 
 @dataclass(frozen=True)
 class RecordedDrive:
-    """A track and what was done on it."""
+    """A track's seed and the actions of a drive on it, each `(3,)`."""
 
     seed: int
     actions: list[NDArray[np.float32]]
 
 
 def record_drive(seed: int) -> RecordedDrive:
-    """What the shipped controller does on a track; it ends with the lap, or after 1000 steps."""
+    """Record the shipped controller on a track until the lap ends, or for 1000 steps."""
     policy, controller = shipped_driver(find_bundle("tiny"))
     policy.begin(controller.parameters)
     environment = make_car_racing(preprocessing=BOX.name)
@@ -103,7 +103,7 @@ def record_drive(seed: int) -> RecordedDrive:
 
 
 def drive_lap(seed: int) -> RecordedDrive:
-    """A drive that touches every tile: towards a point ahead on the middle of the road, which the environment knows."""
+    """Drive a whole lap that touches every tile by steering towards a point ahead on the environment's centre line."""
     environment = make_car_racing(preprocessing=BOX.name, max_episode_steps=4 * STEPS)
     environment.reset(seed=seed)
     inner: Any = environment.unwrapped
@@ -131,7 +131,7 @@ def drive_lap(seed: int) -> RecordedDrive:
 def seconds_a_step(
     environment: gymnasium.Env[Any, Any], recorded_drive: RecordedDrive, policy: Policy | None = None
 ) -> float:
-    """One episode from its reset on. What the policy answers costs its time and is not driven."""
+    """Seconds per step of one episode, reset included. The policy's time counts, its actions are not used."""
     started = perf_counter()
     observation, _ = environment.reset(seed=recorded_drive.seed)
     for action in recorded_drive.actions:
@@ -144,14 +144,14 @@ def seconds_a_step(
 
 
 def make_random_controller(bundle: Bundle) -> Policy:
-    """A controller at work, its parameters at random."""
+    """A policy of the bundle with random parameters."""
     policy = CarRacingPolicy(bundle)
     policy.begin(np.random.default_rng(0).normal(0, 0.1, bundle.controller_shape.size).astype(np.float32))
     return policy.act
 
 
 def make_torch_controller(bundle: Bundle) -> Policy:
-    """The same work in torch, one operation at a time, on a picture of its own."""
+    """The same policy step in torch, one operation at a time, on a fixed picture."""
     from dreamfleet.worker.bench.torch_steps import make_torch_step
 
     parameters = np.zeros((1, bundle.controller_shape.size), np.float32)
@@ -160,7 +160,7 @@ def make_torch_controller(bundle: Bundle) -> Policy:
 
 
 def envpool_seconds_a_step(recorded_drive: RecordedDrive) -> float:
-    """EnvPool's CarRacing, one environment; not the same pixels, and the same actions on tracks of its own."""
+    """Seconds per step of one EnvPool CarRacing under the same actions; its pixels and tracks differ from ours."""
     import envpool
 
     environment = envpool.make("CarRacing-v3", env_type="gymnasium", num_envs=1, seed=recorded_drive.seed)
@@ -172,7 +172,7 @@ def envpool_seconds_a_step(recorded_drive: RecordedDrive) -> float:
 
 
 def check_exact(bundle: Bundle) -> Iterator[tuple[str, Mismatch | None]]:
-    """Every kind of episode beside gymnasium's own; yields what was driven and the first difference."""
+    """Compare each kind of episode with gymnasium's; yield a description and the first difference, or `None`."""
     for seed in range(20):
         yield f"random, seed {seed}, 400 steps", compare(seed, 400, random_action)
     for seed in range(5):
@@ -189,19 +189,19 @@ def check_exact(bundle: Bundle) -> Iterator[tuple[str, Mismatch | None]]:
 
 
 def random_discrete_action(_step: int, _picture: Any, random: np.random.Generator) -> int:
-    """Any of the five discrete actions, gas more often."""
+    """A random one of the five discrete actions, gas more often than the others."""
     return int(random.choice(5, p=[0.1, 0.2, 0.2, 0.4, 0.1]))
 
 
 def make_driver(bundle: Bundle) -> ActionSource:
-    """The shipped controller, which drives."""
+    """The shipped controller as a source of actions."""
     policy, controller = shipped_driver(bundle)
     policy.begin(controller.parameters)
     return lambda _step, picture, _random: policy.act(picture)
 
 
 def shipped_driver(bundle: Bundle) -> tuple[CarRacingPolicy, Controller]:
-    """A bundle's policy and the controller that ships with it."""
+    """A bundle's policy and the controller shipped with it; `ControllerError` if it belongs to another bundle."""
     controller = Controller.load(pretrained_folder() / f"{bundle.manifest.name}.npz")
     if controller.bundle != bundle.sha256:
         raise ControllerError(f"the shipped controller {bundle.manifest.name} is not of {bundle.path}")

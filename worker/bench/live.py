@@ -1,4 +1,4 @@
-"""What the live view costs: the loop that nobody watches against one that knows of none, and a watched slot's turn."""
+"""Benchmark the live view: the cost of its code while nobody watches, and of a watched slot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.messages import Intervals, Job, TaskSpec
 from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.worker.bench.timing import TimedCall, time_alternately
+from dreamfleet.worker.bench.measurement import TimedCall, time_alternately
 from dreamfleet.worker.scoring.episode import score
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service.admission import Admission
@@ -29,8 +29,8 @@ from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
 
 RUN, WORKER = "bench", "bench/00000000"
-TASKS = {"car-racing": 1, "dream": 256}  # jobs of a turn
-HORIZON = 200  # steps of an episode: a turn lasts some tenths of a second, in which a few frames are shown
+TASKS = {"car-racing": 1, "dream": 256}  # jobs per turn
+HORIZON = 200  # steps of an episode: a turn takes some tenths of a second, long enough for a few frames
 SEED = 2**20
 ADMISSION = Admission(RUN, "0" * 32, 1, "bench", TaskSpec("car-racing", "", HORIZON, 0), Intervals())
 Figures = dict[str, Any]
@@ -38,10 +38,11 @@ Floats = NDArray[np.float32]
 
 
 def bench_live(bundle: Bundle) -> Figures:
-    """For each task the time of a turn over that of the same turn without.
+    """Measure, for each task, how much longer a turn (one group of jobs) takes with the live view.
 
-    `unwatched`: a slot's scorer over the task's bare loop. `watched`: a real slot whose frames go through a router to a
-    subscriber, over the same slot while nobody subscribes; `frames_per_second` are those that arrived meanwhile.
+    `unwatched`: time of a slot's scorer divided by that of the task's bare loop. `watched`: time of a real slot whose
+    frames go through a router to a subscriber, divided by the same slot's without one. `frames_per_second`: the frames
+    that arrived during watched turns.
     """
     figures: Figures = {}
     for task, rows in TASKS.items():
@@ -59,7 +60,7 @@ def bench_live(bundle: Bundle) -> Figures:
 
 
 def _bare_cases(spec: TaskSpec, bundle: Bundle, vectors: Floats) -> dict[str, TimedCall]:
-    """A turn by a slot's scorer, and by the loop alone, as it was before there was a live view."""
+    """A turn by a slot's scorer, and by the task's bare loop, which has no live view."""
     scorer, task, assignment = Scorer(spec, bundle), find_task(spec.task), Assignment(spec, bundle)
     jobs = [("score", vector, SEED) for vector in vectors]
 
@@ -76,10 +77,10 @@ def _bare_cases(spec: TaskSpec, bundle: Bundle, vectors: Floats) -> dict[str, Ti
 
 
 class WatchedSlot:
-    """A slot as a worker has it, whose frames go through a router to one subscriber; use it in a `with`."""
+    """A worker's slot whose frames go through a router to one subscriber; a context manager."""
 
     def __init__(self, spec: TaskSpec, bundle: Bundle, vectors: Floats) -> None:
-        self.frames, self.watched = 0, 0.0  # that arrived, and the seconds of turns that were watched
+        self.frames, self.watched = 0, 0.0  # frames that arrived; seconds of watched turns
         self._spec, self._bundle = spec, bundle
         self._make_job = [_make_job(spec, vector, number) for number, vector in enumerate(vectors)]
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
@@ -109,12 +110,12 @@ class WatchedSlot:
         self._stack.close()
 
     def score(self) -> None:
-        """One turn while nobody subscribes."""
+        """Run one turn without a subscriber."""
         self._slot.show(False)
         self._score_group()
 
     def score_watched(self) -> None:
-        """One turn while somebody does."""
+        """Run one turn with a subscriber."""
         self._slot.show(True)
         began = perf_counter()
         self._score_group()

@@ -1,6 +1,6 @@
-"""Matrix products alone, by every library that is here: the fastest of each is what a step's floor is made of.
+"""Time matrix products alone in each installed library: the fastest of each makes up the lower bound of a step's time.
 
-One library's product would flatter the step wherever that library is slow on the processor, or was told to be.
+With one library alone, a step would look better wherever that library is slow on the processor or configured to be.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.worker.bench.timing import TimedCall
+from dreamfleet.worker.bench.measurement import TimedCall
 from dreamfleet.worker.worldmodel.inference import open_graph
 
 Floats = NDArray[np.float32]
@@ -22,7 +22,7 @@ FLOAT = 1  # ONNX's number of the type
 
 
 def product_cases(sizes: Sequence[Size]) -> dict[str, TimedCall]:
-    """Calls that multiply random matrices of these sizes, by NumPy, ONNX Runtime and, where it is installed, torch."""
+    """Calls that multiply random matrices of these sizes with NumPy, ONNX Runtime and, if installed, torch."""
     random = np.random.default_rng(0)
     cases: dict[str, TimedCall] = {}
     for index, size in enumerate(sizes):
@@ -34,7 +34,7 @@ def product_cases(sizes: Sequence[Size]) -> dict[str, TimedCall]:
 
 
 def fastest(seconds: dict[str, float], count: int) -> tuple[float, tuple[str, ...]]:
-    """The seconds of `count` products, each by the library that was fastest at it, and those libraries."""
+    """The summed seconds of `count` products, each in the library that was fastest at it, and those libraries."""
     best = [
         min((seconds[case], library) for library in LIBRARIES if (case := _case(index, library)) in seconds)
         for index in range(count)
@@ -60,7 +60,7 @@ def _by_torch(left: Floats, right: Floats) -> TimedCall:
 
 
 def _by_onnxruntime(left: Floats, right: Floats) -> TimedCall:
-    """The right matrix is a weight, as in a model: the runtime packs it once."""
+    """Multiply with the right matrix as a weight, as in a model: the runtime packs it once."""
     session = open_graph(product_graph(left.shape, right), threads=1)
     binding, out = session.io_binding(), left @ right
     binding.bind_cpu_input("left", left)
@@ -93,7 +93,7 @@ def _value(name: bytes, shape: tuple[int, ...]) -> bytes:
 
 
 def _field(number: int, value: int | bytes) -> bytes:
-    """A number, or bytes with their length before them."""
+    """Encode a protobuf field: a varint, or length-prefixed bytes."""
     if isinstance(value, int):
         return _varint(number << 3) + _varint(value)
     return _varint(number << 3 | 2) + _varint(len(value)) + value

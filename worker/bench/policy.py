@@ -1,4 +1,4 @@
-"""Measuring a policy step against its floor and against torch, in one process and alternating blocks."""
+"""Benchmark a policy step against its arithmetic alone and against torch, in one process and alternating blocks."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ import numpy as np
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.worker.bench.matrix_products import fastest, product_cases
-from dreamfleet.worker.bench.timing import TimedCall, time_alternately
+from dreamfleet.worker.bench.measurement import TimedCall, time_alternately
 from dreamfleet.worker.worldmodel.inference import PolicyStep
 
 MATRIX = 768  # large enough to be all arithmetic, small enough for many blocks
 
 
 def bench_policy(bundle: Bundle) -> dict[str, float | str | None]:
-    """`over_floor`: time of a policy step at batch 1 over its FLOPs at this core's matrix rate; `torch_ratio`.
+    """Measure a policy step at batch 1.
 
-    The FLOPs are those of `flops`; the rate is that of a product of two matrices of 768 x 768 by the library that is
-    fastest at it on this core. At batch 1 a step also has to fetch each weight once, which this floor does not count.
+    `over_floor`: its time divided by the time of its FLOPs (`flops`) at this core's matrix rate. That rate is of a
+    product of two 768 x 768 matrices in the library that is fastest at it. The bound ignores that a step at batch 1
+    must also fetch each weight. `torch_ratio`: torch's time divided by ours.
     """
     policy, random = PolicyStep(bundle), np.random.default_rng(0)
     picture = random.integers(0, 256, (1, *bundle.manifest.picture), dtype=np.uint8)
@@ -47,7 +48,7 @@ def bench_policy(bundle: Bundle) -> dict[str, float | str | None]:
 
 
 def flops(bundle: Bundle) -> int:
-    """Floating-point operations of one policy step, two a multiply-add of its matrix products."""
+    """Floating-point operations of one policy step's matrix products, two per multiply-add."""
     manifest = bundle.manifest
     vae = manifest.models.get("vae", {"padding": "valid", "channels": (32, 64, 128, 256)})
     side, before, total = manifest.picture[0], manifest.picture[2], 0

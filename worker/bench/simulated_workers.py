@@ -1,4 +1,4 @@
-"""Simulated workers: the whole protocol and no scoring, many in one process, to load a real coordinator."""
+"""Simulated workers: the whole protocol without scoring, many in one process, to load a real coordinator."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dreamfleet.worker.service.outbox import Outbox
 
 @dataclass
 class SimulatedWorker:
-    """One worker: its jobs end as they come."""
+    """One simulated worker; it finishes each job as it arrives."""
 
     identity: str
     admission: Admission
@@ -45,7 +45,7 @@ class SimulatedWorker:
             self.outbox.add(Result(job.digest, float(job.seeds[0] % 1000), 1, 0.0, None, None))
 
     def beat(self) -> Heartbeat:
-        """What it holds: nothing but results without a verdict."""
+        """Return its heartbeat: no queued or running jobs, only results not acknowledged yet."""
         run = self.admission
         return Heartbeat(
             run_uid=run.run_uid, incarnation=run.incarnation, nonce=run.nonce,
@@ -57,7 +57,7 @@ class SimulatedWorker:
 
 
 def run_simulated_workers(endpoint: str, count: int, slots: int) -> None:
-    """Join as `count` workers and work until killed."""
+    """Join the coordinator at `endpoint` as `count` workers of `slots` slots, and work until killed."""
     session, inbox = _connect(endpoint), CountingDecoder()
     events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
     crowd: dict[str, SimulatedWorker] = {}
@@ -90,7 +90,7 @@ def _handle_and_send(
     inbox: CountingDecoder,
     wait: float,
 ) -> None:
-    """Handle what has come, send results and beats that are due."""
+    """Handle the received job batches, then send the results and heartbeats that are due."""
     active: set[str] = set()
     try:
         _, sample = events.get(timeout=wait) if wait else events.get_nowait()

@@ -1,4 +1,4 @@
-"""Tasks whose episodes cost a known time, for measuring everything around them."""
+"""Tasks whose episodes take a known time, to measure the overhead around them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SLEEP_TASK, NULL_TASK = (f"{__name__}:{name}" for name in ("SleepTask", "NullTas
 
 
 class SleepEnvironment(gymnasium.Env[Any, Any]):
-    """One step, which takes `seconds`; the reward follows from the seed."""
+    """An environment of one step that takes `seconds`; the reward depends on the seed alone."""
 
     def __init__(self, seconds: float) -> None:
         self.observation_space = gymnasium.spaces.Box(-1, 1, (1,))
@@ -25,13 +25,13 @@ class SleepEnvironment(gymnasium.Env[Any, Any]):
         self._seed = 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:  # noqa: ARG002 - gymnasium's
-        """Begin."""
+        """Begin an episode."""
         super().reset(seed=seed)
         self._seed = seed or 0
         return np.zeros(1, np.float32), {}
 
     def step(self, _action: Any) -> Any:
-        """Sleep, and end."""
+        """Sleep, then end the episode."""
         if self._seconds:
             time.sleep(self._seconds)
         return np.zeros(1, np.float32), float(self._seed % 1000), True, False, {}
@@ -44,7 +44,7 @@ class IdlePolicy:
         """Begin an episode."""
 
     def act(self, observation: Any) -> Any:
-        """No action."""
+        """Return the observation as an action that nothing reads."""
         return observation
 
 
@@ -56,16 +56,16 @@ class SleepTask(Task):
     seconds = SLEEP_SECONDS
 
     def make_environment(self, _assignment: Assignment) -> gymnasium.Env[Any, Any]:
-        """A nap."""
+        """The environment that sleeps."""
         return SleepEnvironment(self.seconds)
 
     def make_policy(self, _assignment: Assignment) -> IdlePolicy:
-        """Of any bundle."""
+        """The idle policy, whatever the bundle."""
         return IdlePolicy()
 
 
 class NullTask(SleepTask):
-    """Episodes of no time."""
+    """Episodes that take no time."""
 
     name = NULL_TASK
     seconds = 0.0

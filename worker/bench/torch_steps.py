@@ -1,4 +1,4 @@
-"""A policy step and a dream step in torch, one operation at a time: what the ONNX graphs are measured against."""
+"""A policy step and a dream step in torch, one operation at a time, as a comparison for the ONNX graphs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
 
 def make_torch_step(bundle: Bundle, picture: NDArray[np.uint8], parameters: NDArray[np.float32]) -> Callable[[], Any]:
-    """A call that makes one step of the bundle's sizes at batch 1, on one thread; the weights' values do not matter."""
+    """Return a call that makes one policy step of the bundle's sizes at batch 1 on one thread, with random weights."""
     torch.set_num_threads(1)
     manifest = bundle.manifest
     config = from_plain(VAEConfig, manifest.models["vae"]) if manifest.models else VAEConfig(latent=manifest.latent)
@@ -39,7 +39,7 @@ def make_torch_step(bundle: Bundle, picture: NDArray[np.uint8], parameters: NDAr
 
 
 def make_torch_dream(bundle: Bundle, batch: int) -> Callable[[], Any]:
-    """A call that dreams one step of `batch` rows with torch's modules and distributions, on one thread."""
+    """Return a call that dreams one step of `batch` rows with torch modules and distributions on one thread."""
     torch.set_num_threads(1)
     manifest = bundle.manifest
     mixtures = int(manifest.models["mdnrnn"]["mixtures"])

@@ -1,7 +1,6 @@
-"""CarRacing with gymnasium's own physics: with a native picture, equal to the bit, and seen through a frozen encoder.
+"""CarRacing with gymnasium's physics: one with a natively drawn, bit-exact picture, one seen through a frozen encoder.
 
-Importing this registers `dreamfleet/CarRacing-v3` and `dreamfleet/CarRacingLatent-v0`, as gymnasium's packages of
-environments do.
+Importing this registers `dreamfleet/CarRacing-v3` and `dreamfleet/CarRacingLatent-v0` with gymnasium.
 
 >>> import gymnasium, dreamfleet.worker.car_racing
 >>> environment = gymnasium.make("dreamfleet/CarRacing-v3")

@@ -1,4 +1,4 @@
-"""Who drives CarRacing by its pictures, without a world model."""
+"""Agents that drive CarRacing by its pictures, without a world model."""
 
 from __future__ import annotations
 
@@ -12,21 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.artifacts.onnx_checks import check_self_contained
 from dreamfleet.common.artifacts.trained_agent import NETWORK, TrainedAgent
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.worker.car_racing.frame_skip_policy import FrameSkipPolicy
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS, find_preprocessing
 from dreamfleet.worker.car_racing.task import WORLD, CarRacingTask, make_reference_environment
 from dreamfleet.worker.tasks.api import Policy, World
-from dreamfleet.worker.worldmodel.inference import open_graph
+from dreamfleet.worker.worldmodel.inference import open_untrusted_graph
 
 Floats = NDArray[np.float32]
-NO_PARAMETERS = np.zeros(0, np.float32)  # the parameters of who has none
+NO_PARAMETERS = np.zeros(0, np.float32)  # of agents without any
 
 
 class PictureAgent(ABC):
-    """An agent, as `scoring.agents` has it, that sees the pictures of a preprocessing."""
+    """An agent that sees the pictures of a preprocessing."""
 
     task: ClassVar[str] = CarRacingTask.name
     reality: ClassVar[str] = CarRacingTask.name
@@ -38,30 +37,30 @@ class PictureAgent(ABC):
     @property
     @abstractmethod
     def sha256(self) -> str:
-        """Of all that its choices follow from, but the picture and the episode's seed."""
+        """SHA-256, hexadecimal, of all that its choices depend on besides the picture and the episode's seed."""
 
     @property
     @abstractmethod
     def preprocessing(self) -> str:
-        """Name of what makes the pictures that it sees."""
+        """The name of the preprocessing of its pictures."""
 
     @abstractmethod
     def make_policies(self) -> Callable[[int], Policy]:
-        """It at the wheel in the episode of a seed."""
+        """Return a function from an episode's seed to a policy."""
 
     def make_judge(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
-        """The unmodified environment of gymnasium, observing what it sees."""
+        """Gymnasium's unmodified environment, observing this agent's pictures."""
         return make_reference_environment(find_preprocessing(self.preprocessing), render_mode)
 
     @property
     def truth(self) -> Callable[[gymnasium.Env[Any, Any]], dict[str, float]]:
-        """The task's."""
+        """The task's function from an environment to its true state."""
         return CarRacingTask().truth
 
 
 @dataclass(frozen=True)
 class NetworkAgent(PictureAgent):
-    """A trained agent, by its file alone; `ControllerError` for one that cannot drive here."""
+    """A trained agent from its file; `ControllerError` if it cannot drive CarRacing."""
 
     trained: TrainedAgent
 
@@ -79,40 +78,39 @@ class NetworkAgent(PictureAgent):
 
     @property
     def sha256(self) -> str:
-        """The trained agent's own."""
+        """The SHA-256 of the trained agent's file."""
         return self.trained.sha256
 
     @property
     def preprocessing(self) -> str:
-        """As the agent's manifest says."""
+        """The preprocessing in the agent's manifest."""
         return self.trained.manifest.preprocessing
 
     def make_policies(self) -> Callable[[int], NetworkPolicy]:
-        """The same in each episode."""
+        """Return a function that gives the same policy for each episode."""
         policy = NetworkPolicy(self.trained)
         return lambda _seed: policy
 
 
 class NetworkPolicy(FrameSkipPolicy):
-    """The choice that the network gives most worth, of equal ones the first."""
+    """Takes the choice with the highest Q value; of equal ones the first."""
 
     def __init__(self, trained: TrainedAgent) -> None:
         manifest = trained.manifest
         super().__init__(manifest.choices, manifest.frame_skip)
         try:
-            check_self_contained(trained.network)
-            self._run = open_graph(trained.network, threads=1).run
+            self._run = open_untrusted_graph(trained.network).run
         except Exception as error:  # the runtime's errors share no public base
             raise _unusable_network_error(error) from error
         self._zero = np.zeros((1, manifest.state), np.float32)
         self._state = self._zero
 
     def reset_memory(self) -> None:
-        """Nothing is remembered."""
+        """Forget the last episode."""
         self._state = self._zero
 
     def choose(self, picture: NDArray[np.uint8]) -> int:
-        """The best; `ControllerError` where the network tells no worth of each choice."""
+        """Return the number of the best choice; `ControllerError` if the network gives no finite value of each."""
         try:
             worth, self._state = self._run(["worth", "next_state"], {"picture": picture[None], "state": self._state})
         except Exception as error:  # as above
@@ -122,7 +120,7 @@ class NetworkPolicy(FrameSkipPolicy):
             or self._state.shape != self._zero.shape
             or not np.isfinite(worth).all()
         ):
-            raise _unusable_network_error(f"it tells {worth.shape} of {len(self._actions)} choices, or no numbers")
+            raise _unusable_network_error(f"it gives {worth.shape} values for {len(self._actions)} choices, or NaN")
         return int(worth[0].argmax())
 
 

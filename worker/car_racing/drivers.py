@@ -1,7 +1,7 @@
-"""Random drivers: what the first world model learns from.
+"""Random drivers, which collect the data of the first world model.
 
-`DRIVERS` are three kinds of noise, so that the model sees straight, weaving and spinning cars; all lean on the gas, for
-a car that stands teaches nothing. The others drive as those of a source do.
+`DRIVERS` are three kinds of noise, so that the model sees straight, weaving and spinning cars. All of them prefer gas,
+because a standing car teaches nothing. The other drivers reproduce those of published sources.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class HeldDriver:
 
 
 class UniformDriver:
-    """What `action_space.sample()` gives, held for 20 frames: gas and brake apart (the notebook's data)."""
+    """A sample of the action space, held for 20 frames; gas and brake are independent (the notebook's data)."""
 
     def __init__(self, random: np.random.Generator) -> None:
         self._random = random
@@ -51,9 +51,9 @@ class UniformDriver:
 
 
 class PushedDriver(UniformDriver):
-    """A push at the beginning, then one control at a time, each held for 20 frames (the article's data).
+    """A first push, then one control at a time, each held for 20 frames (the article's data).
 
-    Of ten choices one is nothing, four are gas, two steer to the left, two to the right, and one brakes.
+    Of ten equally likely choices one does nothing, four give gas, two steer left, two steer right, and one brakes.
     """
 
     def _choose(self) -> NDArray[np.float32]:
@@ -65,7 +65,7 @@ class PushedDriver(UniformDriver):
 
 
 class OrnsteinUhlenbeckDriver:
-    """Steering and pedal drift around slight gas and return to it."""
+    """Steering and pedal as Ornstein-Uhlenbeck processes, which return to straight ahead and slight gas."""
 
     def __init__(self, random: np.random.Generator) -> None:
         self._random = random
@@ -80,7 +80,7 @@ class OrnsteinUhlenbeckDriver:
 
 
 class RandomWalkDriver:
-    """Steering and pedal walk between their bounds (ctallec's Brownian data)."""
+    """Steering and pedal as random walks between bounds (ctallec's Brownian data)."""
 
     def __init__(self, random: np.random.Generator) -> None:
         self._random = random
@@ -101,5 +101,5 @@ DRIVERS: dict[str, type[HeldDriver] | type[OrnsteinUhlenbeckDriver] | type[Rando
 
 
 def _controls(steer: float, pedal: float) -> NDArray[np.float64]:
-    """One pedal for both: positive is gas, negative is brake."""
+    """The action `(3,)` of a steering and one pedal: positive is gas, negative is brake."""
     return np.array([np.clip(steer, -1, 1), np.clip(pedal, 0, 1), np.clip(-pedal, 0, 1)])

@@ -1,7 +1,7 @@
-"""gymnasium's CarRacing-v3 with its own track, physics and rewards; only the observation is drawn by our native module.
+"""gymnasium's CarRacing-v3 with its own track, physics and rewards; our native module draws only the observation.
 
-`rgb_array` and `human` rendering stay gymnasium's. Where the native module was not built, `car_racing.check` says
-so and gymnasium draws.
+`rgb_array` and `human` rendering are gymnasium's. If the native module was not built, `native_check` logs that and
+gymnasium draws.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ try:
 except ImportError:  # no compiler when this was installed
     _native = None  # type: ignore[assignment]
 
-TEXT_WIDTH = 125  # pixels at the window's left end that hold the score
+TEXT_WIDTH = 125  # pixels at the window's left edge that hold the score
 _Base: Any = car_racing.CarRacing  # untyped upstream
 
 
 class CarRacing(_Base):  # type: ignore[misc]
     """CarRacing-v3 with its observation drawn natively.
 
-    `preprocessing` names what it observes: `raw-96`, gymnasium's own, or another of `car_racing.preprocessing`.
-    `native` False lets gymnasium draw, as it does anyway where the module was not built. Not thread-safe, as
-    gymnasium's is not: environments of one process share one canvas.
+    `preprocessing` names its pictures: `raw-96`, gymnasium's own, or another of `car_racing.preprocessing`. With
+    `native` False, or without the native module, gymnasium draws. Like gymnasium's, it is not thread-safe:
+    environments of one process share one canvas.
     """
 
     def __init__(self, *arguments: Any, preprocessing: str = RAW.name, native: bool = True, **more: Any) -> None:
@@ -47,12 +47,12 @@ class CarRacing(_Base):  # type: ignore[misc]
 
     @property
     def drawn_by(self) -> str:
-        """`native` or `gymnasium`."""
+        """Which one draws the observation: `native` or `gymnasium`."""
         return "native" if self._native else "gymnasium"
 
     def step(self, action: Any) -> Any:
-        """Gymnasium's step; an action of another shape, or NaN, is refused before anything moves."""
-        if self.car.__class__ is car_dynamics.Car and is_native_available():  # a new one, of a reset
+        """Gymnasium's step; `InvalidAction` for an action of another shape or with NaN, before anything moves."""
+        if self.car.__class__ is car_dynamics.Car and is_native_available():  # a reset made a new car
             self.car.__class__ = Car
         if action is not None and self.continuous:
             action = np.asarray(action)
@@ -61,7 +61,7 @@ class CarRacing(_Base):  # type: ignore[misc]
         return super().step(action)
 
     def _create_track(self) -> bool:
-        """Gymnasium's track; the tiles' colours then live in one array, which contacts change in place."""
+        """Make gymnasium's track; then keep the tiles' colours in one array, which contacts change in place."""
         if not super()._create_track():
             return False
         self._road = np.array([corners for corners, _ in self.road_poly], dtype=np.float64)
@@ -121,7 +121,7 @@ def is_native_available() -> bool:
 
 
 def list_fixtures(car: car_dynamics.Car) -> NDArray[np.float64]:
-    """The car's polygons in drawing order: body, colour, count, vertices."""
+    """The car's polygons in drawing order, flat: for each its body, colour, vertex count and vertices."""
     rows: list[float] = []
     for obj in car.drawlist:
         body = 4 if obj is car.hull else car.wheels.index(obj)
@@ -134,7 +134,7 @@ def list_fixtures(car: car_dynamics.Car) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=4096)
 def render_score(text: str) -> NDArray[np.uint8]:
-    """The score's text as observation rows 84-95, columns 0-11.
+    """The score's text as pixels `(12, 12, 3)`: the observation's rows 84-95, columns 0-11.
 
     The text lies within the window's first 125 columns, which are exactly twelve of the observation's.
     """
@@ -150,7 +150,7 @@ def render_score(text: str) -> NDArray[np.uint8]:
 def _render_text(text: str) -> pygame.Surface:
     try:
         return _font().render(text, True, (255, 255, 255), (0, 0, 0))
-    except pygame.error:  # somebody closed a window, and with it pygame and its fonts
+    except pygame.error:  # closing a window has shut down pygame and its fonts
         _font.cache_clear()
         return _font().render(text, True, (255, 255, 255), (0, 0, 0))
 

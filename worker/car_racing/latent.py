@@ -1,4 +1,4 @@
-"""CarRacing as a world model sees it: the reality of an agent that was trained in the dream."""
+"""CarRacing as a world model sees it: the real environment for an agent that was trained in the dream."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Floats = NDArray[np.float32]
 
 
 class CarRacingLatent(gymnasium.Env[Floats, Floats]):
-    """Gymnasium's own CarRacing, observed and driven as `CarRacingDream` is: latent `(latent,)`, actions `(3,)`.
+    """Gymnasium's CarRacing with the observations and actions of `CarRacingDream`: latent `(latent,)`, actions `(3,)`.
 
-    The latent is the encoder's mean; `features` `zh` puts the MDN-RNN's hidden state behind it. Both are what
-    controllers see, to the bit. Rewards, ends and `info` are gymnasium's, and an episode is a whole one. With `native`
-    the picture is drawn natively where that is exact, which is faster and changes nothing else.
+    The latent is the encoder's mean; with `features` `zh` the MDN-RNN's hidden state follows it. Both equal what
+    controllers see, to the bit. Rewards, ends and `info` are gymnasium's. With `native` our module draws the picture
+    where that is exact, which is faster and changes nothing else.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": WORLD.frames_per_second}  # noqa: RUF012
@@ -43,14 +43,14 @@ class CarRacingLatent(gymnasium.Env[Floats, Floats]):
         self.observation_space, self.action_space = self._observation.space, self._environment.action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Begin on a seed's track; without a seed, on one after the last."""
+        """Begin on the track of a seed; without one, on the next random track."""
         super().reset(seed=seed, options=options)
         picture, info = self._environment.reset(seed=seed, options=options)
         self._mind.begin()
         return self._observe(picture), info
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Drive one step under `action` `(3,)`."""
+        """Drive one step with `action` `(3,)`; `ValueError` if it is not finite."""
         done = np.asarray(action, dtype=np.float32).reshape(3)
         if not np.isfinite(done).all():
             raise ValueError("an action must be three finite numbers")
@@ -64,7 +64,7 @@ class CarRacingLatent(gymnasium.Env[Floats, Floats]):
         return self._environment.render()
 
     def close(self) -> None:
-        """Release gymnasium's environment."""
+        """Close gymnasium's environment."""
         self._environment.close()
 
     def _observe(self, picture: NDArray[np.uint8]) -> Floats:

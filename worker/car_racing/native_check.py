@@ -1,4 +1,4 @@
-"""Holding the native picture against the installed gymnasium: exactness is tied to what pygame was compiled to."""
+"""Compare the native picture with the installed gymnasium's: whether they are equal depends on how pygame was built."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ActionSource = Callable[[int, NDArray[np.uint8], np.random.Generator], Any]  # s
 
 @dataclass(frozen=True)
 class Mismatch:
-    """The first thing that differs, and where."""
+    """The first difference, and the track and step at which it appeared."""
 
     what: str
     seed: int
@@ -36,7 +36,7 @@ class Mismatch:
 
 @cache
 def native_is_exact() -> bool:
-    """Whether the native picture can stand for gymnasium's here; looked at once a process, in under a second."""
+    """Whether the native picture equals gymnasium's on this machine; checked once per process, in under a second."""
     if not is_native_available():
         log.warning("no native picture was built (no C compiler at installation): gymnasium draws, 15 times slower")
         return False
@@ -44,21 +44,21 @@ def native_is_exact() -> bool:
     if difference is not None:
         log.warning(
             "the native picture differs from the installed gymnasium's (%s): gymnasium draws; pygame-ce or gymnasium "
-            "may be of another version than this was made for", difference.what,
+            "may be another version than the supported ones", difference.what,
         )  # fmt: skip
     return difference is None
 
 
 def random_action(step: int, _picture: Any, random: np.random.Generator) -> NDArray[np.float32]:
-    """Random driving with much gas."""
+    """A random action with much gas."""
     steer = random.uniform(-1, 1) if step % 2 else 0.1
     return np.array([steer, random.uniform(0.3, 1), random.uniform(0, 0.2)], dtype=np.float32)
 
 
 def compare(seed: int, steps: int, actions: ActionSource, **settings: Any) -> Mismatch | None:
-    """Drive gymnasium's environment and ours side by side; the first difference in anything, or `None`.
+    """Drive gymnasium's environment and ours side by side; return the first difference, or `None`.
 
-    Compared are observation, picture, reward, flags, info, and every body's state.
+    It compares observation, picture, reward, flags, info, and the state of each body.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # SWIG's, on first import
@@ -77,7 +77,7 @@ def compare(seed: int, steps: int, actions: ActionSource, **settings: Any) -> Mi
             results = [each.step(action) for each in (theirs, ours, small)]
             if quick and step % 8 == 7:
                 for each in (theirs, ours, small):
-                    each.t += 0.4  # the opening's zoom lasts a second; a quick look is past it sooner
+                    each.t += 0.4  # shortens the opening zoom, which lasts a second
         return None
     finally:
         for each in (theirs, ours, small):
@@ -85,7 +85,7 @@ def compare(seed: int, steps: int, actions: ActionSource, **settings: Any) -> Mi
 
 
 def find_mismatch(results: list[Any], environments: tuple[Any, ...]) -> str | None:
-    """What differs between gymnasium's result and ours."""
+    """Describe what differs between gymnasium's result and ours; `None` if nothing does."""
     reference, ours, small = results
     if not np.array_equal(reference[0], ours[0]):
         return f"observation, {int((reference[0] != ours[0]).any(axis=-1).sum())} pixels"
@@ -98,7 +98,7 @@ def find_mismatch(results: list[Any], environments: tuple[Any, ...]) -> str | No
 
 
 def body_state(environment: Any) -> Iterator[tuple[float, ...]]:
-    """Position, angle and velocities of the hull and each wheel."""
+    """Yield position, angle and velocities of the hull and each wheel."""
     car = environment.car
     for body in (car.hull, *car.wheels):
         yield (*body.position, body.angle, *body.linearVelocity, body.angularVelocity)
@@ -107,5 +107,5 @@ def body_state(environment: Any) -> Iterator[tuple[float, ...]]:
 
 
 def make_car_racing(**settings: Any) -> gymnasium.Env[Any, Any]:
-    """`dreamfleet/CarRacing-v3`, drawn natively where that is exact, else by gymnasium."""
+    """Make `dreamfleet/CarRacing-v3`, drawn natively where that is exact, else by gymnasium."""
     return gymnasium.make(ENVIRONMENT, native=native_is_exact(), disable_env_checker=True, **settings)

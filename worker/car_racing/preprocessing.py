@@ -1,9 +1,9 @@
-"""From CarRacing's 96x96 observation to the picture that a world model sees: one definition for all uses.
+"""From CarRacing's 96x96 observation to the picture that a world model sees.
 
-`raw-96` is the whole observation as it is. `box-64` is its rows 0-83 (below them is the indicator bar) through an exact
-integer box filter 84x96 -> 64x64: an output pixel averages 21/16 rows and 3/2 columns. With weights in sixteenths and
-halves their sum is 63 and the pixel `(sum + 31) // 63`. No library's resize, so that the native renderer equals it to
-the bit.
+`raw-96` is the whole observation. `box-64` is its rows 0-83 (below them is the indicator bar) after an exact integer
+box filter 84x96 -> 64x64: an output pixel averages 21/16 rows and 3/2 columns. With weights in sixteenths and halves
+their sum is 63 and the pixel `(sum + 31) // 63`. It uses no library's resize, so that the native renderer can equal it
+to the bit.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _raw(observation: Pixels) -> Pixels:
 
 
 BOX = Preprocessing("box-64", SMALL, _box)
-RAW = Preprocessing("raw-96", 96, _raw, mirrors=False)  # the indicator bar would be another one
+RAW = Preprocessing("raw-96", 96, _raw, mirrors=False)  # a mirrored indicator bar never occurs
 PREPROCESSINGS = {each.name: each for each in (BOX, RAW)}
 
 

@@ -1,4 +1,4 @@
-"""A random network at the wheel, as Ha & Schmidhuber collected their data (WorldModelsExperiments, extract.py)."""
+"""A random network as a driver, as Ha & Schmidhuber 2018 collected their data (WorldModelsExperiments, extract.py)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Floats = NDArray[np.float32]
 CHANNELS = (32, 64, 128, 256)  # of convolutions of kernel 4 and stride 2
 LATENT, HIDDEN = 32, 256
 MAX_SPREAD = 0.01  # of the weights of a drive's network
-MAX_LOGVAR, MAX_LATENT = 20.0, 1e6  # beyond which Cauchy's tails leave nothing but infinities
+MAX_LOGVAR, MAX_LATENT = 20.0, 1e6  # bounds against infinities from the Cauchy distribution's tails
 
 
 class RandomNetworkPolicy:
-    """Encoder, LSTM and linear controller, all of Cauchy's weights, of a spread that is another for each drive."""
+    """Encoder, LSTM and linear controller with Cauchy-distributed weights, whose scale is drawn for each drive."""
 
     def __init__(self, random: np.random.Generator) -> None:
         self._random = random
@@ -31,7 +31,7 @@ class RandomNetworkPolicy:
         self._hidden = self._cell = np.zeros(HIDDEN, dtype=np.float32)
 
     def begin(self, parameters: Floats) -> None:
-        """It has none but its own."""
+        """Ignore the parameters: its weights are random."""
 
     def act(self, observation: Any) -> Any:
         """Steering, gas and brake `(3,)` for one picture `(side, side, 3)`."""
@@ -46,7 +46,7 @@ class RandomNetworkPolicy:
         return (self._random.standard_cauchy((inputs + 1, outputs)) * self._spread).astype(np.float32)
 
     def _encode(self, picture: NDArray[np.uint8]) -> Floats:
-        """A latent drawn from what the encoder makes of the picture."""
+        """Sample a latent `(32,)` from the encoder's distribution for the picture."""
         value: Floats = picture.astype(np.float32) / np.float32(255)
         for kernel in self._kernels:
             value = np.maximum(_convolve(value, kernel), np.float32(0))
@@ -65,7 +65,7 @@ class RandomNetworkPolicy:
 
 
 def _convolve(value: Floats, kernel: Floats) -> Floats:
-    """`(side, side, channels)` through kernels of 4x4 at every second place."""
+    """Convolve `(side, side, channels)` with 4x4 kernels at stride 2."""
     seen = sliding_window_view(value, (4, 4), axis=(0, 1))[::2, ::2]
     return _layer(seen.reshape(*seen.shape[:2], -1), kernel)
 

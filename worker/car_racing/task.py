@@ -55,7 +55,7 @@ class CarRacingTask(Task):
     preprocessings = PREPROCESSINGS
 
     def world_of(self, assignment: Assignment) -> World:
-        """The world as the run's variant drives it."""
+        """The world with the actions and costs of the run's variant."""
         variant = assignment.world_model.variant
         return replace(
             WORLD, actions=variant.controls, version=variant.version, time_cost=variant.time_cost,
@@ -63,26 +63,26 @@ class CarRacingTask(Task):
         )  # fmt: skip
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
-        """The environment with the native picture, where that is exact; it observes the bundle's pictures."""
+        """The environment with the native picture, if that is exact, in the bundle's preprocessing."""
         return _with_off_road_info(self.make_recorded(self.preprocessing(assignment.world_model).name), assignment)
 
     def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
-        """The same, observing the pictures of a preprocessing by name."""
+        """The same, in the preprocessing of this name."""
         return make_car_racing(preprocessing=preprocessing)
 
     def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
-        """The unmodified environment of gymnasium, preprocessed here."""
+        """Gymnasium's unmodified environment in the bundle's preprocessing, computed by NumPy."""
         return _with_off_road_info(
             make_reference_environment(self.preprocessing(assignment.world_model), render_mode), assignment
         )
 
     def make_policy(self, assignment: Assignment) -> CarRacingPolicy:
-        """Encoder, controller and MDN-RNN of a bundle that was trained on this task's pictures."""
+        """The policy of a bundle: encoder, controller and MDN-RNN; `BundleError` for other pictures."""
         self.preprocessing(assignment.world_model)
         return CarRacingPolicy(assignment.world_model)
 
     def begin_anywhere(self, environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:
-        """Move the car to a random tile, turned and shifted a little, past the opening's zoom."""
+        """Move the car to a random tile, a little turned and shifted, and skip the opening zoom."""
         inner: Any = environment.unwrapped
         _, beta, x, y = inner.track[random.integers(len(inner.track))]
         shift, turn = random.normal(0, 2.0), random.normal(0, 0.25)
@@ -94,11 +94,11 @@ class CarRacingTask(Task):
         return environment.step(np.zeros(3, dtype=np.float32))[0]
 
     def truth(self, environment: gymnasium.Env[Any, Any]) -> dict[str, float]:
-        """Car and road as the simulator knows them; `car_racing.truth` names units and signs."""
+        """The simulator's state of car and road; `true_state` documents units and signs."""
         return read_true_state(environment.unwrapped)
 
     def preprocessing(self, bundle: Bundle) -> Preprocessing:
-        """What makes the pictures that the bundle was trained on; `BundleError` if this task does not give them."""
+        """The preprocessing of the bundle's pictures; `BundleError` if this task has no such pictures."""
         manifest = bundle.manifest
         found = PREPROCESSINGS.get(manifest.preprocessing)
         if manifest.task != self.name or found is None or manifest.picture != found.shape:
@@ -111,12 +111,12 @@ class CarRacingTask(Task):
 
 
 def make_reference_environment(preprocessing: Preprocessing, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
-    """The unmodified environment of gymnasium, its observation as the picture of a preprocessing."""
+    """Make gymnasium's unmodified environment, observing the pictures of a preprocessing."""
     return PictureObservation(gymnasium.make(ENVIRONMENT, render_mode=render_mode), preprocessing)
 
 
 class PictureObservation(gymnasium.ObservationWrapper[NDArray[np.uint8], Any, NDArray[np.uint8]]):
-    """CarRacing's observation as the picture of a preprocessing."""
+    """Turns CarRacing's observation into the picture of a preprocessing."""
 
     def __init__(self, environment: gymnasium.Env[Any, Any], preprocessing: Preprocessing) -> None:
         super().__init__(environment)
@@ -124,15 +124,15 @@ class PictureObservation(gymnasium.ObservationWrapper[NDArray[np.uint8], Any, ND
         self.observation_space = spaces.Box(0, 255, preprocessing.shape, np.uint8)
 
     def observation(self, observation: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture."""
+        """Return the picture."""
         return self._preprocessing.picture(observation)
 
 
 class OffRoadInfo(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """CarRacing whose `info` says in `off_road` whether a wheel touches no tile of the road."""
+    """CarRacing whose `info["off_road"]` is true while any wheel touches no road tile."""
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """The environment's step, and that beside it."""
+        """The environment's step with `off_road` added to `info`."""
         *given, info = self.env.step(action)
         inner: Any = self.env.unwrapped
         info[WORLD.stray] = not all(wheel.tiles for wheel in inner.car.wheels)
@@ -140,14 +140,14 @@ class OffRoadInfo(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def _with_off_road_info(environment: gymnasium.Env[Any, Any], assignment: Assignment) -> gymnasium.Env[Any, Any]:
-    """The environment, saying which steps are off the road where candidates pay for them."""
+    """Wrap the environment in `OffRoadInfo` if candidates pay for steps off the road."""
     return OffRoadInfo(environment) if assignment.world_model.variant.offroad_cost else environment
 
 
 class CarRacingPolicy:
-    """A controller on latent and hidden state; the state advances with every action, also with one that is held.
+    """A controller on latent and hidden state. The state advances at every step, also when an action is repeated.
 
-    The MDN-RNN was trained on every frame: one that skipped some would remember another car's speed.
+    The MDN-RNN was trained on every frame: if frames were skipped, it would misjudge the car's speed.
     """
 
     def __init__(self, bundle: Bundle) -> None:
@@ -169,5 +169,5 @@ class CarRacingPolicy:
         return chosen
 
     def reward(self, value: float) -> None:
-        """What the last action brought; some models see it in the next step."""
+        """Record the reward of the last action, which some models see in the next step."""
         self._step.write_rewards(self.state, np.array([value]))

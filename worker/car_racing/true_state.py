@@ -1,7 +1,7 @@
-"""What CarRacing's simulator knows of the car and the road ahead: what a world model is measured against.
+"""The true state of car and road in CarRacing's simulator, with which world models are compared.
 
-Lengths in the simulator's metres, angles in radians, times in seconds. Positive is left of the centre line, turned to
-the left, or bending to the left, as Box2D counts angles; a track is driven counter-clockwise.
+Lengths are in the simulator's metres, angles in radians, times in seconds. Positive means left of the centre line,
+turned left, or curving left, as in Box2D; tracks run counter-clockwise.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TrackPosition:
-    """Where a point lies beside the centre line: how far along it, how far to its left, and where it heads there."""
+    """A point relative to the centre line: distance along it, offset to its left, and the line's heading there."""
 
     along: float
     offset: float
@@ -29,7 +29,7 @@ class TrackPosition:
 
 @dataclass(frozen=True)
 class CentreLine:
-    """A closed track of N points: `points` (N, 2), `heading` (N,) at each, `along` (N + 1,) to each and around."""
+    """A closed track: `points` (N, 2), their `heading` (N,), the distance `along` (N + 1,) to each and all around."""
 
     points: Floats
     heading: Floats
@@ -37,14 +37,14 @@ class CentreLine:
 
     @classmethod
     def of(cls, track: Any) -> CentreLine:
-        """Gymnasium's track: alpha, heading, x and y of each point; a heading of 0 looks along y."""
+        """Convert gymnasium's track: alpha, heading, x and y of each point; a heading of 0 points along y."""
         rows = np.asarray(track, dtype=np.float64)
         points = rows[:, 2:4]
         lengths = np.hypot(*(np.roll(points, -1, axis=0) - points).T)
         return cls(points, rows[:, 1], np.concatenate([[0.0], np.cumsum(lengths)]))
 
     def nearest_position(self, x: float, y: float) -> TrackPosition:
-        """The nearest place of the line."""
+        """Return the nearest position on the line to a point."""
         at = np.array([x, y])
         ways = np.roll(self.points, -1, axis=0) - self.points
         squares = np.maximum((ways**2).sum(axis=1), 1e-12)
@@ -62,7 +62,7 @@ class CentreLine:
         return float(self.heading[row] + share * turned)
 
     def curvature(self, along: Any) -> Floats:
-        """How the line bends at places `(K,)` along it, in radians a metre, from the points on both sides of each."""
+        """The curvature `(K,)` at distances `along` (K,), in radians per metre, interpolated between the points."""
         turned = wrap_angle(np.roll(self.heading, -1) - np.roll(self.heading, 1))
         lengths = np.diff(self.along)
         bends = turned / (lengths + np.roll(lengths, 1))
@@ -73,14 +73,14 @@ class CentreLine:
 
 @lru_cache(maxsize=4)
 def centre_line(track: tuple[tuple[float, ...], ...]) -> CentreLine:
-    """The centre line of gymnasium's track; it is asked for at every step."""
+    """The centre line of gymnasium's track; cached, because each step needs it."""
     return CentreLine.of(track)
 
 
 def read_true_state(environment: Any) -> dict[str, float]:
-    """The true state of a CarRacing, gymnasium's or ours, as its last observation shows it.
+    """Read the true state at the last observation from a CarRacing environment, gymnasium's or ours.
 
-    `side_slip` is the speed to the car's own left; `off_road` is 1 where no wheel touches a tile of the road, else 0.
+    `side_slip` is the speed to the car's left; `off_road` is 1 while no wheel touches a road tile, else 0.
     """
     car, line = environment.car, centre_line(tuple(environment.track))
     hull = car.hull
@@ -100,5 +100,5 @@ def read_true_state(environment: Any) -> dict[str, float]:
 
 
 def wrap_angle(angle: Any) -> Any:
-    """The same angle, from -pi to pi."""
+    """The same angle in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi

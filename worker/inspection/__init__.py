@@ -1,1 +1,1 @@
-"""A look into a world model: what it sees, forgets and dreams, as one page."""
+"""Inspect a world model: an HTML page of what it sees, forgets and dreams, and figures measured on drives."""

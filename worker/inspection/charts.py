@@ -1,4 +1,4 @@
-"""Figures as PNG: what every section is drawn with."""
+"""Draw the sections' figures as PNG."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-WIDTH = 10.0  # inches: 1100 pixels, the page's own width
+WIDTH = 10.0  # inches: 1100 pixels, the width of the page
 DPI = 110
 FONT = 9
 Pictures = NDArray[np.uint8]
 
 
 def new_figure(height: float, rows: int = 1, columns: int = 1, **settings: Any) -> tuple[Figure, NDArray[Any]]:
-    """A figure of the page's width, and its axes `(rows, columns)`."""
+    """Make a figure as wide as the page; return it and its axes `(rows, columns)`."""
     figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **settings)
     for each in axes.ravel():
@@ -26,14 +26,14 @@ def new_figure(height: float, rows: int = 1, columns: int = 1, **settings: Any) 
 
 
 def render_png(figure: Figure) -> bytes:
-    """The figure's PNG, without the version that drew it: equal figures give equal bytes."""
+    """Render a figure as PNG without matplotlib's version in it, so that equal figures give equal bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
 
 
 def picture_grid(rows: Sequence[tuple[str, Pictures]], columns: Sequence[str]) -> bytes:
-    """Rows of pictures `(N, side, side, 3)`, each row with its label, each column with its heading."""
+    """Draw rows of pictures `(N, side, side, 3)` with a label per row and a heading per column."""
     side = (WIDTH - 1.6) / max(len(columns), 5)
     figure, axes = new_figure(len(rows) * (side + 0.05) + 0.35, len(rows), len(columns))
     for (label, pictures), line in zip(rows, axes, strict=True):
@@ -48,7 +48,7 @@ def picture_grid(rows: Sequence[tuple[str, Pictures]], columns: Sequence[str]) -
 
 
 def draw_heatmap(axes: Any, values: NDArray[Any], title: str, **settings: Any) -> None:
-    """Values `(rows, steps)` as colours, with their scale beside them."""
+    """Draw values `(rows, steps)` as colours beside a colour bar."""
     image = axes.imshow(values, aspect="auto", interpolation="nearest", **settings)
     axes.set_title(title, fontsize=FONT + 1)
     bar = axes.figure.colorbar(image, ax=axes, pad=0.01)

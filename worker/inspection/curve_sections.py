@@ -1,4 +1,4 @@
-"""Curves: the losses of trainings, the fitness of a run."""
+"""Sections with curves: the losses of trainings, the fitness of a run."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from dreamfleet.worker.inspection.page import Section
 from dreamfleet.worker.inspection.training_curves import MODELS, UNITS, LossCurve, TrainingCurves
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-MARKED = 25  # points of a line, about
+MARKED = 25  # approximate number of markers on a line
 Style = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class CurveStyle:
-    """How lines of batches and of held-out drives are drawn."""
+    """The line styles of training batches and of held-out drives."""
 
     trained: Style
     held_out: Style
 
     @classmethod
     def of(cls, trained: str, held_out: str, marker: str = "o", alpha: float = 1.0) -> CurveStyle:
-        """In these colours."""
+        """Make the styles from two colours."""
         held = {"color": held_out, "linewidth": 1.6, "marker": marker, "markersize": 4}
         return cls({"color": trained, "linewidth": 1.2, "alpha": alpha}, held)
 
@@ -42,7 +42,7 @@ ALONE, ANY = CurveStyle.of("tab:blue", "tab:orange"), CurveStyle.of("tab:gray", 
 
 
 def loss_sections(found: Sequence[TrainingCurves]) -> list[Section]:
-    """A section for each model that was trained."""
+    """Return a section for each trained model."""
     names = dict.fromkeys(each.name for each in found)
     looks = {name: CurveStyle.of(colour, colour, marker, 0.5)
              for name, colour, marker in zip(names, cycle(PLOT_COLOURS), cycle(MARKERS), strict=False)}  # fmt: skip
@@ -51,7 +51,7 @@ def loss_sections(found: Sequence[TrainingCurves]) -> list[Section]:
 
 
 def _loss_section(found: Sequence[TrainingCurves], model: str, looks: Mapping[str, CurveStyle]) -> Section:
-    """A panel for each part of a loss: of each training what its batches and what held-out drives lost."""
+    """Draw a panel for each part of a loss, with the curves of batches and held-out drives of each training."""
     parts = [part for part in UNITS if any(part in each.curves for each in found)]
     figure, axes = new_figure(3.6 if len(found) == 1 else 4.0, 1, len(parts))
     for panel, part in zip(axes[0], parts, strict=True):
@@ -85,7 +85,7 @@ def _draw(panel: Any, curve: LossCurve, look: CurveStyle) -> None:
 
 
 def _legend_handles(names: Sequence[str], looks: Mapping[str, CurveStyle]) -> list[Line2D]:
-    """What the lines of one training are; of several, whose they are too."""
+    """Legend handles of the two kinds of lines, and of each training if there are several."""
     kinds, named = (
         (ALONE, []) if len(names) == 1 else (ANY, [_legend_handle(name, looks[name].held_out) for name in names])
     )
@@ -110,7 +110,7 @@ def _scale(panel: Any, lines: Sequence[NDArray[np.float64]]) -> None:
 
 
 def fitness_section(run: RunFolder) -> Section | None:
-    """The population's fitness over a run's generations; `None` before the first has closed."""
+    """Draw the population's fitness over a run's generations; `None` before the first one is complete."""
     history = run.history()
     if not history:
         return None

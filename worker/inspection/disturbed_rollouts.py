@@ -1,4 +1,4 @@
-"""Drives under disturbed actions, with the simulator's truth beside what a world model held at each step."""
+"""Drive with disturbed actions and record the simulator's true state beside the world model's state at each step."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 Floats = NDArray[np.float32]
 Truth = dict[str, NDArray[np.float64]]
-OFF, OFFSET = "off_road", "lateral_offset"  # of a world's truth: 1 or 0; how far off it is
+OFF, OFFSET = "off_road", "lateral_offset"  # columns of a world's true state: 1 or 0; distance from the centre line
 
 
 @dataclass(frozen=True)
 class DisturbedDriveConfig:
     """How drives are disturbed, and where they end.
 
-    `noise` is the standard deviation of what is added to each action, in halves of its range. The road is lost where
-    the car is off it for `lasting` steps in a row; a drive goes on `after` steps from the first of them. The first
-    `opening` steps are not measured: in CarRacing's the camera comes down. `anywhere` begins drives at a random place
-    of their world, for drivers that never come far.
+    `noise` is the standard deviation of the noise on each action, in halves of its range. The road is lost when the car
+    is off it for `lasting` steps in a row; a drive ends `after` steps after the first of them. The first `opening`
+    steps are not measured, because CarRacing's camera zooms in. `anywhere` begins drives at a random place of their
+    world, for drivers that do not get far.
     """
 
     noise: float = 0.3
@@ -50,10 +50,11 @@ class DisturbedDriveConfig:
 
 @dataclass(frozen=True)
 class DisturbedDrive:
-    """T steps: before each what the mind held, `latent` (T, latent) and `state` (T, state), and the `truth` (T,).
+    """A drive of T steps.
 
-    Then the `action` (T, actions) that was done, `push` (T, actions) of it the disturbance, and its `reward` (T,).
-    `lost` is the first step of the loss that ended it, if one did; `hidden` how many columns of the state are h.
+    Before each step: the world model's `latent` (T, latent) and `state` (T, state), the columns of the `truth` (T,).
+    Then the `action` (T, actions) including the disturbance `push` (T, actions), and the `reward` (T,). `lost` is the
+    first step of the loss of the road that ended the drive, if any. The first `hidden` columns of the state are h.
     """
 
     seed: int
@@ -71,13 +72,13 @@ class DisturbedDrive:
 
     @property
     def features(self) -> Floats:
-        """[z, h] of each step `(T, latent + hidden)`: what a controller sees."""
+        """[z, h] of each step `(T, latent + hidden)`, a controller's inputs."""
         return np.concatenate([self.latent, self.state[:, : self.hidden]], axis=1)
 
 
 @dataclass
 class Notes:
-    """What a witness writes down, step by step."""
+    """The columns of a drive while it is recorded, one entry per step."""
 
     latent: list[Floats] = field(default_factory=list)
     state: list[Floats] = field(default_factory=list)
@@ -87,7 +88,7 @@ class Notes:
 
 
 class DisturbedDriveRecorder(DisturbedPolicy):
-    """A policy that drives by a disturbed hand, and notes what was true and what the mind held."""
+    """A policy that disturbs an actor's actions, and records the true state and the world model's state."""
 
     def __init__(
         self, mind: RecurrentState, actor: Actor, disturbance: Disturbance, truth: Callable[[], dict[str, float]]
@@ -97,7 +98,7 @@ class DisturbedDriveRecorder(DisturbedPolicy):
         self.notes, self.hidden = Notes(), mind.hidden
 
     def on_action(self, action: Floats, push: Floats) -> None:
-        """Write a step down."""
+        """Record a step."""
         notes, mind = self.notes, self._mind
         notes.latent.append(mind.latent[0])
         notes.state.append(mind.state[0])
@@ -109,14 +110,14 @@ class DisturbedDriveRecorder(DisturbedPolicy):
 def witness(
     bundle: Bundle, mind: RecurrentState, hand_of: Callable[[int], Actor], config: DisturbedDriveConfig
 ) -> Iterator[DisturbedDrive]:
-    """One drive a seed after the other, without end; `mind` is the bundle's, `hand_of` gives the hand of a seed.
+    """Record drives without end, one per seed; `mind` is the bundle's state, `hand_of` gives the actor of a seed.
 
-    `UsageError` where the bundle's world tells no truth, or its actions cannot be disturbed.
+    `UsageError` if the bundle's world gives no true state, or its actions are not continuous.
     """
     assignment = Assignment.of(bundle.manifest.task, bundle)
     task = find_task(bundle.manifest.task)
     if not isinstance(task, TaskWithTrueState):
-        raise UsageError(f"task {task.name} tells no truth to compare with: give it a `truth` (docs/tasks.md)")
+        raise UsageError(f"task {task.name} gives no true state to compare with: give it a `truth` (docs/tasks.md)")
     if not isinstance(actions := task.world_of(assignment).actions, Continuous):
         raise UsageError(f"task {task.name} has no continuous actions: its drives cannot be disturbed")
     begin_at = _random_begin(task) if config.anywhere else lambda _seed: None
@@ -132,7 +133,7 @@ def witness(
 
 def _random_begin(task: Task) -> Callable[[int], ResetHook]:
     if not isinstance(task, RecordableTask):
-        raise UsageError(f"drives of task {task.name} cannot begin anywhere: let a --controller drive")
+        raise UsageError(f"drives of task {task.name} cannot begin at a random place: give a --controller")
     begin = task.begin_anywhere
     return lambda seed: lambda environment, _seen: begin(environment, np.random.default_rng(seed))
 
@@ -161,7 +162,7 @@ def _drive(
 
 
 def first_sustained(off: NDArray[np.bool_], lasting: int) -> NDArray[np.int64]:
-    """Where each row `(rows, T)` is first off for `lasting` steps in a row `(rows,)`; -1: nowhere."""
+    """The first step `(rows,)` at which each row `(rows, T)` is off for `lasting` steps in a row; -1 if never."""
     if off.shape[1] < lasting:
         return np.full(len(off), -1)
     stays: NDArray[np.bool_] = np.all(np.lib.stride_tricks.sliding_window_view(off, lasting, axis=1), axis=2)

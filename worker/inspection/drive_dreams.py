@@ -1,4 +1,4 @@
-"""Dreams that begin at a step of a real drive."""
+"""Dream from a step of a real drive on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Doubles = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DreamSegment:
-    """A step of a drive from which dreams begin, and how many steps they last."""
+    """A drive's step at which dreams begin, and their length in steps."""
 
     drive: DisturbedDrive
     step: int
@@ -30,12 +30,12 @@ class DreamSegment:
 
     @property
     def steps(self) -> slice:
-        """The drive's steps that are dreamt."""
+        """The drive's steps that the dreams replace."""
         return slice(self.step, self.step + self.length)
 
 
 class DriveDreamer:
-    """Dreams from real states on, under a controller that is pushed as in reality, or under reality's own actions."""
+    """Dreams from real states on, under a controller with the real disturbance or under the drive's own actions."""
 
     def __init__(self, bundle: Bundle, controller: Controller, temperature: float, rows: int) -> None:
         fitting = bundle.for_controller(controller)
@@ -44,10 +44,10 @@ class DriveDreamer:
         self._parameters = np.repeat(controller.parameters[None], rows, axis=0)
 
     def dream(self, segment: DreamSegment, *, own: bool) -> tuple[Floats, Doubles]:
-        """[z, h] `(dreams, steps, features)`, the first step's reality's, and rewards `(dreams, steps)`.
+        """Return [z, h] `(dreams, steps, features)`, real at the first step, and rewards `(dreams, steps)`.
 
-        `own`: the controller chooses what is done; else what was done in reality is done again. A dream that ends stays
-        as it was, and brings nothing more.
+        With `own` the controller chooses the actions; otherwise the drive's actions are repeated. After its end a dream
+        repeats its last state with reward 0.
         """
         drive, rows, features, rewards = segment.drive, len(self._parameters), list[Floats](), list[Doubles]()
         noises = [
@@ -67,9 +67,9 @@ class DriveDreamer:
         return np.stack(features, axis=1), np.stack(rewards, axis=1)
 
     def predict_next(self, drive: DisturbedDrive) -> tuple[Floats, Doubles]:
-        """[z, h] of each step `(T, features)`, z as dreamt from the real step before, and its foretold reward `(T,)`.
+        """Predict each step from the real step before: [z, h] `(T, features)` and rewards `(T,)`.
 
-        The first z is the picture's own.
+        z is the dreamt one, except for the first step's, which is real; h is real.
         """
         noise = EpisodeNoise(drive.seed, self._world.chance)
         pieces = [noise.draw_block() for _ in range(0, len(drive), BLOCK_STEPS)]

@@ -1,4 +1,4 @@
-"""A drive, and what the encoder makes of it: a fresh one in a bundle's own world."""
+"""A drive with the encoder's latents of its pictures, recorded anew in a bundle's world."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from dreamfleet.worker.worldmodel.inference import Encoder
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]
-ZOOM = 50  # steps: CarRacing's camera comes down in the first second
+ZOOM = 50  # steps in which CarRacing's camera zooms in, the first second
 
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """Which track, and how far."""
+    """The track, the length and the driver of a drive."""
 
     seed: int = 20_000  # a validation track
     steps: int = 300
-    action: tuple[float, ...] = ()  # done at each step, whoever else could drive
+    action: tuple[float, ...] = ()  # repeated at each step instead of any driver's
 
 
 @dataclass(frozen=True)
@@ -41,37 +41,37 @@ class EncodedRollout:
     logvar: Floats
     action: Floats
     reward: NDArray[np.float64]
-    description: str  # what drive it is
+    description: str  # for captions
 
     def __len__(self) -> int:
         return len(self.action)
 
     @property
     def nats(self) -> Floats:
-        """What each latent carries `(latent,)`: its divergence from the standard normal, on average."""
+        """The information in each latent `(latent,)`: its mean KL divergence from the standard normal, in nats."""
         nats: Floats = self._divergence.mean(axis=0)
         return nats
 
     @property
     def most_active(self) -> NDArray[np.int64]:
-        """The latents' numbers `(latent,)`, those that carry most first."""
+        """The latents' numbers `(latent,)`, the most informative first."""
         return np.argsort(-self.nats, kind="stable")
 
     @property
     def most_informative_step(self) -> int:
-        """The step whose picture says most; of a drive that is long enough, one after the opening's zoom."""
+        """The step with the largest KL divergence; after the opening zoom if the drive is long enough."""
         start = ZOOM if len(self) > ZOOM else 0
         return start + int(self._divergence[start:].sum(axis=1).argmax())
 
     @property
     def _divergence(self) -> Floats:
-        """In nats `(T, latent)`."""
-        told: Floats = 0.5 * (self.mu**2 + np.exp(self.logvar) - self.logvar - 1)
-        return told
+        """The KL divergence of each latent at each step, in nats `(T, latent)`."""
+        divergence: Floats = 0.5 * (self.mu**2 + np.exp(self.logvar) - self.logvar - 1)
+        return divergence
 
 
 class ConstantDriver:
-    """A driver that does the same at each step; `UsageError` for what is no action of the world."""
+    """A driver that repeats one action; `UsageError` if the world has no such action."""
 
     def __init__(self, action: Sequence[float], world: World) -> None:
         actions, names = world.actions, world.action_names
@@ -99,9 +99,9 @@ def _format_action(action: Sequence[float]) -> str:
 def record_drive(
     bundle: Bundle, controller: Controller | None, config: DriveConfig, own: Bundle | None = None
 ) -> EncodedRollout:
-    """Drive one episode: one action alone, else the controller, else the world's second random driver, which drifts.
+    """Drive one episode with `config.action`, else with the controller, else with the world's second random driver.
 
-    `own` is the controller's world model, where that is another than the bundle which sees the drive.
+    `own` is the controller's world model if it differs from `bundle`, which encodes the drive.
     """
     if own is not None:
         check_same_pictures(own, bundle)

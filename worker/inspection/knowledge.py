@@ -1,4 +1,4 @@
-"""What a world model knows of its world's truth: how much of each quantity a map from [z, h] finds on unseen drives."""
+"""How much of its world's true state a world model holds: R² of maps from [z, h] to each quantity on unseen drives."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.inspection.disturbed_rollouts import OFF, DisturbedDrive
-from dreamfleet.worker.inspection.estimate import Estimate
-from dreamfleet.worker.inspection.probe import LinearProbe, NetworkProbe, Probe, folds, other_rows
+from dreamfleet.worker.inspection.probe import Estimate, LinearProbe, NetworkProbe, Probe, folds, other_rows
 
 Floats = NDArray[np.float64]
 Fit = Callable[[Floats, Floats], Probe]
@@ -20,7 +19,7 @@ PROBES: tuple[tuple[str, Fit], ...] = (("linear", LinearProbe.fit), ("network", 
 
 @dataclass(frozen=True)
 class KnownQuantity:
-    """Of one quantity: R² on held-out drives by what is seen (`z`, `zh`) and how it is mapped, as in `z_linear`."""
+    """One quantity's R² on held-out drives, by inputs (`z`, `zh`) and kind of map, with keys such as `z_linear`."""
 
     quantity: str
     deviation: float  # of its true values
@@ -29,7 +28,7 @@ class KnownQuantity:
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known of each quantity, and by how many drives and steps that was measured."""
+    """R² of each quantity, and the number of drives and steps it was measured on."""
 
     drives: int
     steps: int
@@ -37,9 +36,9 @@ class Knowledge:
 
 
 def cross_validate_probes(drives: Sequence[DisturbedDrive], opening: int) -> Knowledge:
-    """Hold each fold's drives against maps that were fitted on the other folds'; `UsageError` if there are too few.
+    """Cross-validate: predict each fold's drives by maps fitted on the other folds; `UsageError` for too few drives.
 
-    Steps on which the road is lost are left out: what the road ahead is like means nothing there.
+    Steps off the road are left out, because the quantities of the road ahead mean nothing there.
     """
     seen = [(drive, rows) for drive in drives if (rows := _on_road(drive, opening)).any()]
     if len(seen) < 2:
@@ -60,9 +59,9 @@ def cross_validate_probes(drives: Sequence[DisturbedDrive], opening: int) -> Kno
 
 
 def explained_variance(truths: Sequence[Floats], predictions: Sequence[Floats]) -> list[Estimate]:
-    """R² of each column over all drives' rows; its standard error by leaving out one drive at a time (jackknife).
+    """R² of each column over the rows of all drives, with a standard error by the jackknife over drives.
 
-    Of a column that never changes nothing can be explained: 0.
+    It is 0 for a column that never changes.
     """
     mean = np.concatenate(truths).mean(axis=0)
     wrong = np.stack([((p - t) ** 2).sum(axis=0) for p, t in zip(predictions, truths, strict=True)])
@@ -79,13 +78,13 @@ def _explained_share(wrong: Floats, spread: Floats) -> Floats:
 
 
 def _predict_held_out(features: Sequence[Floats], truths: Sequence[Floats], fit: Fit) -> list[Floats]:
-    """Each drive's quantities as a map tells them that has not seen its fold."""
-    told: dict[int, Floats] = {}
+    """Predict each drive's quantities by a map that was fitted without its fold."""
+    predicted: dict[int, Floats] = {}
     for fold in folds(len(features)):
         rest = other_rows(fold, len(features))
         probe = fit(np.concatenate([features[row] for row in rest]), np.concatenate([truths[row] for row in rest]))
-        told |= {row: probe.predict(features[row]) for row in fold}
-    return [told[row] for row in range(len(features))]
+        predicted |= {row: probe.predict(features[row]) for row in fold}
+    return [predicted[row] for row in range(len(features))]
 
 
 def _on_road(drive: DisturbedDrive, opening: int) -> NDArray[np.bool_]:

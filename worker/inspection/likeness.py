@@ -1,8 +1,8 @@
-"""Whether dreams are of the world that is driven: how often they come to what is rare there.
+"""Compare how often large values of each true quantity occur in dreams and in reality.
 
-A dream may follow from step to step and yet hold fewer bends than the world does, or milder ones; controllers evolve
-for what it holds. A linear probe tells each quantity of the truth from [z, h]. It is fitted on other drives' latents as
-they are foreseen one step ahead, and it also judges real drives, so that its own faults show.
+A dream may be plausible from step to step and yet contain fewer or milder bends than the world, and controllers evolve
+for what it contains. A linear probe estimates each quantity from [z, h]. It is fitted on other drives, on latents
+predicted one step ahead, and is also applied to real steps, so that its own errors show.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.inspection.disturbed_rollouts import OFF, DisturbedDrive
 from dreamfleet.worker.inspection.drive_dreams import DreamSegment, DriveDreamer
-from dreamfleet.worker.inspection.estimate import Estimate
-from dreamfleet.worker.inspection.probe import LinearProbe, folds, other_rows
+from dreamfleet.worker.inspection.probe import Estimate, LinearProbe, folds, other_rows
 from dreamfleet.worker.inspection.road_losses import FOLDS
 
 Floats = NDArray[np.float64]
-RARE = 0.9  # the quantile of a quantity's size in reality, beyond which it is rare
-SHORTEST = 100  # steps on the road that a drive has to have
+RARE = 0.9  # quantile of a quantity's absolute value in reality above which it counts as rare
+SHORTEST = 100  # steps on the road that a drive must have
 
 
 @dataclass(frozen=True)
 class RareFrequency:
-    """Of one quantity: the size that a tenth of real steps exceeds, and the share of steps that does.
+    """One quantity: the absolute value that a tenth of real steps exceeds, and the shares of steps that exceed it.
 
-    In `reality` by its truth, `foreseen` by the probe on real steps, `dream` by the probe on dreamt ones.
+    The shares are by source: `reality` by the true state, `foreseen` by the probe on real steps predicted one step
+    ahead, `dream` by the probe on dreamt steps.
     """
 
     quantity: str
@@ -43,16 +43,16 @@ def compare(
     drives: Sequence[DisturbedDrive], bundle: Bundle, controller: Controller, opening: int, dreams: int,
     temperature: float,
 ) -> list[RareFrequency]:  # fmt: skip
-    """Dreams begun behind each drive's opening, as long as it keeps to the road, under the same disturbance.
+    """Compare each drive, from its opening until it leaves the road, with dreams of the same length and disturbance.
 
-    `UsageError` if fewer than two drives keep to it for long enough.
+    `UsageError` if fewer than two drives stay on the road for long enough.
     """
     begun = [each for drive in drives if (each := _dream_segment(drive, opening)) is not None]
     if len(begun) < 2:
-        raise UsageError(f"dreams are held to two drives at least that keep to the road for {SHORTEST} steps")
+        raise UsageError(f"dreams are compared with two drives at least that stay on the road for {SHORTEST} steps")
     imagination = DriveDreamer(bundle, controller, temperature, dreams)
     if begun[0].drive.truth.keys() <= {OFF}:
-        raise UsageError("the world's truth tells nothing that dreams could be held to")
+        raise UsageError("the world's true state has no quantity to compare dreams with")
     names = [name for name in begun[0].drive.truth if name != OFF]
     truths = [np.stack([each.drive.truth[name][each.steps] for name in names], axis=1) for each in begun]
     foreseen = [imagination.predict_next(each.drive)[0][each.steps] for each in begun]
@@ -65,10 +65,14 @@ def compare(
             dreamt = _before_ends(imagination.dream(begun[row], own=True)[0])
             if not len(dreamt):
                 continue
-            told = {"reality": truths[row], "foreseen": probe.predict(foreseen[row]), "dream": probe.predict(dreamt)}
-            shares.append({where: (np.abs(values) > rare).mean(axis=0) for where, values in told.items()})
+            by_source = {
+                "reality": truths[row],
+                "foreseen": probe.predict(foreseen[row]),
+                "dream": probe.predict(dreamt),
+            }
+            shares.append({where: (np.abs(values) > rare).mean(axis=0) for where, values in by_source.items()})
     if len(shares) < 2:
-        raise UsageError("the dreams of all drives but one end as they begin: nothing of them can be told")
+        raise UsageError("the dreams of all drives but one end as they begin: nothing can be measured on them")
     found = {where: np.stack([each[where] for each in shares], axis=1) for where in shares[0]}
     return [
         RareFrequency(name, float(rare[row]), {where: Estimate.of(list(each[row])) for where, each in found.items()})
@@ -77,9 +81,9 @@ def compare(
 
 
 def _before_ends(features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The steps `(steps, features)` of dreams `(dreams, steps, features)`, without those behind their ends.
+    """The steps `(steps, features)` of dreams `(dreams, steps, features)` before their ends.
 
-    A dream that has ended stays as it was.
+    After its end a dream repeats its last state.
     """
     still = (np.diff(features, axis=1) == 0).all(axis=2)
     going: NDArray[np.float32] = features[:, 1:][~still]
@@ -87,7 +91,7 @@ def _before_ends(features: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _dream_segment(drive: DisturbedDrive, opening: int) -> DreamSegment | None:
-    """The part of a drive behind its opening until it first leaves the road."""
+    """The part of a drive from its opening until it first leaves the road; `None` if that is too short."""
     off = np.flatnonzero(drive.truth.get(OFF, np.zeros(len(drive)))[opening:] > 0)
     length = int(off[0]) if len(off) else len(drive) - opening
     return DreamSegment(drive, opening, length) if length >= SHORTEST else None

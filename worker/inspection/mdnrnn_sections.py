@@ -1,4 +1,4 @@
-"""What the MDN-RNN foresees: a dream beside the drive, rewards, and where attention looks."""
+"""Sections on the MDN-RNN: a dream beside the drive, predicted rewards, and attention weights."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from dreamfleet.worker.inspection.vae_view import VAEView
 from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
 
 Floats = NDArray[np.float32]
-STEPS = (0, 5, 10, 20, 50, 100, 200, 299)  # shown of a dream
+STEPS = (0, 5, 10, 20, 50, 100, 200, 299)  # of a dream that are drawn
 TEMPERATURES = (0.5, 1.0)
 
 
 def recurrent_states(bundle: Bundle, drive: EncodedRollout) -> Floats:
-    """The recurrent state `(T, 1, state)` before each step of the drive, as a controller would have it."""
+    """The recurrent state `(T, 1, state)` before each step of the drive, as a controller would see it."""
     model, label = DreamStep(bundle), RewardLabel(bundle)
     state, states = model.zero_state(1), []
     for latent, action, reward in zip(drive.mu, drive.action, drive.reward, strict=True):
@@ -31,7 +31,7 @@ def recurrent_states(bundle: Bundle, drive: EncodedRollout) -> Floats:
 
 
 def dream_latents(bundle: Bundle, drive: EncodedRollout, temperature: float, seed: int = 0) -> Floats:
-    """The latents `(T, latent)` dreamt from the drive's first one under its actions."""
+    """Dream latents `(T, latent)` from the drive's first one on under its actions."""
     check_temperature(temperature)
     model = DreamStep(bundle)
     noise, latent, state = EpisodeNoise(seed, model.chance), drive.mu[:1], model.zero_state(1)
@@ -45,7 +45,7 @@ def dream_latents(bundle: Bundle, drive: EncodedRollout, temperature: float, see
 
 
 def dream_section(bundle: Bundle, drive: EncodedRollout, vae_view: VAEView) -> Section:
-    """Frames of the drive and of dreams under the same actions."""
+    """Draw frames of the drive and of dreams under the same actions."""
     steps = [step for step in STEPS if step < len(drive)]
     rows = [("drive", drive.picture[steps]), ("decoded", vae_view.decode(drive.mu[steps]))]
     for temperature in TEMPERATURES:
@@ -60,7 +60,7 @@ def dream_section(bundle: Bundle, drive: EncodedRollout, vae_view: VAEView) -> S
 
 
 def reward_section(bundle: Bundle, drive: EncodedRollout) -> Section:
-    """Predicted and real reward of each step, and their sums."""
+    """Draw the predicted and the real reward of each step, and their running sums."""
     world, zeros = DreamWorld(bundle, 1.0), np.zeros((1, bundle.manifest.latent), np.float32)
     awake = [
         world.imagine(latent[None], action[None], state, Draw(zeros, zeros)).reward[0]
@@ -85,16 +85,16 @@ def reward_section(bundle: Bundle, drive: EncodedRollout) -> Section:
 
 
 def _dreamt_rewards(world: DreamWorld, drive: EncodedRollout) -> list[float]:
-    noise, latent, state, told = EpisodeNoise(0, world.chance), drive.mu[:1], world.begin(1), []
+    noise, latent, state, rewards = EpisodeNoise(0, world.chance), drive.mu[:1], world.begin(1), []
     for action in drive.action:
         moment = world.imagine(latent, action[None], state, noise.next())
-        told.append(float(moment.reward[0]))
+        rewards.append(float(moment.reward[0]))
         latent, state = moment.latent, moment.state
-    return told
+    return rewards
 
 
 def attention_section(bundle: Bundle, drive: EncodedRollout) -> Section | None:
-    """Where the model looks at each step of the drive; `None` without a window."""
+    """Draw the attention weights at each step of the drive; `None` for a model without attention."""
     model = DreamStep(bundle)
     if not model.has_attention:
         return None

@@ -1,4 +1,4 @@
-"""Figures of a world model, measured on disturbed drives of its world."""
+"""Measure a world model on disturbed drives of its world."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ OnCount = Callable[[int], None]
 
 @dataclass(frozen=True)
 class DriverChoice:
-    """Who drives: a controller and its own world model, or a random driver of the world by name."""
+    """The driver: a controller with its own world model, or a random driver of the world by name."""
 
     controller: Controller | None = None
     own: Bundle | None = None
     driver: str = ""
 
     def observing_model(self, bundle: Bundle) -> Bundle:
-        """The world model that watches, under the controller if that drives by it."""
+        """The world model that observes the drives, set up for the controller if that was evolved with it."""
         if self.controller is None or self.controller.bundle != bundle.sha256:
             return bundle
         return bundle.for_controller(self.controller)
 
     def hands(self, bundle: Bundle, mind: RecurrentState) -> Callable[[int], Actor]:
-        """The hand of each seed."""
+        """Return a function from a drive's seed to its actor."""
         if self.controller is None:
             return make_driver_actors(bundle, self.driver)
         if self.own is None:
@@ -47,11 +47,8 @@ class DriverChoice:
 def probe(
     bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig, episodes: int, on_drive: OnCount
 ) -> Knowledge:
-    """What the world model holds of the truth on so many drives."""
-    drives = []
-    for drive in islice(_drives(bundle, driving, config), episodes):
-        drives.append(drive)
-        on_drive(len(drives))
+    """Measure how much of the true state the world model holds, on `episodes` drives."""
+    drives = _first_drives(bundle, driving, config, episodes, on_drive)
     return cross_validate_probes(drives, config.opening)
 
 
@@ -63,21 +60,19 @@ def likeness(
     episodes: int,
     on_drive: OnCount,
 ) -> list[RareFrequency]:
-    """How often dreams come to what is rare on so many drives; `UsageError` as of `measure_dream_losses`."""
+    """Measure how often rare values occur in dreams, on `episodes` drives; errors as in `measure_dream_losses`."""
     controller = _dream_controller(bundle, driving)
-    drives = []
-    for drive in islice(_drives(bundle, driving, config), episodes):
-        drives.append(drive)
-        on_drive(len(drives))
+    drives = _first_drives(bundle, driving, config, episodes, on_drive)
     return alike(drives, bundle, controller, config.opening, dreams.dreams, dreams.temperature)
 
 
 def measure_dream_losses(
     bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig, losses: RoadLossConfig, on_loss: OnCount
 ) -> tuple[list[RoadLossComparison], int]:
-    """Dreams begun before real losses of the road, and how many drives it took to find these.
+    """Compare real losses of the road with dreams begun before them; also return how many drives that took.
 
-    `UsageError` unless a controller drives that was evolved with this world model: it has to drive on in the dream.
+    `UsageError` unless the driver is a controller that was evolved with this world model, because it also drives the
+    dreams.
     """
     controller = _dream_controller(bundle, driving)
     drives = collect_losing_drives(_drives(bundle, driving, config), losses, config, on_loss)
@@ -85,7 +80,7 @@ def measure_dream_losses(
 
 
 def _dream_controller(bundle: Bundle, driving: DriverChoice) -> Controller:
-    """Who drives in dreams too."""
+    """The controller, which drives the dreams too."""
     controller = driving.controller
     if controller is None or controller.bundle != bundle.sha256:
         raise UsageError(
@@ -98,3 +93,13 @@ def _dream_controller(bundle: Bundle, driving: DriverChoice) -> Controller:
 def _drives(bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig) -> Iterator[DisturbedDrive]:
     mind = RecurrentState(driving.observing_model(bundle))
     return witness(bundle, mind, driving.hands(bundle, mind), config)
+
+
+def _first_drives(
+    bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig, episodes: int, on_drive: OnCount
+) -> list[DisturbedDrive]:
+    drives = []
+    for drive in islice(_drives(bundle, driving, config), episodes):
+        drives.append(drive)
+        on_drive(len(drives))
+    return drives

@@ -1,4 +1,4 @@
-"""Sections as one HTML page that needs no other file."""
+"""An HTML page of sections that needs no other file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ th { color: #5b6470; } td { font-variant-numeric: tabular-nums; overflow-wrap: a
 
 @dataclass(frozen=True)
 class Page:
-    """A title, what it is about, a table of facts, and sections."""
+    """A page: title, a line about its subject, a table of facts, and sections."""
 
     title: str
     about: str
@@ -29,7 +29,7 @@ class Page:
     sections: Sequence[Section]
 
     def html(self) -> str:
-        """The page; pictures are data URIs."""
+        """Render the page; pictures become data URIs."""
         rows = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>\n" for name, value in self.facts)
         body = "".join(_section(each) for each in self.sections)
         return (
@@ -53,7 +53,7 @@ def _section(section: Section) -> str:
 
 @dataclass(frozen=True)
 class Section:
-    """A title, what to look for, and a picture (PNG) or none; `name` is its file's."""
+    """A section: title, explanation and perhaps a PNG `picture`; `name` is the section's id and its file's name."""
 
     name: str
     title: str

@@ -1,4 +1,4 @@
-"""The whole look: from a bundle, a run or trainings to a folder of pictures and a page."""
+"""Build an inspection page: from a bundle, a run or trainings to a folder of pictures and an HTML page."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from dreamfleet.common.runs.stages import begun_stages, join_distinct
 from dreamfleet.worker.dream.parallel_dream import can_dream
 from dreamfleet.worker.inspection import curve_sections, mdnrnn_sections, vae_sections
 from dreamfleet.worker.inspection.encoded_rollout import DriveConfig, EncodedRollout, record_drive
-from dreamfleet.worker.inspection.own_pictures import own_pictures
 from dreamfleet.worker.inspection.page import Page, Section
 from dreamfleet.worker.inspection.tables import measured_rows
 from dreamfleet.worker.inspection.training_curves import MODELS, TrainingCurves, load_trainings
+from dreamfleet.worker.inspection.vae_sections import own_pictures
 from dreamfleet.worker.inspection.vae_view import CHECKPOINT, VAEView, held_out_drive
 
 PAGE = "index.html"
-UNITS = {  # of figures of quality, by a part of their names, and what is good
+UNITS = {  # units of the quality figures, by a part of their names, and which values are good
     "picture_error": "summed squared error of the mean picture, which a reconstruction has to beat",
     "reconstruction_error": "summed squared error of a picture: the less, the better",
     "nats_per_dimension": "of the next latent: the less, the better",
     "latent_error": "root mean square, in the latents' spread: 0 is exact, 1 as bad as their mean",
     "auc": "0.5 is chance, 1 exact",
 }
-DRIVEN = ("episodes", "frames", "held_out_episodes")  # of a bundle's provenance
+DRIVEN = ("episodes", "frames", "held_out_episodes")  # counts in a bundle's provenance
 
 
 @dataclass(frozen=True)
 class InspectionSubject:
-    """What is looked at: a bundle; of a run, its controller too. A run without a world model shows how it went.
+    """What the page is about: a bundle, perhaps with a run and its controller, or a run without a world model.
 
-    With neither, trainings alone are looked at. `own` is the controller's world model, where that is another.
+    With none of them the page shows trainings alone. `own` is the controller's world model if it is another.
     """
 
     bundle: Bundle | None
@@ -50,7 +50,7 @@ class InspectionSubject:
 
 @contextmanager
 def find_subject(name: str, runs_dir: Path) -> Iterator[InspectionSubject]:
-    """A bundle by file or shipped name, else a run by name."""
+    """Find a bundle by its file or shipped name, else a run by its name."""
     if is_file(Path(name)) or name in shipped_names():
         yield InspectionSubject(find_bundle(name))
         return
@@ -75,9 +75,9 @@ def write_page(
     subject: InspectionSubject, out: Path, config: DriveConfig, data: Sequence[Path] = (),
     on_section: Callable[[int, str], None] = lambda _done, _name: None, pictures: Sequence[Path] = (),
 ) -> Path:  # fmt: skip
-    """Write a PNG a section and the page, with the trainings in the folders of `data`; returns the page's path.
+    """Write a PNG per section and the page, with the trainings in the folders `data`; return the page's path.
 
-    `pictures` are files of one's own, which the bundle's VAE looks at, else that of the first folder.
+    `pictures` are the user's own files, shown to the bundle's VAE, or without a bundle to that of the first folder.
     """
     sections: list[Section] = []
     try:
@@ -97,14 +97,14 @@ def write_page(
 
 
 def _page(subject: InspectionSubject, trained: Sequence[TrainingCurves], sections: list[Section]) -> Page:
-    told = [(f"{each.name}, {MODELS[each.model]}", each.summary) for each in trained]
+    facts = [(f"{each.name}, {MODELS[each.model]}", each.summary) for each in trained]
     if subject.bundle is not None:
         title = f"{subject.bundle.manifest.name}, a world model"
         about = f"{subject.bundle.path.name}, SHA-256 {subject.bundle.sha256}"
-        return Page(title, about, manifest_facts(subject.bundle) + told, sections)
+        return Page(title, about, manifest_facts(subject.bundle) + facts, sections)
     if subject.run is None:
         names = ", ".join(dict.fromkeys(each.name for each in trained))
-        return Page(f"How {names} learnt", f"trainings: {len(told)}", told, sections)
+        return Page(f"How {names} learnt", f"trainings: {len(facts)}", facts, sections)
     settings, history = subject.run.settings, subject.run.history()
     stages = begun_stages(settings, history, subject.run.evaluations())
     rows = [
@@ -113,7 +113,7 @@ def _page(subject: InspectionSubject, trained: Sequence[TrainingCurves], section
         ("population", join_distinct(f"{each.stage.population} x {each.stage.episodes} episodes" for each in stages)),
         ("generations", str(len(history))),
     ]
-    return Page(f"{subject.run.name}, a run without a world model", f"run {subject.run.uid}", rows + told, sections)
+    return Page(f"{subject.run.name}, a run without a world model", f"run {subject.run.uid}", rows + facts, sections)
 
 
 def sections_of(
@@ -123,7 +123,7 @@ def sections_of(
     pictures: Sequence[Path],
     trained: Sequence[TrainingCurves],
 ) -> Iterator[Section]:
-    """The sections of the page, each as it is drawn."""
+    """Yield the sections of the page one by one as they are drawn."""
     if pictures:
         yield own_pictures(_find_vae_view(subject, data), pictures)
     if subject.bundle is not None:
@@ -138,14 +138,12 @@ def _find_vae_view(subject: InspectionSubject, data: Sequence[Path]) -> VAEView:
     if subject.bundle is not None:
         return VAEView.of_bundle(subject.bundle)
     if not data:
-        raise UsageError(
-            "--picture is looked at by a VAE, and this run has none: name a bundle, or a training's --data"
-        )
+        raise UsageError("--picture needs a VAE, and this run has none: name a bundle, or a training's --data")
     return VAEView.of_folder(data[0])
 
 
 def _vae_sections(data: Sequence[Path], config: DriveConfig) -> Iterator[Section]:
-    """What VAEs keep that no bundle need hold yet: of one folder everything, of several the pictures of each."""
+    """Sections on VAEs in data folders: all sections for one folder, only reconstructions for several."""
     folders = [each for each in data if (each / CHECKPOINT).exists() and any(each.glob("episodes/[0-9]*.npz"))]
     for number, folder in enumerate(folders, 1):
         try:
@@ -193,27 +191,25 @@ def _dream_sections(bundle: Bundle, driven: EncodedRollout, vae_view: VAEView) -
 
 
 def _with_unit(name: str, value: object) -> str:
-    """A figure of quality with its unit, and what is good."""
+    """Format a quality figure with its unit and which values are good."""
     return next((f"{value} ({unit})" for known, unit in UNITS.items() if known in name), str(value))
 
 
 def manifest_facts(bundle: Bundle) -> list[tuple[str, str]]:
-    """What the manifest tells: sizes, models, origin, and the figures of quality on held-out drives."""
+    """The facts in a bundle's manifest: sizes, models, origin, and quality figures on held-out drives."""
     manifest, provenance = bundle.manifest, bundle.manifest.provenance
     model, quality = manifest.models.get("mdnrnn", {}), provenance.get("quality", {})
     rows = [
         ("pictures", " x ".join(str(size) for size in manifest.picture)),
         ("latents", str(manifest.latent)),
         ("hidden units", str(manifest.hidden)),
-        ("reward head", str(model.get("reward", "not told"))),
+        ("reward head", str(model.get("reward", "unknown"))),
         ("attention window", str(model.get("window", 0) or "none")),
         ("recorded states", str(bundle.recorded_count or "none")),
     ]
-    rows += [
-        (name, str(provenance[name])) for name in ("episodes", "frames", "held_out_episodes") if name in provenance
-    ]
+    rows += [(name, str(provenance[name])) for name in DRIVEN if name in provenance]
     if isinstance(quality, dict):
         rows += [(f"quality: {name}", _with_unit(name, value)) for name, value in quality.items()]
     measured = provenance.get("measured", [])
-    rows += [row for told in measured for row in measured_rows(told)] if isinstance(measured, list) else []
+    rows += [row for each in measured for row in measured_rows(each)] if isinstance(measured, list) else []
     return [(name.replace("_", " "), value) for name, value in rows]

@@ -1,6 +1,6 @@
-"""Maps from what a world model holds to what is true: a linear one and a small network, in NumPy alone.
+"""Probes: regressions from a world model's state to true quantities, linear or by a small network, in NumPy alone.
 
-Looking into a world model needs no torch; a network of one layer is thirty lines without it.
+With NumPy alone inspection needs no torch.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-STRENGTH = 1e-3  # of the ridge, a sample, on features of variance 1
+STRENGTH = 1e-3  # of the ridge penalty, per sample, on features of variance 1
 UNITS, UPDATES, BATCH, RATE, DECAY = 64, 2000, 256, 2e-3, 1e-2  # of the network
 MOMENTS, SMALL = (0.9, 0.999), 1e-8  # Adam's (Kingma & Ba 2015)
 
@@ -22,37 +22,37 @@ class Probe(Protocol):
     """A map from features `(N, features)` to quantities `(N, quantities)`."""
 
     def predict(self, features: Any) -> Floats:
-        """The quantities."""
+        """Predict the quantities."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Means and deviations of columns, to and from mean 0 and deviation 1; a constant column becomes 0."""
+    """Standardises columns to mean 0 and deviation 1, and back; a constant column becomes 0."""
 
     mean: Floats
     deviation: Floats
 
     @classmethod
     def of(cls, values: Any, weights: Floats | None = None) -> Scale:
-        """The scale of `values` `(N, columns)`, its rows weighted."""
+        """Compute the scale of `values` `(N, columns)` with `weights` `(N,)`."""
         mean = np.average(values, axis=0, weights=weights)
         deviation = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weights))
         return cls(np.asarray(mean, float), np.asarray(np.where(deviation > 1e-9, deviation, 1.0), float))
 
     def apply(self, values: Any) -> Floats:
-        """The values in this scale."""
+        """Standardise values."""
         scaled: Floats = (values - self.mean) / self.deviation
         return scaled
 
     def undo(self, values: Any) -> Floats:
-        """The values out of this scale."""
+        """Map standardised values back."""
         plain: Floats = values * self.deviation + self.mean
         return plain
 
 
 @dataclass(frozen=True)
 class LinearProbe:
-    """`W x + b` on scaled features."""
+    """Ridge regression on standardised features, solved in closed form."""
 
     inputs: Scale
     outputs: Scale
@@ -60,7 +60,7 @@ class LinearProbe:
 
     @classmethod
     def fit(cls, features: Any, targets: Any, weights: Floats | None = None) -> LinearProbe:
-        """Ridge regression; `weights` `(N,)` of the samples."""
+        """Fit `features` (N, features) to `targets` (N, quantities) with sample `weights` (N,)."""
         inputs, outputs = Scale.of(features, weights), Scale.of(targets, weights)
         x, y = inputs.apply(features), outputs.apply(targets)
         weighted = x if weights is None else x * weights[:, None]
@@ -70,13 +70,13 @@ class LinearProbe:
         return cls(inputs, outputs, np.asarray(found, float))
 
     def predict(self, features: Any) -> Floats:
-        """The quantities."""
+        """Predict the quantities."""
         return self.outputs.undo(self.inputs.apply(features) @ self.weights)
 
 
 @dataclass(frozen=True)
 class NetworkProbe:
-    """One layer of tanh units on scaled features, by Adam on the squared error; the rate falls to 0 as a cosine."""
+    """One layer of tanh units on standardised features, trained by Adam on the squared error with a cosine schedule."""
 
     inputs: Scale
     outputs: Scale
@@ -84,7 +84,7 @@ class NetworkProbe:
 
     @classmethod
     def fit(cls, features: Any, targets: Any, seed: int = 0) -> NetworkProbe:
-        """The same network for the same data and seed."""
+        """Fit a network; the same data and seed give the same network."""
         inputs, outputs = Scale.of(features), Scale.of(targets)
         x, y = (each.astype(np.float32) for each in (inputs.apply(features), outputs.apply(targets)))
         random = np.random.default_rng(seed)
@@ -97,7 +97,7 @@ class NetworkProbe:
         return cls(inputs, outputs, tuple(layers))
 
     def predict(self, features: Any) -> Floats:
-        """The quantities."""
+        """Predict the quantities."""
         first, offsets, second, last = self.layers
         hidden = np.tanh(self.inputs.apply(features) @ first + offsets)
         return self.outputs.undo(hidden @ second + last)
@@ -111,7 +111,7 @@ def _initial_layers(features: int, quantities: int, random: np.random.Generator)
 
 
 def _gradients(layers: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
-    """Of half the mean squared error, and of the decay of weights."""
+    """Gradients of half the mean squared error plus the weight decay."""
     first, offsets, second, last = layers
     hidden = np.tanh(x @ first + offsets)
     error = (hidden @ second + last - y) / len(x)
@@ -122,7 +122,7 @@ def _gradients(layers: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
 def _adam_step(
     layers: Sequence[Any], moments: Sequence[Any], gradients: Sequence[Any], rate: float, update: int
 ) -> None:
-    """One step of Adam, in place."""
+    """Make one step of Adam in place."""
     for layer, (mean, square), gradient in zip(layers, moments, gradients, strict=True):
         mean[...] += (1 - MOMENTS[0]) * (gradient - mean)
         square[...] += (1 - MOMENTS[1]) * (gradient**2 - square)
@@ -131,7 +131,7 @@ def _adam_step(
 
 
 def folds(drives: int, most: int = 4) -> list[list[int]]:
-    """The drives' rows in parts: a probe that judges one of them is fitted on the others."""
+    """Split the drives' rows into cross-validation folds: a probe applied to one is fitted on the others."""
     parts = min(most, drives)
     return [list(range(part, drives, parts)) for part in range(parts)]
 
@@ -139,3 +139,19 @@ def folds(drives: int, most: int = 4) -> list[list[int]]:
 def other_rows(fold: Sequence[int], drives: int) -> list[int]:
     """The rows that are not in a fold."""
     return sorted(set(range(drives)) - set(fold))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value and its standard error."""
+
+    value: float
+    error: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Estimate:
+        """The mean of two or more values and its standard error."""
+        return cls(float(np.mean(values)), float(np.std(values, ddof=1) / len(values) ** 0.5))
+
+    def __str__(self) -> str:
+        return f"{self.value:.2f} ± {self.error:.2f}"

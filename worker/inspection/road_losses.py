@@ -1,7 +1,7 @@
-"""Whether a dream loses the road where reality lost it: dreams begun shortly before real losses.
+"""Measure whether dreams that begin shortly before a real loss of the road lose it too.
 
-Whether a dream is off the road is told by probes, which also judge real steps that they were not fitted on, and dreams
-begun where reality loses nothing: so their own faults show.
+Probes estimate from [z, h] whether a dream is off the road. They are also applied to real steps that they were not
+fitted on, and to dreams that begin where reality stays on the road, so that their own errors show.
 """
 
 from __future__ import annotations
@@ -17,23 +17,27 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.dream.world import check_temperature
-from dreamfleet.worker.inspection.disturbed_rollouts import OFF, OFFSET, DisturbedDrive, DisturbedDriveConfig
+from dreamfleet.worker.inspection.disturbed_rollouts import (
+    OFF,
+    OFFSET,
+    DisturbedDrive,
+    DisturbedDriveConfig,
+    first_sustained,
+)
 from dreamfleet.worker.inspection.drive_dreams import DreamSegment, DriveDreamer
-from dreamfleet.worker.inspection.estimate import Estimate
-from dreamfleet.worker.inspection.probe import folds, other_rows
-from dreamfleet.worker.inspection.road_probe import RoadOutcome, RoadProbe
+from dreamfleet.worker.inspection.probe import Estimate, LinearProbe, folds, other_rows
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
-FOLDS = 10  # a linear probe is fitted at once, and steps off the road are rare
-PATIENCE = 10  # drives for each loss that is wanted, at most
-CALM = "no loss"  # the beginnings behind which reality loses nothing
+FOLDS = 10  # many, because linear probes are fast to fit and steps off the road are rare
+PATIENCE = 10  # most drives per wanted loss
+CALM = "no loss"  # name of the beginnings after which reality stays on the road
 Kinds = list[tuple[str, dict[int, DreamSegment]]]
 
 
 @dataclass(frozen=True)
 class RoadLossConfig:
-    """How many losses, how many steps before each dreams begin, and how many of each beginning at which temperature."""
+    """How many losses to find, how many steps before each dreams begin, how many dreams of each, and temperature."""
 
     losses: int = 30
     before: tuple[int, ...] = (40, 20, 0)
@@ -46,10 +50,10 @@ class RoadLossConfig:
 
 @dataclass(frozen=True)
 class RoadLossComparison:
-    """Means over beginnings of one kind, by figure and by where it was measured.
+    """Means over the beginnings of one kind, by figure and source.
 
-    `reality` is the simulator's truth, `foreseen` what probe and reward head make of its steps, one step ahead.
-    `dream` is the controller's, under the real disturbance; in `same_actions` reality's actions are repeated.
+    `reality` is the simulator's true state; `foreseen` are probe and reward head on real steps predicted one step
+    ahead. `dream` is under the controller with the real disturbance, `same_actions` under the real actions.
     """
 
     begun: str
@@ -57,11 +61,53 @@ class RoadLossComparison:
     figures: dict[str, dict[str, Estimate]]
 
 
+@dataclass(frozen=True)
+class RoadOutcome:
+    """What happened from a beginning on, for each dream `(dreams, steps)`; reality has one row.
+
+    `off`: whether the car is off the road. `offset`: its distance from the centre line. `reward`: of each step.
+    """
+
+    off: NDArray[np.bool_]
+    offset: Doubles
+    reward: Doubles
+
+    def summarise(self, lasting: int) -> dict[str, float]:
+        """Means over the dreams. `lasting` steps off the road in a row count as lost; the end is the last `lasting`."""
+        return {
+            "lost": float((first_sustained(self.off, lasting) >= 0).mean()),
+            "off_at_end": float(self.off[:, -lasting:].mean()),
+            "offset_at_end": float(self.offset[:, -lasting:].mean()),
+            "reward": float(self.reward.sum(axis=1).mean()),
+        }
+
+
+class RoadProbe:
+    """Linear probe of being off the road and of the distance from its centre line.
+
+    Dreamt latents are sampled and noisier than a picture's. So the probe is fitted on [z, h] that the model predicts
+    one step ahead of real ones, with the true state of the predicted step.
+    """
+
+    def __init__(self, drives: Sequence[DisturbedDrive], foreseen: Sequence[Floats], opening: int) -> None:
+        features = np.concatenate([each[opening:] for each in foreseen])
+        off = np.concatenate([drive.truth[OFF][opening:] for drive in drives])
+        offset = np.abs(np.concatenate([drive.truth[OFFSET][opening:] for drive in drives]))
+        often = min(max(float(off.mean()), 1e-6), 1 - 1e-6)
+        balanced = np.where(off > 0, 0.5 / often, 0.5 / (1 - often))  # both classes weigh the same
+        self._probe = LinearProbe.fit(features, np.stack([off, offset], axis=1), balanced)
+
+    def outcome(self, features: Floats, reward: Doubles) -> RoadOutcome:
+        """The outcome of features `(rows, steps, features)` with rewards `(rows, steps)`."""
+        predicted = self._probe.predict(features.astype(np.float64))
+        return RoadOutcome(predicted[..., 0] > 0.5, predicted[..., 1], reward)
+
+
 def collect_losing_drives(
     drives: Iterator[DisturbedDrive], config: RoadLossConfig, driven: DisturbedDriveConfig,
     on_loss: Callable[[int], None] = lambda _losses: None,
 ) -> list[DisturbedDrive]:  # fmt: skip
-    """Drives until so many have lost the road; `UsageError` if ten times as many have not."""
+    """Collect drives until `config.losses` have lost the road; `UsageError` if ten times as many drives have not."""
     taken, losses = list[DisturbedDrive](), 0
     for drive in islice(drives, PATIENCE * config.losses):
         _check_truth(drive)
@@ -82,7 +128,7 @@ def compare(
     config: RoadLossConfig,
     driven: DisturbedDriveConfig,
 ) -> list[RoadLossComparison]:
-    """Dreams begun before each loss, and where nothing is lost; each judged by probes fitted on other folds' drives."""
+    """Compare losses, and stretches without one, with dreams begun there, by probes fitted on other folds' drives."""
     imagination = DriveDreamer(bundle, controller, config.temperature, config.dreams)
     foreseen = [imagination.predict_next(drive) for drive in drives]
     judges = dict[int, RoadProbe]()
@@ -98,10 +144,10 @@ def compare(
 
 
 def _average(courses: Sequence[dict[str, RoadOutcome]], lasting: int) -> dict[str, dict[str, Estimate]]:
-    told = [{where: outcome.summarise(lasting) for where, outcome in each.items()} for each in courses]
+    summaries = [{where: outcome.summarise(lasting) for where, outcome in each.items()} for each in courses]
     return {
-        figure: {where: Estimate.of([each[where][figure] for each in told]) for where in told[0]}
-        for figure in told[0]["reality"]
+        figure: {where: Estimate.of([each[where][figure] for each in summaries]) for where in summaries[0]}
+        for figure in summaries[0]["reality"]
     }
 
 
@@ -120,7 +166,7 @@ def _outcomes(
 
 
 def _dream_segments(drives: Sequence[DisturbedDrive], config: RoadLossConfig, driven: DisturbedDriveConfig) -> Kinds:
-    """Each kind of beginning, by the drives' rows."""
+    """Each kind of beginning by name, with its segments by the drives' rows."""
     lost = {row: drive for row, drive in enumerate(drives) if has_usable_loss(drive, config, driven)}
     kinds: Kinds = []
     for before in config.before:
@@ -137,7 +183,7 @@ def _dream_segments(drives: Sequence[DisturbedDrive], config: RoadLossConfig, dr
 
 
 def _find_calm_stretch(drive: DisturbedDrive, length: int, opening: int) -> DreamSegment | None:
-    """A stretch of a drive on which it is never off the road, taken by its seed."""
+    """A random stretch of a drive, by its seed, on which it is never off the road; `None` if there is none."""
     steps = np.arange(opening, len(drive) - length + 1)
     off = np.concatenate([[0], np.cumsum(drive.truth[OFF])])
     calm = steps[off[steps + length] == off[steps]]
@@ -145,7 +191,7 @@ def _find_calm_stretch(drive: DisturbedDrive, length: int, opening: int) -> Drea
 
 
 def has_usable_loss(drive: DisturbedDrive, config: RoadLossConfig, driven: DisturbedDriveConfig) -> bool:
-    """Whether it lost the road, with enough of the drive before and behind."""
+    """Whether the drive lost the road with enough steps before and after."""
     if drive.lost is None:
         return False
     return drive.lost - max(config.before) >= driven.opening and drive.lost + driven.after <= len(drive)
@@ -153,4 +199,6 @@ def has_usable_loss(drive: DisturbedDrive, config: RoadLossConfig, driven: Distu
 
 def _check_truth(drive: DisturbedDrive) -> None:
     if lacking := {OFF, OFFSET} - drive.truth.keys():
-        raise UsageError(f"the world's truth does not tell {' and '.join(sorted(lacking))}: no loss of a road is seen")
+        raise UsageError(
+            f"the world's true state lacks {' and '.join(sorted(lacking))}: losses of the road cannot be seen"
+        )

@@ -1,4 +1,4 @@
-"""Figures as rows of a table for people."""
+"""Format measured figures as rows of a table."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Any
 
 from dreamfleet.worker.inspection.knowledge import Knowledge
 from dreamfleet.worker.inspection.likeness import RareFrequency
+from dreamfleet.worker.inspection.probe import Estimate
 from dreamfleet.worker.inspection.road_losses import CALM, RoadLossComparison
 
-BEGUN = {"0 steps before": "at the loss", CALM: "where nothing is lost"}  # where another word says it better
+BEGUN = {"0 steps before": "at the loss", CALM: "where nothing is lost"}  # clearer words for some beginnings
 HELD = {"z": "z", "zh": "[z, h]"}
 WHERE = {
     "reality": "reality",
@@ -22,7 +23,7 @@ WHAT = {"lost": "road lost", "off_at_end": "off at the end", "offset_at_end": "o
 
 
 def knowledge_rows(knowledge: Knowledge) -> list[dict[str, str]]:
-    """A row a quantity: its true deviation, and R² by what was seen and how it was mapped."""
+    """A row per quantity: its true standard deviation, and R² by inputs and kind of map."""
     return [
         {"quantity": each.quantity, "deviation": f"{each.deviation:.3g}"}
         | {_column(name): str(share) for name, share in each.found.items()}
@@ -31,7 +32,7 @@ def knowledge_rows(knowledge: Knowledge) -> list[dict[str, str]]:
 
 
 def knowledge_text(knowledge: Knowledge) -> str:
-    """What the rows are of."""
+    """Describe the rows of `knowledge_rows`."""
     return (
         f"R² ± standard error on held-out drives; {knowledge.drives} drives, {knowledge.steps} steps on the road; "
         "deviations in the world's own units, of CarRacing metres, radians and seconds"
@@ -39,17 +40,17 @@ def knowledge_text(knowledge: Knowledge) -> str:
 
 
 def loss_rows(compared: Sequence[RoadLossComparison]) -> list[dict[str, object]]:
-    """A row a kind of beginning and figure: of reality, and of the dreams."""
+    """A row per kind of beginning and figure, with a column per source."""
     return [
         {"begun": BEGUN.get(each.begun, each.begun), "n": each.count, "mean": WHAT[figure]}
-        | {WHERE[where]: str(estimate) for where, estimate in told.items()}
+        | {WHERE[where]: str(estimate) for where, estimate in by_source.items()}
         for each in compared
-        for figure, told in each.figures.items()
+        for figure, by_source in each.figures.items()
     ]
 
 
 def likeness_rows(compared: Sequence[RareFrequency]) -> list[dict[str, str]]:
-    """A row a quantity: what is rare in reality, and how often it is exceeded there and in dreams."""
+    """A row per quantity: its threshold, and how often reality and dreams exceed it."""
     return [
         {"quantity": each.quantity, "rare": f"above {each.rare:.3g}"}
         | {WHERE[where]: str(share) for where, share in each.found.items()}
@@ -64,29 +65,26 @@ LIKENESS = (
 
 
 def loss_text(drives: int, dreams: int, lasting: int) -> str:
-    """What the rows are of."""
+    """Describe the rows of `loss_rows`."""
     return (
         f"means ± standard errors over n beginnings in {drives} drives, {dreams} dreams of each; the road is lost "
         f"after {lasting} steps in a row off it, and the end is as long"
     )
 
 
-def measured_rows(told: Any) -> Iterator[tuple[str, str]]:
-    """What a manifest keeps of these figures: linear maps from [z, h], and how dreams are and what they lose.
-
-    Whatever else a manifest holds there tells nothing.
-    """
+def measured_rows(measured: Any) -> Iterator[tuple[str, str]]:
+    """Yield a row for each main figure in a manifest's `measured`; malformed entries are left out."""
     with suppress(KeyError, TypeError, ValueError, AttributeError, OverflowError):
-        for each in told.get("probe", {}).get("known", ()):
+        for each in measured.get("probe", {}).get("known", ()):
             yield f"R² of {each['quantity']}, linear on [z, h]", _estimate(each["found"]["zh_linear"])
-        for each in told.get("losses", {}).get("begun", ()):
+        for each in measured.get("losses", {}).get("begun", ()):
             yield f"road lost in dreams begun {each['begun']}", _estimate(each["figures"]["lost"]["dream"])
-        for each in told.get("likeness", {}).get("quantities", ()):
+        for each in measured.get("likeness", {}).get("quantities", ()):
             yield f"dreamt share of {each['quantity']} above {each['rare']:.3g}", _estimate(each["found"]["dream"])
 
 
-def _estimate(told: dict[str, float]) -> str:
-    return f"{told['value']:.2f} ± {told['error']:.2f}"
+def _estimate(figure: dict[str, float]) -> str:
+    return str(Estimate(figure["value"], figure["error"]))
 
 
 def _column(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Trainings, as the loss curves of their data folders tell of them."""
+"""Load the loss curves of trainings from their data folders."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from dreamfleet.common.files.regular_files import read_text
 
 Doubles = NDArray[np.float64]
 Points = list[dict[str, float]]
-MOST_BYTES, MOST = 100_000_000, 1e30  # of a file of points, and of a loss that can be drawn
+MOST_BYTES, MOST = 100_000_000, 1e30  # largest file of points, largest loss
 HELD_OUT, WHOLE = "held_out_", "held_out"
 MODELS = {"vae": "the VAE", "mdnrnn": "the MDN-RNN"}
-UNITS = {  # of each part of a loss, as training names it: what it is of, and what in
+UNITS = {  # of each part of a loss, by its name in the curve: title and unit
     "error": ("reconstruction error", "squared error a picture"),
     "kl": ("divergence", "nats a picture"),
     "latent": ("next latents", "nats a latent dimension"),
@@ -38,13 +38,13 @@ class LossLine:
         return len(self.updates)
 
     def at(self, update: float) -> float:
-        """The loss at an update that it has."""
+        """The loss at an update that is on the line."""
         return float(self.values[self.updates == update][0])
 
 
 @dataclass(frozen=True)
 class LossCurve:
-    """A part of a loss: of the batches that were trained on, and of held-out drives."""
+    """One part of a loss, on training batches and on held-out drives."""
 
     trained: LossLine
     held_out: LossLine
@@ -52,9 +52,9 @@ class LossCurve:
 
 @dataclass(frozen=True)
 class TrainingCurves:
-    """A model's training in a folder, `updates` long: a curve a part of its loss, by name.
+    """A model's training of `updates` updates: a curve for each part of its loss, by name.
 
-    `best` is the update whose loss of held-out drives was least in all.
+    `best` is the update with the smallest total loss on held-out drives.
     """
 
     name: str
@@ -65,7 +65,7 @@ class TrainingCurves:
 
     @property
     def summary(self) -> str:
-        """How long it was, and what held-out drives lost where they lost least."""
+        """The number of updates, and the held-out losses at the best one."""
         if self.best is None:
             return f"{self.updates:,.0f} updates"
         held = {part: each.held_out for part, each in self.curves.items()}
@@ -76,24 +76,24 @@ class TrainingCurves:
 
 
 def load_trainings(folders: Sequence[Path]) -> list[TrainingCurves]:
-    """The trainings in data folders; `DatasetError` names a folder that holds none."""
+    """Load the trainings in data folders; `DatasetError` names a folder without any."""
     return [each for folder, name in zip(folders, _names(folders), strict=True) for each in _load_folder(folder, name)]
 
 
 def _load_folder(folder: Path, name: str) -> list[TrainingCurves]:
     if not folder.is_dir():
         raise DatasetError(
-            f"no folder {folder}: --data names folders that were trained in, and what is looked into stands before it"
+            f"no folder {folder}: --data names folders of trainings; a bundle or run to inspect goes before it"
         )
     paths = {model: folder / f"{model}.jsonl" for model in MODELS}
     found = [_load_training(path, name, model) for model, path in paths.items() if path.exists()]
     if not found:
-        raise DatasetError(f"{folder} holds no loss curve: give --data a folder that was trained in, or leave it out")
+        raise DatasetError(f"{folder} holds no loss curve: give --data the folder of a training, or leave it out")
     return found
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Each folder's own name; where two have one name, their paths."""
+    """The folders' names, or their paths if two names are equal."""
     names = [folder.resolve().name for folder in folders]
     return names if len(set(names)) == len(names) else [str(folder) for folder in folders]
 
@@ -109,7 +109,7 @@ def _load_training(path: Path, name: str, model: str) -> TrainingCurves:
 
 
 def _held_out(row: Mapping[str, float]) -> float | None:
-    """The loss of held-out drives in all: the VAE's own, else the sum of its parts."""
+    """The total held-out loss: the VAE records it, otherwise it is the sum of the parts."""
     parts = [value for name, value in row.items() if name.startswith(HELD_OUT)]
     return row.get(WHOLE, sum(parts)) if parts else None
 
@@ -124,11 +124,11 @@ def _lines(curve: LossCurve) -> Iterable[LossLine]:
 
 
 def read_points(path: Path) -> Points:
-    """The points of a curve, some of batches, some of held-out drives; `DatasetError` if it is damaged or empty."""
+    """Read the points of a curve, of batches and of held-out drives; `DatasetError` if it is damaged or empty."""
     try:
         points: Points = [json.loads(line) for line in read_text(path, MOST_BYTES).splitlines() if line]
         if not points or any("update" not in point or len(point) < 2 for point in points):
-            raise ValueError("a point tells no loss of an update")
+            raise ValueError("a point lacks its update or a loss")
         if not all(type(each) in (int, float) and abs(each) < MOST for point in points for each in point.values()):
             raise ValueError("a point is no finite number")
     except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
@@ -137,7 +137,7 @@ def read_points(path: Path) -> Points:
 
 
 def merge_points(points: Points) -> dict[float, dict[str, float]]:
-    """What each update tells, in order; a training that went back to a checkpoint tells the updates behind it anew."""
+    """Merge points by update, in order. Where a training went back to a checkpoint, new points replace later ones."""
     rows: dict[float, dict[str, float]] = {}
     for point in points:
         update, parts = point["update"], {name: value for name, value in point.items() if name != "update"}

@@ -1,21 +1,34 @@
-"""What the VAE keeps of a picture, and what its latents mean."""
+"""Sections on the VAE: reconstructions of a drive and of the user's own pictures, and the meaning of its latents."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pygame
+from numpy.typing import NDArray
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files.regular_files import open_regular
+from dreamfleet.common.printable import truncate
 from dreamfleet.worker.inspection.charts import FONT, draw_heatmap, new_figure, picture_grid, render_png
 from dreamfleet.worker.inspection.encoded_rollout import EncodedRollout
 from dreamfleet.worker.inspection.page import Section
 from dreamfleet.worker.inspection.vae_view import VAEView
+from dreamfleet.worker.training.data.dataset import find_world
 
-SHOWN = 8  # pictures a row, latents a table
+SHOWN = 8  # pictures per row, latents per table
 TRAVERSED = np.linspace(-3, 3, 7)
-NOISE = (-2, -1, 0, 1, 2)  # means of the latents out of nothing
+NOISE = (-2, -1, 0, 1, 2)  # means of the random latents
+MOST, MOST_BYTES = 8, 50_000_000  # own pictures, bytes of a file
+NAME = 16  # characters of a heading
+Pictures = NDArray[np.uint8]
 
 
 def reconstructions(drive: EncodedRollout, vae_view: VAEView) -> Section:
-    """Pictures of the drive, and what the decoder makes of their means."""
+    """Draw pictures of the drive above the decoder's pictures of their mean latents."""
     steps = np.linspace(0, len(drive) - 1, SHOWN).astype(int)
     decoded = vae_view.decode(drive.mu)
     difference = decoded.astype(np.float64) - drive.picture
@@ -30,7 +43,7 @@ def reconstructions(drive: EncodedRollout, vae_view: VAEView) -> Section:
 
 
 def traversals(drive: EncodedRollout, vae_view: VAEView) -> Section:
-    """The most active latents, one moved at a time around a picture of the drive."""
+    """Draw pictures in which one of the most active latents varies, around a picture of the drive."""
     step = drive.most_informative_step
     base = drive.mu[step]
     rows = []
@@ -47,7 +60,7 @@ def traversals(drive: EncodedRollout, vae_view: VAEView) -> Section:
 
 
 def latent_moments(drive: EncodedRollout) -> Section:
-    """Mean and log variance of every latent over the drive."""
+    """Draw the mean and the log variance of each latent over the drive."""
     order, height = drive.most_active, 1.2 + 0.075 * drive.mu.shape[1]
     figure, axes = new_figure(2 * height, 2, sharex=True)
     most = float(np.abs(drive.mu).max())
@@ -66,7 +79,7 @@ def latent_moments(drive: EncodedRollout) -> Section:
 
 
 def samples(vae_view: VAEView) -> Section:
-    """Decodings of latents that no picture stands behind."""
+    """Draw the decoder's pictures of random latents."""
     normal = np.random.default_rng(0).standard_normal((SHOWN, vae_view.latent)).astype(np.float32)
     rows = [(f"N({mean}, 1)", vae_view.decode(normal + np.float32(mean))) for mean in NOISE]
     return Section(
@@ -75,3 +88,52 @@ def samples(vae_view: VAEView) -> Section:
         "track; far from them it need not.",
         picture_grid(rows, [""] * SHOWN),
     )  # fmt: skip
+
+
+def own_pictures(vae_view: VAEView, paths: Sequence[Path]) -> Section:
+    """Draw the user's own pictures as the VAE sees and decodes them; `UsageError` for an unreadable file."""
+    if len(paths) > MOST:
+        raise UsageError(f"--picture takes {MOST} files at most, not {len(paths)}")
+    seen = np.stack([fit_picture(_read(path), vae_view.side) for path in paths])
+    decoded = vae_view.decode(vae_view.encode(seen)[0])
+    error = np.square((decoded.astype(np.float64) - seen) / 255).sum(axis=(1, 2, 3))
+    named = ", ".join(f"{truncate(path.name, 60)} {each:.1f}" for path, each in zip(paths, error, strict=True))
+    rows = [("seen", seen), ("decoded", decoded)]
+    return Section(
+        "own", "Pictures of your own",
+        "Each as the model sees it, and the decoder's picture of its mean latent. An observation of the world is "
+        "prepared as on a drive, any other picture cut to its middle square and scaled. "
+        f"Summed squared error: {named}.",
+        picture_grid(rows, [truncate(path.name, NAME) for path in paths]),
+    )  # fmt: skip
+
+
+def fit_picture(picture: Pictures, side: int) -> Pictures:
+    """Fit a picture `(height, width, 3)` to a VAE's `(side, side, 3)`."""
+    if picture.shape[:2] == (side, side):
+        return picture
+    known = find_world().preprocessings.values()
+    observed = max(each.shape for each in known)  # the largest is the raw observation
+    wanted = next((each for each in known if each.size == side), None)
+    if picture.shape == observed and wanted is not None:
+        return wanted.picture(picture)
+    height, width, _ = picture.shape
+    edge = min(height, width)
+    top, left = (height - edge) // 2, (width - edge) // 2
+    surface = pygame.surfarray.make_surface(picture[top : top + edge, left : left + edge].swapaxes(0, 1))
+    return _surface_to_array(pygame.transform.smoothscale(surface, (side, side)))
+
+
+def _read(path: Path) -> Pictures:
+    try:
+        with open_regular(path, MOST_BYTES) as file:
+            return _surface_to_array(pygame.image.load(file, path.name))
+    except (OSError, pygame.error) as error:
+        raise UsageError(f"--picture {path} cannot be read ({error}): give a PNG or a JPEG") from error
+
+
+def _surface_to_array(surface: Any) -> Pictures:
+    """Convert a surface of any kind to pixels `(height, width, 3)`, on black where it is transparent."""
+    plain = pygame.Surface(surface.get_size(), depth=24)
+    plain.blit(surface, (0, 0))
+    return np.ascontiguousarray(pygame.surfarray.array3d(plain).swapaxes(0, 1))

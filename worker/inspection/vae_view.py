@@ -1,4 +1,4 @@
-"""A VAE as it is looked into: of a bundle, or of a data folder in which no more than it is trained yet."""
+"""A VAE to inspect: of a bundle, or of a data folder in which only the VAE is trained so far."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from dreamfleet.worker.worldmodel.inference import Decoder, Encoder, open_graph
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]
-NEEDED = ("torch", "onnx", "safetensors")  # of the extra `train`, to read a checkpoint
+NEEDED = ("torch", "onnx", "safetensors")  # packages of the extra `train` that reading a checkpoint needs
 CHECKPOINT = "vae.safetensors"
 
 
 @dataclass(frozen=True)
 class VAEView:
-    """What it makes of pictures `(N, side, side, 3)`, and of latents `(N, latent)`."""
+    """A VAE's functions on pictures `(N, side, side, 3)` and latents `(N, latent)`."""
 
     side: int
     latent: int
@@ -32,15 +32,15 @@ class VAEView:
 
     @classmethod
     def of_bundle(cls, bundle: Bundle) -> VAEView:
-        """A world model's."""
+        """The VAE of a world model."""
         manifest = bundle.manifest
         return cls(manifest.picture[0], manifest.latent, Encoder(bundle).encode, Decoder(bundle).decode)
 
     @classmethod
     def of_folder(cls, folder: Path) -> VAEView:
-        """As it was trained there last; `DatasetError` where it was not, or its file is damaged."""
+        """The last checkpoint in a data folder; `DatasetError` if there is none or it is damaged."""
         if missing := [each for each in NEEDED if find_spec(each) is None]:
-            raise MissingExtraError(f"a VAE that is in no bundle needs {missing[0]!r}: pip install 'dreamfleet[train]'")
+            raise MissingExtraError(f"a VAE outside a bundle needs {missing[0]!r}: pip install 'dreamfleet[train]'")
         from dreamfleet.worker.training.checkpoint import load_config, load_weights
         from dreamfleet.worker.worldmodel.export import export_decoder, export_encoder
         from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -60,7 +60,7 @@ class VAEView:
 
 
 def held_out_drive(folder: Path, vae_view: VAEView, config: DriveConfig) -> EncodedRollout:
-    """The first drive of a data set that is held out, as far as `config` wants to see."""
+    """Load the first held-out drive of a data set, `config.steps` steps at most."""
     from dreamfleet.worker.training.data.dataset import (
         check_pictures,
         episode_paths,

@@ -1,4 +1,4 @@
-"""From trained weights to a bundle."""
+"""Assemble a bundle from trained weights."""
 
 from __future__ import annotations
 
@@ -35,9 +35,15 @@ from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
-from dreamfleet.worker.training.data.dataset import episode_paths, load_arrays, split_held_out
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
-from dreamfleet.worker.training.data.world import WORLD, find_world, preprocessing_of_size
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
+from dreamfleet.worker.training.data.dataset import (
+    WORLD,
+    episode_paths,
+    find_world,
+    load_arrays,
+    preprocessing_of_size,
+    split_held_out,
+)
 from dreamfleet.worker.training.encode import ENCODED, latents_encoder_hash
 from dreamfleet.worker.training.recorded_states import compute_recorded_states
 from dreamfleet.worker.worldmodel.export import (
@@ -55,13 +61,13 @@ QUALITY = "quality.json"
 MEASURED, CIRCUMSTANCES = (
     ("probe", "losses", "likeness"),
     ("driver", "noise", "first_seed"),
-)  # of what `inspect --json` tells
-MOST_FIGURES = 1 << 18  # bytes: a manifest has a million at most
+)  # keys of the output of `inspect --json`
+MOST_FIGURES = 1 << 18  # bytes; a manifest has at most a million
 INITIAL_LATENTS = 256
 
 
 def record_quality(folder: Path, figures: dict[str, float]) -> None:
-    """Keep a model's figures beside the data, for the manifest."""
+    """Store a model's quality figures in the data folder, for the manifest."""
     path = folder / QUALITY
     known = json.loads(path.read_text()) if path.exists() else {}
     with explain_write_errors(path), atomic_write(path) as file:
@@ -71,11 +77,11 @@ def record_quality(folder: Path, figures: dict[str, float]) -> None:
 def assemble(
     folder: Path, out: Path, name: str, *, with_weights: bool, recorded: int = 0, measured: Sequence[Path] = ()
 ) -> Bundle:
-    """Build the bundle of a data folder whose models are trained, with `recorded` states of its drives at most.
+    """Build the bundle of a data folder with trained models, with at most `recorded` states of its drives.
 
-    `measured` are figures that `inspect --json` told of the same bundle without them; `DatasetError` if of another.
+    `measured` are files of `inspect --json` on the same bundle without them; `DatasetError` if on another bundle.
     """
-    told = [(path, *_load_measurements(path)) for path in measured]
+    measurements = [(path, *_load_measurements(path)) for path in measured]
     vae = load_weights(folder / train_vae.CHECKPOINT)
     rnn = load_weights(folder / train_mdnrnn.CHECKPOINT)
     configs = (
@@ -108,30 +114,30 @@ def assemble(
         parts[WEIGHTS] = save(
             tensors, {"vae": json.dumps(to_dict(configs[0])), "mdnrnn": json.dumps(to_dict(configs[1]))}
         )
-    if told:
+    if measurements:
         with TemporaryDirectory() as aside:
             bare = write_bundle(Path(aside) / out.name, make_manifest(name, provenance, *configs), parts).sha256
-        for path, of, _ in told:
+        for path, of, _ in measurements:
             if of != bare:
                 raise DatasetError(
-                    f"{path} was measured of the world model {str(of)[:12]}..., and this folder makes {bare[:12]}...: "
-                    "bundle that without --measured, and measure it"
+                    f"{path} was measured on the world model {str(of)[:12]}..., and this folder makes {bare[:12]}...: "
+                    "bundle it without --measured, and measure that bundle"
                 )
-        provenance["measured"] = [figures for *_, figures in told]
+        provenance["measured"] = [figures for *_, figures in measurements]
     with explain_write_errors(out):
         return write_bundle(out, make_manifest(name, provenance, *configs), parts)
 
 
 def _load_measurements(path: Path) -> tuple[object, dict[str, Any]]:
-    """Of which bundle `inspect --json` told figures, and these."""
+    """The SHA-256 of the bundle that a file of `inspect --json` measured, and its figures."""
     try:
-        told = json.loads(read_regular(path, MOST_FIGURES))
-        figures = {name: told[name] for name in MEASURED if name in told}
-        circumstances = {name: told[name] for name in CIRCUMSTANCES}
+        plain = json.loads(read_regular(path, MOST_FIGURES))
+        figures = {name: plain[name] for name in MEASURED if name in plain}
+        circumstances = {name: plain[name] for name in CIRCUMSTANCES}
         json.dumps(figures | circumstances, allow_nan=False)
         if not figures:
             raise ValueError(f"none of {', '.join(MEASURED)}")
-        return told["bundle"], circumstances | figures
+        return plain["bundle"], circumstances | figures
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(f"{path} holds no figures of `inspect BUNDLE --probe --json` ({error})") from error
 
@@ -139,7 +145,7 @@ def _load_measurements(path: Path) -> tuple[object, dict[str, Any]]:
 def make_manifest(
     name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED
 ) -> BundleManifest:
-    """The manifest of these models."""
+    """Make the manifest of these models."""
     preprocessing = preprocessing_of_size(vae.picture)
     return BundleManifest(
         name=name,
@@ -161,10 +167,10 @@ def export_graphs(
     vae_config: VAEConfig = PAPER,
     rnn_config: MDNRNNConfig = REWARDED,
 ) -> dict[str, bytes]:
-    """The parts of a new bundle."""
+    """Make the parts of a bundle, by name."""
     actions = find_world().world.actions
     if not isinstance(actions, Continuous) or actions.output_indices:
-        raise DatasetError(f"world models are built for continuous actions of an output each; those of {WORLD} are not")
+        raise DatasetError(f"world models need continuous actions with one output each; those of {WORLD} are not")
     return {
         ENCODER: export_encoder(vae, vae_config),
         DECODER: export_decoder(vae, vae_config),
@@ -183,7 +189,7 @@ def _npy(array: NDArray[Any]) -> bytes:
 
 
 def initial_latents(folder: Path) -> NDArray[np.float32]:
-    """First `mu` and `logvar` of recorded rollouts, `(N, 2, latent)`: where dreams begin."""
+    """The first `mu` and `logvar` of recorded rollouts, `(N, 2, latent)`, from which dreams begin."""
     firsts = []
     for path in episode_paths(folder, ENCODED)[:INITIAL_LATENTS]:
         arrays = load_arrays(path, "mu", "logvar")

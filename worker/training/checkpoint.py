@@ -19,15 +19,15 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.stop_signals import signals_deferred
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.common.serialization.validation import MalformedError, from_plain
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
 
 T = TypeVar("T")
 
 
 def save_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam, progress: dict[str, Any]) -> None:
-    """Write a checkpoint whole or not at all; `progress` is anything that JSON holds, the model has a `config`.
+    """Write a checkpoint atomically; `progress` must be JSON, and the model has a `config`.
 
-    A signal waits until it is written. `DatasetError` where there is no room: what was there stays.
+    Signals wait until it is written. `DatasetError` if it cannot be written; the last checkpoint then stays.
     """
     tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
     for index, state in optimiser.state_dict()["state"].items():
@@ -40,10 +40,10 @@ def save_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
 def load_checkpoint(
     path: Path, model: torch.nn.Module, optimiser: torch.optim.Adam | None, extensible: frozenset[str] = frozenset()
 ) -> dict[str, Any] | None:
-    """Put a checkpoint back and return its progress; `None` if there is none yet.
+    """Restore model and optimiser from a checkpoint and return its progress; `None` if there is none yet.
 
-    Fields in `extensible` may add to what the checkpoint's model has: the rows that they add to a tensor start as in
-    the new model, and that tensor's moments at zero.
+    The model may set fields in `extensible` that the checkpoint's model lacks. Rows that they add to a tensor keep the
+    new model's initial values, and Adam's moments of that tensor start at zero.
     """
     if not path.exists():
         return None
@@ -66,7 +66,7 @@ def load_checkpoint(
 
 
 def load_config(path: Path, kind: type[T]) -> T:
-    """The configuration of a checkpoint's model; one from before they were kept has the defaults."""
+    """Load the configuration of a checkpoint's model; old checkpoints without one have the defaults."""
     about = _read_metadata(path)
     try:
         return from_plain(kind, json.loads(about["config"])) if "config" in about else kind()
@@ -75,7 +75,7 @@ def load_config(path: Path, kind: type[T]) -> T:
 
 
 def load_progress(path: Path) -> dict[str, Any]:
-    """How far a checkpoint has come."""
+    """Load a checkpoint's progress."""
     try:
         progress: dict[str, Any] = json.loads(_read_metadata(path)["progress"])
     except (ValueError, KeyError, RecursionError) as error:
@@ -98,7 +98,7 @@ def _select_prefix(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str
 
 
 def _add_rows(weights: dict[str, torch.Tensor], model: torch.nn.Module) -> set[int]:
-    """Give tensors that are shorter than the model's its own last rows; which of its parameters they are."""
+    """Extend tensors that are shorter than the model's by the model's rows; return the indices of those parameters."""
     own, grown = model.state_dict(), set()
     for index, (name, _) in enumerate(model.named_parameters()):
         if name in weights and len(weights[name]) < len(own[name]):
@@ -112,9 +112,9 @@ def _drop_parameters(moments: Mapping[str, torch.Tensor], parameters: set[int]) 
 
 
 def check_config(path: Path, config: Any, extensible: frozenset[str] = frozenset()) -> None:
-    """`DatasetError` names what a checkpoint's model has otherwise; what is `extensible` may have come newly."""
+    """`DatasetError` names the fields in which a checkpoint's model differs; `extensible` ones may be newly set."""
     stored, wanted = asdict(load_config(path, type(config))), asdict(config)
-    if any(stored[name] for name in extensible):  # what is there stays what it is
+    if any(stored[name] for name in extensible):  # they can be set only once
         extensible = frozenset()
     differing = [f"{name} {stored[name]}, not {value}" for name, value in wanted.items()
                  if stored[name] != value and not (name in extensible and value)]  # fmt: skip
@@ -126,7 +126,7 @@ def check_config(path: Path, config: Any, extensible: frozenset[str] = frozenset
 
 
 def load_weights(path: Path) -> dict[str, NDArray[np.float32]]:
-    """A checkpoint's weights as arrays; `DatasetError` if it is not there."""
+    """Load a checkpoint's weights as arrays; `DatasetError` if it is missing or damaged."""
     if not path.exists():
         raise DatasetError(f"no {path}: train it first with `dreamfleet train {path.stem}`")
     try:

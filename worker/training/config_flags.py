@@ -1,4 +1,4 @@
-"""Flags that change a preset's training and layers: one a field."""
+"""Flags that override a preset's training and layers, one per field."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.worker.training.presets import PRESETS
 
 T = TypeVar("T")
-FIXED = ("actions",)  # what the task says
+FIXED = ("actions",)  # fields that the task determines
 
 
 def add_training_flags(parser: argparse.ArgumentParser, model: Literal["vae", "mdnrnn"]) -> None:
-    """The flags of a `train` verb of that model."""
+    """Add the flags of a model's `train` verb."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
     parser.add_argument("--preset", help=preset_help_text("training"))
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--continue-from", type=Path, metavar="FILE", help="begin from this checkpoint's weights")
     parser.add_argument(
         "--new", action="store_true",
-        help="begin anew where a checkpoint lies: it goes, and with it its curve and what --keep-every kept",
+        help="begin anew: delete the folder's checkpoint, its curve and the checkpoints of --keep-every",
     )  # fmt: skip
     parser.add_argument(
         "--summary",
         action="store_true",
-        help="print layers and parameters, and train nothing; a model to continue from must have these layers",
+        help="print layers and parameters without training; a model to continue from must have these layers",
     )
     parser.add_argument(
-        "--tensorboard", type=Path, metavar="FOLDER", help="write the losses as TensorBoard's events there too"
+        "--tensorboard", type=Path, metavar="FOLDER", help="also write the losses there as TensorBoard events"
     )
     add_json_flag(parser)
     add_config_flags(parser, "training", {name: getattr(each, model) for name, each in PRESETS.items()})
@@ -41,34 +41,34 @@ def add_training_flags(parser: argparse.ArgumentParser, model: Literal["vae", "m
 
 
 def add_config_flags(parser: argparse.ArgumentParser, title: str, presets: Mapping[str, Any]) -> None:
-    """A flag a field of the presets' configuration; one that is not given leaves no trace.
+    """Add a flag for each field of the presets' configuration; a flag that is not given sets no attribute.
 
-    Help tells each preset's value: that of the first one, which counts where none is named, and where others differ.
+    The help shows the first preset's value, which is the default, and those of presets that differ.
     """
     config = type(next(iter(presets.values())))
     group, hints = parser.add_argument_group(f"{title}, instead of the preset's"), get_type_hints(config)
     for each in fields(config):
         if each.name not in FIXED:
             flag, text = "--" + each.name.replace("_", "-"), each.metadata.get("help")
-            told = _describe_defaults({name: getattr(preset, each.name) for name, preset in presets.items()})
-            text = text and f"{text} ({told})" if told else text
+            defaults = _describe_defaults({name: getattr(preset, each.name) for name, preset in presets.items()})
+            text = text and f"{text} ({defaults})" if defaults else text
             group.add_argument(flag, default=argparse.SUPPRESS, help=text, **_options(hints[each.name]))
 
 
 def _describe_defaults(values: Mapping[str, Any]) -> str:
-    """The presets' values of one field: `default 1500; notebook 30000; article, paper 60000`; nothing where all are."""
+    """Describe a field's values: `default 1500; notebook 30000; article, paper 60000`; empty if all are empty."""
     names: dict[str, list[str]] = {}
     for name, value in values.items():
         plain = ("on" if value else "off") if isinstance(value, bool) else value
         said = " ".join(map(str, plain)) if isinstance(plain, tuple) else str(plain)
         names.setdefault(said, []).append(name)
     (first, _), *others = names.items()
-    told = [f"default {first}"] if first else []
-    return "; ".join((*told, *(f"{', '.join(each)} {said}" for said, each in others)))
+    default = [f"default {first}"] if first else []
+    return "; ".join((*default, *(f"{', '.join(each)} {said}" for said, each in others)))
 
 
 def apply_flags(config: T, args: argparse.Namespace) -> T:
-    """A preset's configuration with what the flags say."""
+    """Return a preset's configuration with the given flags applied."""
     given = {each.name: getattr(args, each.name) for each in fields(config) if hasattr(args, each.name)}  # type: ignore[arg-type]
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     return replace(config, **given)  # type: ignore[type-var]

@@ -1,7 +1,7 @@
-"""Recorded pictures as latents, once, so that the MDN-RNN trains on them many times.
+"""Encode recorded pictures to latents once, because the MDN-RNN trains on them many times.
 
-Each drive also mirrored, where its pictures show nothing that a mirrored drive would not show.
-By the encoder as bundles carry it: the latents that controllers will see, to the bit.
+Each drive is also encoded mirrored, if mirrored pictures can occur in a drive. The encoder is the bundle's ONNX graph,
+so the latents equal those that controllers will see, to the bit.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.data.dataset import (
     check_pictures,
     check_whole,
@@ -25,9 +26,8 @@ from dreamfleet.worker.training.data.dataset import (
     load_arrays,
     load_pictures,
     load_steps,
+    preprocessing_of_size,
 )
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
-from dreamfleet.worker.training.data.world import preprocessing_of_size
 from dreamfleet.worker.training.train_vae import CHECKPOINT
 from dreamfleet.worker.worldmodel.export import export_encoder
 from dreamfleet.worker.worldmodel.inference import open_graph
@@ -35,13 +35,13 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
 ENCODED = "encoded"
 BATCH = 100  # pictures
-ENCODER = ("encoder.", "mu.", "logvar.")  # its weights, by name
+ENCODER = ("encoder.", "mu.", "logvar.")  # prefixes of its weights' names
 
 Latents = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def encode(folder: Path) -> Iterator[int]:
-    """Encode the episodes that are not encoded yet, and all when the VAE is another; yields the frames of each."""
+    """Encode the episodes without latents of this VAE; yield the number of frames of each."""
     if not (folder / CHECKPOINT).exists():
         raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
     config = load_config(folder / CHECKPOINT, VAEConfig)
@@ -71,13 +71,13 @@ def encode(folder: Path) -> Iterator[int]:
 
 
 def count_unencoded(folder: Path) -> int:
-    """How many of a folder's drives have no latents yet."""
+    """The number of a folder's drives without latents."""
     drives, latents = ({path.name for path in (folder / kind).glob("[0-9]*.npz")} for kind in ("episodes", ENCODED))
     return len(drives - latents)
 
 
 def latents_encoder_hash(folder: Path) -> str:
-    """Hash of the encoder that a folder's latents come from; `DatasetError` if it is not the folder's own."""
+    """The hash of a folder's encoder; `DatasetError` if its latents come from another one."""
     if not (folder / CHECKPOINT).exists():
         raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
     vae = encoder_hash(folder)
@@ -88,12 +88,12 @@ def latents_encoder_hash(folder: Path) -> str:
 
 
 def encodes_mirrored(folder: Path) -> bool:
-    """Whether a mirrored picture of the folder's VAE is one that a drive may show."""
+    """Whether mirrored pictures of the folder's VAE can occur in a drive."""
     return preprocessing_of_size(load_config(folder / CHECKPOINT, VAEConfig).picture).mirrors
 
 
 def encoder_hash(folder: Path) -> str:
-    """SHA-256, hexadecimal, of the encoder's weights: a decoder may learn on, the latents stay."""
+    """SHA-256, hexadecimal, of the encoder's weights; further training of the decoder alone does not change it."""
     hashed = hashlib.sha256()
     for name, array in sorted(load_weights(folder / CHECKPOINT).items()):
         if name.startswith(ENCODER):
@@ -103,7 +103,7 @@ def encoder_hash(folder: Path) -> str:
 
 
 def _is_current(target: Path, vae: str) -> bool:
-    """Whether an encoded episode is whole, has what this version looks for, and comes from this VAE."""
+    """Whether an encoded episode is readable, has the arrays of this version, and comes from this VAE."""
     try:
         return str(load_arrays(target, "vae", "ended", "mu")["vae"]) == vae
     except DatasetError:
@@ -111,7 +111,7 @@ def _is_current(target: Path, vae: str) -> bool:
 
 
 def _make_encoder(folder: Path, config: VAEConfig) -> Callable[[NDArray[np.uint8]], Latents]:
-    """From pictures `(T, side, side, 3)` to `mu` and `logvar` `(T, latent)`, on as many threads as torch would take."""
+    """Return a function from pictures `(T, side, side, 3)` to `mu` and `logvar` `(T, latent)`, on torch's threads."""
     graph = export_encoder(load_weights(folder / CHECKPOINT), config)
     session = open_graph(graph, torch.get_num_threads())
 

@@ -1,13 +1,13 @@
-"""A subspace for a search: what a driver will do and earn, as far as a world model's [z, h] foretells it linearly.
+"""Fit a subspace of [z, h] for a search: the directions that predict a driver's later actions and rewards linearly.
 
-Recorded drives are their own teachers: for each moment, what was done in windows of the following steps, how large
-that was, and what was earned, are regressed on what the model saw and remembered before, by ridge regression (Hoerl
-and Kennard 1970) in closed form. What is foretold at all is a feature: the direction of [z, h] that foretells, say,
-how sharply will be steered half a second from now.
+The targets come from recorded drives: for each step the mean actions, their absolute values and the mean rewards over
+windows of the following steps. They are regressed on [z, h] by ridge regression (Hoerl and Kennard 1970) in closed
+form. Each target that is predictable on held-out drives gives a feature: the direction of [z, h] that predicts, say,
+the steering half a second later.
 
-What a driver makes good at once, such as its place on the road, shows in nothing that it does later. So the model's own
-view of the near future can be asked for too: the directions of [z, h] that are best correlated with [z, h] some steps
-later, by canonical correlations (Hotelling 1936).
+Quantities that a driver corrects at once, such as the place on the road, do not show in its later actions. So the
+features can also include "views": the directions of [z, h] that correlate best with [z, h] some steps later, by
+canonical correlation analysis (Hotelling 1936).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.tasks.api import World
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.training.data.drive_steps import FIRST_START, on_road_mask
-from dreamfleet.worker.training.refit import (
+from dreamfleet.worker.training.drive_regression import (
     HELD_OUT_EVERY,
     DriveArrays,
     FeatureExtractor,
@@ -44,19 +44,19 @@ ACTION_WINDOWS = (
     (15, 22),
     (22, 30),
     (30, 40),
-)  # steps from now on, in which an action is asked for
-NEXT_WINDOW = (0, 5)
-REWARD_WINDOWS = ((0, 6), (6, 20), (20, 40))  # and the reward
-LEAST_STEPS = 500  # that count, of all drives: a model sees hundreds of numbers
-MIN_R_SQUARED = 0.05  # R² on held-out drives of what counts as foretold
-VIEW_STEPS = 15  # steps until [z, h] is asked for again
+)  # steps from now, of two-sided actions such as steering
+NEXT_WINDOW = (0, 5)  # of other actions
+REWARD_WINDOWS = ((0, 6), (6, 20), (20, 40))
+LEAST_STEPS = 500  # usable steps of all drives, since [z, h] has hundreds of columns
+MIN_R_SQUARED = 0.05  # on held-out drives, for a predictable target
+VIEW_STEPS = 15  # steps ahead that a view predicts
 
 Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class SubspaceResult:
-    """The subspace, R² of each of its features on held-out drives; of how many drives and steps."""
+    """The subspace, R² of each of its features on held-out drives, and how many drives and steps it was fitted on."""
 
     subspace: Subspace
     r_squared: tuple[float, ...]
@@ -66,15 +66,18 @@ class SubspaceResult:
 
 @dataclass(frozen=True)
 class PredictionTarget:
-    """One thing to foretell: the mean of a column over a window of steps, or its size."""
+    """One target: the mean of a column over a window of steps, or its absolute value."""
 
     name: str
-    column: int  # of actions; behind them the reward
+    column: int  # of the actions followed by the reward
     window: tuple[int, int]
-    size: bool = False
+    size: bool = False  # take the absolute value
 
     def values(self, sums: Doubles) -> Doubles:
-        """At each step `(T,)` of a drive, by the running sums of its columns `(T + 1, columns)`; cut at its end."""
+        """Its values at each step `(T,)` of a drive, from the columns' running sums `(T + 1, columns)`.
+
+        Windows are cut at the drive's end.
+        """
         steps = len(sums) - 1
         start, end = (np.minimum(np.arange(steps) + each, steps) for each in self.window)
         mean: Doubles = (sums[end, self.column] - sums[start, self.column]) / (self.window[1] - self.window[0])
@@ -82,7 +85,7 @@ class PredictionTarget:
 
 
 def make_targets(world: World, columns: int) -> list[PredictionTarget]:
-    """What is asked for of so many actions: all windows of one that goes both ways, of others what comes next."""
+    """Make the targets: all windows of a two-sided action, and the next steps of others, and the rewards."""
     actions, found = world.actions, []
     for column in range(columns):
         name = world.action_names[column] if column < len(world.action_names) else f"action {column + 1}"
@@ -100,18 +103,18 @@ def make_targets(world: World, columns: int) -> list[PredictionTarget]:
 def find_subspace(
     bundle: Bundle, paths: Sequence[Path], on_progress: Callable[[int], None], views: int = 0
 ) -> SubspaceResult:
-    """The subspace of these drives for a world model's default controllers; `on_progress` gets how many are followed.
+    """Fit the subspace for a world model's default controllers; `on_progress` gets the number of drives processed.
 
-    `views` directions of [z, h] that foretell [z, h] are features too, as many at most as foretell anything.
+    It has at most `views` views besides the predicted targets.
 
-    `DatasetError` if they have other pictures or actions or are damaged; `UsageError` if nothing is foretold.
+    `DatasetError` for damaged drives or other pictures or actions; `UsageError` if no target is predictable.
     """
     check_drives(paths, bundle.manifest.preprocessing)
-    onlooker = FeatureExtractor(bundle)
+    extractor = FeatureExtractor(bundle)
     targets = make_targets(find_task(bundle.manifest.task).world, bundle.manifest.actions)
     halves, later = SplitSums(), SplitSums()
     for first, drives in load_in_batches(paths, bundle.manifest.actions):
-        features = onlooker.features(drives, onlooker.encode_drives(drives))
+        features = extractor.features(drives, extractor.encode_drives(drives))
         for row, drive in enumerate(drives):
             on, wanted = _mask_and_targets(drive, targets)
             seen = features[row, : len(on)]
@@ -129,23 +132,23 @@ def find_subspace(
             "off the road do not count: `dreamfleet collect` drives more"
         )
     r_squared = others.r_squared(used.solve(RIDGE))
-    foretold = [index for index, each in enumerate(r_squared) if each >= MIN_R_SQUARED]
-    if not foretold:
-        raise UsageError(f"{bundle.manifest.name} foretells nothing of these {len(paths)} drives: give others")
+    predictable = [index for index, each in enumerate(r_squared) if each >= MIN_R_SQUARED]
+    if not predictable:
+        raise UsageError(f"{bundle.manifest.name} predicts nothing of these {len(paths)} drives: give others")
     whole = used + others
-    solved, names = whole.solve(RIDGE)[:, foretold], [targets[each].name for each in foretold]
-    told_of = [float(r_squared[each]) for each in foretold]
+    solved, names = whole.solve(RIDGE)[:, predictable], [targets[each].name for each in predictable]
+    scores = [float(r_squared[each]) for each in predictable]
     if later.used and later.others:
         ahead, correlated = _canonical_features(later.used, later.others, views)
-        solved, told_of = np.concatenate([solved, ahead], axis=1), told_of + correlated
+        solved, scores = np.concatenate([solved, ahead], axis=1), scores + correlated
         names += [
             _feature_name(f"view {number}", (VIEW_STEPS, VIEW_STEPS + 1)) for number in range(1, len(correlated) + 1)
         ]
-    return SubspaceResult(_standardise(whole, solved, names, bundle), tuple(told_of), len(paths), whole.steps)
+    return SubspaceResult(_standardise(whole, solved, names, bundle), tuple(scores), len(paths), whole.steps)
 
 
 def _mask_and_targets(drive: DriveArrays, targets: Sequence[PredictionTarget]) -> tuple[NDArray[np.bool_], Doubles]:
-    """The steps `(T,)` that count, and what is to be foretold at each `(T, targets)`."""
+    """The mask `(T,)` of usable steps, and the targets' values `(T, targets)`."""
     columns = np.concatenate([drive.action, drive.reward[:, None]], axis=1).astype(np.float64)
     sums = np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
     on = on_road_mask(drive.reward)
@@ -155,9 +158,9 @@ def _mask_and_targets(drive: DriveArrays, targets: Sequence[PredictionTarget]) -
 
 
 def _canonical_features(used: LeastSquaresSums, others: LeastSquaresSums, count: int) -> tuple[Doubles, list[float]]:
-    """The maps `(inputs + 1, found)` to what of [z, h] is best foretold, and its share R² on other drives.
+    """The maps `(inputs + 1, found)` of at most `count` views, and their R² on held-out drives.
 
-    The sums are of [z, h] now and later, side by side. As many as are foretold, `count` at most.
+    The sums are over [z, h] now and later, side by side.
     """
     spread, shared, later = _covariances(used)
     whitened = [_whitening(each) for each in (spread, later)]
@@ -167,27 +170,27 @@ def _canonical_features(used: LeastSquaresSums, others: LeastSquaresSums, count:
     sizes = (now * (spread @ now)).sum(axis=0) * (then * (later @ then)).sum(axis=0)
     correlated = (now * (shared @ then)).sum(axis=0) ** 2 / sizes
     kept = correlated >= MIN_R_SQUARED
-    signs = np.sign(now[np.abs(now).argmax(axis=0), np.arange(now.shape[1])])  # of a pair either will do
+    signs = np.sign(now[np.abs(now).argmax(axis=0), np.arange(now.shape[1])])  # an arbitrary sign, fixed here
     solved = np.concatenate([now * signs, np.zeros((1, now.shape[1]))])[:, kept]
     return solved, [float(each) for each in correlated[kept]]
 
 
 def _covariances(sums: LeastSquaresSums) -> tuple[Doubles, Doubles, Doubles]:
-    """Of the first half of the inputs, of that with the second, and of the second."""
+    """The covariances of the inputs' first half, between both halves, and of the second half."""
     mean, half = sums.inputs[-1, :-1] / sums.steps, len(sums.inputs) // 2
     whole = sums.inputs[:-1, :-1] / sums.steps - np.outer(mean, mean)
     return whole[:half, :half], whole[:half, half:], whole[half:, half:]
 
 
 def _whitening(spread: Doubles) -> Doubles:
-    """The symmetric map that gives inputs of this covariance unit variance, but for the ridge."""
+    """The symmetric map that whitens inputs of this covariance, apart from the ridge."""
     scales, axes = np.linalg.eigh(spread + RIDGE * np.eye(len(spread)))
     found: Doubles = axes / np.sqrt(scales) @ axes.T
     return found
 
 
 def _standardise(sums: LeastSquaresSums, solved: Doubles, names: Sequence[str], bundle: Bundle) -> Subspace:
-    """The foretold values with mean 0 and deviation 1 on these steps."""
+    """Scale the predicted values to mean 0 and deviation 1 on these steps."""
     mean = sums.inputs[-1] @ solved / sums.steps
     squares = (solved * (sums.inputs @ solved)).sum(axis=0) / sums.steps
     deviation = np.sqrt(squares - mean**2)

@@ -1,4 +1,4 @@
-"""A training's loss curve on disk, and where it is asked for as TensorBoard's events."""
+"""Write a training's loss curve to disk, and optionally as TensorBoard events."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dreamfleet.common.files.tensorboard import open_event_file
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
 
 AddPoint = Callable[..., None]  # `point(update=120, error=0.3)`
 
 
 @contextmanager
 def open_loss_curve(path: Path, events: Path | None, update: int) -> Iterator[AddPoint]:
-    """Takes points of a training that goes on behind `update`; `events`: the folder of TensorBoard's, if there is one.
+    """Yield a function that appends points to the curve; `events` is a folder for TensorBoard events, or `None`.
 
-    `MissingExtraError` where events are wanted and cannot be written.
+    The training resumes after `update`: events beyond it are superseded. `MissingExtraError` if events cannot be
+    written.
     """
     if events is None:
         yield lambda **values: append_point(path, **values)
@@ -32,7 +33,7 @@ def open_loss_curve(path: Path, events: Path | None, update: int) -> Iterator[Ad
 
 
 def append_point(path: Path, **values: float) -> None:
-    """One point as a line of JSON, whole or not at all; `DatasetError` where there is no room for it."""
+    """Append a point as a line of JSON, whole or not at all; `DatasetError` if it cannot be written."""
     line = (json.dumps({name: round(value, 6) for name, value in values.items()}) + "\n").encode()
     with explain_write_errors(path), path.open("ab", buffering=0) as file:
         end = file.seek(0, 2)

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.training.presets import TrainingPreset
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig, TrainingPreset
 
 Arguments = tuple[str, ...]
 COLLECT, VAE, ENCODE, MDNRNN, BUNDLE = STAGES = ("collect", "train.vae", "encode", "train.mdnrnn", "bundle")

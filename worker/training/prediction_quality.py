@@ -1,4 +1,4 @@
-"""How well a model foresees: heads' accuracy at once, and after steps of dreaming under recorded actions."""
+"""Measure an MDN-RNN's predictions: one step ahead, and after steps of dreaming under recorded actions."""
 
 from __future__ import annotations
 
@@ -10,32 +10,38 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels, load_rollouts
-from dreamfleet.worker.training.teacher_forcing import teacher_force, with_reward_label
+from dreamfleet.worker.training.data.rollouts import (
+    Rollouts,
+    done_labels,
+    load_rollouts,
+    teacher_force,
+    with_reward_label,
+)
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction, reward_labels
 
-DREAM_STEPS = (1, 10, 50)  # steps of dreaming
-START_EVERY = 25  # a dream begins behind so many recorded steps more
-MAX_ROLLOUTS = 40  # held-out rollouts
+DREAM_STEPS = (1, 10, 50)  # lengths of dreams
+START_EVERY = 25  # recorded steps between the beginnings of dreams
+MAX_ROLLOUTS = 40  # held-out ones to measure on
 
 Floats = NDArray[np.float32]
 
 
 def foresight(model: MDNRNN, held_out: Sequence[Path]) -> dict[str, float]:
-    """Of each head, how it judges recorded steps, and `_after_N` those that N dreamt steps lead to.
+    """Measure each head on recorded steps, and as `..._after_N` on states after N dreamt steps.
 
-    Binary heads by the area under the curve, a value by its root mean square error; latents by theirs, in units of
-    their spread. A figure that the rollouts cannot tell (they are too short, or all labels equal) is left out.
+    Binary heads are scored by the area under the ROC curve, values by their root mean square error (RMSE), latents by
+    their RMSE in units of their standard deviation. Figures that are undefined, because rollouts are too short or all
+    labels are equal, are left out.
     """
     device = next(model.parameters()).device
     rollouts = load_rollouts(held_out[:MAX_ROLLOUTS]).to(device)
     model.eval()
     with torch.no_grad():
         hidden, states = teacher_force(model, rollouts)
-        told = model.predict(hidden)
+        prediction = model.predict(hidden)
         labels = _labels(model, rollouts)
         mask = rollouts.mask > 0
-        figures = {name: _score_head(model, name, _head(told, name)[mask], labels[name][mask]) for name in labels}
+        figures = {name: _score_head(model, name, _head(prediction, name)[mask], labels[name][mask]) for name in labels}
         for ahead, (seen, predicted, latents) in _dream(model, rollouts, states).items():
             rows, steps = seen
             for name in labels:
@@ -49,7 +55,7 @@ def foresight(model: MDNRNN, held_out: Sequence[Path]) -> dict[str, float]:
 
 
 def area_under_curve(scores: Floats, positive: NDArray[np.bool_]) -> float:
-    """How often a positive scores above a negative; 0.5 is chance, NaN without both kinds."""
+    """Area under the ROC curve: how often a positive scores above a negative; NaN if either kind is missing."""
     ranks = np.empty(len(scores))
     ranks[np.argsort(scores)] = np.arange(1, len(scores) + 1)
     positives = int(positive.sum())
@@ -60,9 +66,9 @@ def area_under_curve(scores: Floats, positive: NDArray[np.bool_]) -> float:
 def _dream(
     model: MDNRNN, rollouts: Rollouts, states: list[Tensor]
 ) -> dict[int, tuple[tuple[Tensor, Tensor], Prediction, Tensor]]:
-    """From recorded prefixes on, dreaming means under the recorded actions.
+    """Dream from recorded states on under the recorded actions, taking the mean of each mixture.
 
-    By steps ahead: which recorded steps (rows, steps) the dreams have come to, what is told there, dreamt latents.
+    Returns by number of steps ahead: the recorded steps reached (rows, steps), the predictions there, dreamt latents.
     """
     config, length = model.config, rollouts.mu.shape[1]
     found: dict[int, list[tuple[Tensor, Tensor, Tensor, Tensor]]] = {ahead: [] for ahead in DREAM_STEPS}
@@ -70,11 +76,11 @@ def _dream(
         latent, state = rollouts.mu[:, start], states[start]
         for ahead in range(1, min(max(DREAM_STEPS), length - 1 - start) + 1):
             hidden, state = model.advance(torch.cat([latent, rollouts.action[:, start + ahead - 1]], dim=1), state)
-            told = model.predict(hidden)
-            latent = (told.log_weights.exp() * told.means).sum(dim=-1)
+            predicted = model.predict(hidden)
+            latent = (predicted.log_weights.exp() * predicted.means).sum(dim=-1)
             if config.previous_reward:
                 state = with_reward_label(
-                    model, state, told.reward if config.reward == "value" else (told.reward > 0).float()
+                    model, state, predicted.reward if config.reward == "value" else (predicted.reward > 0).float()
                 )
             if ahead in found:
                 rows = torch.nonzero(rollouts.mask[:, start + ahead])[:, 0]
@@ -97,14 +103,14 @@ def _labels(model: MDNRNN, rollouts: Rollouts) -> dict[str, Tensor]:
     return labels
 
 
-def _head(told: Prediction, name: str) -> Tensor:
-    return told.reward if name == "reward" else told.done
+def _head(prediction: Prediction, name: str) -> Tensor:
+    return prediction.reward if name == "reward" else prediction.done
 
 
-def _score_head(model: MDNRNN, name: str, told: Tensor, label: Tensor) -> float:
+def _score_head(model: MDNRNN, name: str, predicted: Tensor, label: Tensor) -> float:
     if name == "reward" and model.config.reward == "value":
-        return float((told - label).square().mean().sqrt())
-    return area_under_curve(told.cpu().numpy(), label.cpu().numpy() > 0)
+        return float((predicted - label).square().mean().sqrt())
+    return area_under_curve(predicted.cpu().numpy(), label.cpu().numpy() > 0)
 
 
 def _figure_name(model: MDNRNN, name: str) -> str:

@@ -1,20 +1,53 @@
-"""Named amounts of everything that training does, and the models it is done to."""
+"""The presets of whole trainings: amounts of data and updates, and the models' layers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.presets import check_preset
+from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.training.data.collect_config import CollectConfig
-from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.worldmodel import mdnrnn_config, vae_config
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
 
+def required(text: str) -> Any:
+    """A field without a default, with the text that `--help` shows."""
+    return field(metadata={"help": text})
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How one model is trained: Adam at `rate` for `updates` updates of `batch` pictures or drives."""
+
+    updates: int = required("updates in total, those already made included")
+    batch: int = required("pictures, or drives, per update")
+    rate: float = required("Adam's learning rate")
+    clip: float = option(1.0, "largest norm of the gradients; 0: no limit")
+    seed: int = option(0, "random seed of the training: of first weights, batches and noise")
+    decay: float = option(1.0, "factor of the rate per epoch, in which each recorded frame or drive is shown once")
+    patience: int = option(0, "validations without a better held-out loss before training ends; 0: never")
+    validate_every: int = option(200, "updates between validations on held-out drives, each with a checkpoint")
+    keep_every: int = option(
+        0, "updates between checkpoints that are kept beside the last one, as vae.000400.safetensors; 0: none"
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("updates", "batch", "validate_every"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        if self.keep_every < 0:
+            raise UsageError(f"--keep-every must be at least 1, or 0 for none, not {self.keep_every}")
+        if not (self.rate > 0 and self.clip >= 0 and 0 < self.decay <= 1 and self.patience >= 0 and self.seed >= 0):
+            raise UsageError("--rate must be positive, --decay in (0, 1], --clip, --patience and --seed not negative")
+
+
 @dataclass(frozen=True)
 class TrainingPreset:
-    """A whole pipeline."""
+    """The configuration of a whole pipeline: collecting, both trainings, both models' layers."""
 
     name: str
     collect: CollectConfig
@@ -24,16 +57,16 @@ class TrainingPreset:
     mdnrnn_layers: MDNRNNConfig = mdnrnn_config.REWARDED
 
 
-# About 12 minutes of two cores. A VAE that was trained on more, or longer, told pictures apart better and made worse
-# dreams; an MDN-RNN that was made better ones (docs/dreams.md): `iterate` goes on with it and the decoder alone.
+# About 12 minutes on two cores. More data or updates made a VAE distinguish pictures better but dream worse, while an
+# MDN-RNN gained from them (docs/dreams.md): `iterate` continues training the MDN-RNN and the decoder alone.
 TINY = TrainingPreset(
     name="tiny",
     collect=CollectConfig(episodes=620, steps=300),
     vae=TrainConfig(updates=1500, batch=100, rate=5e-4, clip=0),
     mdnrnn=TrainConfig(updates=800, batch=32, rate=1e-3),
 )
-# As the sources have it: ten passes over the frames for the VAE at 1e-4, rollouts from the track's beginning that end
-# with their steps, and gradients and trainings that nothing cuts short.
+# As in the sources: ten passes over the frames for the VAE at a rate of 1e-4, rollouts from the track's beginning that
+# end after `steps`, no gradient clipping and no early stopping.
 NOTEBOOK = TrainingPreset(
     name="notebook",
     collect=CollectConfig(episodes=1000, steps=300, picture=96, driver="uniform", anywhere=0.0, patience=0),
@@ -50,7 +83,7 @@ ARTICLE = TrainingPreset(
     vae_layers=vae_config.ARTICLE,
     mdnrnn_layers=mdnrnn_config.ARTICLE,
 )
-# Plain and attentive compare at equal parameters: `--window 0 --hidden 256` is the plain one.
+# Compares plain and attentive at equal numbers of parameters: `--window 0 --hidden 256` is the plain one.
 ATTENTIVE = TrainingPreset(
     name="attentive",
     collect=CollectConfig(episodes=500, steps=384),
@@ -69,5 +102,5 @@ PRESETS = {preset.name: preset for preset in (TINY, NOTEBOOK, ARTICLE, ATTENTIVE
 
 
 def find_preset(name: str) -> TrainingPreset:
-    """The preset of that name; `UsageError` lists those that exist."""
+    """Return the preset `name`; `UsageError` lists those that exist."""
     return PRESETS[check_preset("training", name)]

@@ -1,4 +1,4 @@
-"""Recorded states for a bundle: where a folder's drives were, and what its MDN-RNN remembered there."""
+"""Compute recorded states for a bundle: latents and recurrent states at steps of a folder's drives."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
 from dreamfleet.worker.training.data.dataset import episode_paths, load_steps
 from dreamfleet.worker.training.data.drive_steps import DriveStep, sample_steps
-from dreamfleet.worker.training.data.rollouts import load_rollouts
+from dreamfleet.worker.training.data.rollouts import load_rollouts, teacher_force
 from dreamfleet.worker.training.encode import ENCODED
-from dreamfleet.worker.training.one_thread import on_one_thread
-from dreamfleet.worker.training.teacher_forcing import teacher_force
+from dreamfleet.worker.training.torch_setup import on_one_thread
 from dreamfleet.worker.training.train_mdnrnn import CHECKPOINT
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
-DRIVES = 32  # that are followed at once: 1000 steps of the default layers' states are 65 MB
+DRIVES = 32  # processed at once: 1000 steps of the default layers' states take 65 MB
 SEED = 0
 
 
@@ -30,7 +29,7 @@ SEED = 0
 class RecordedStates:
     """States `(N, 2 * latent + state)` in half precision: mu, logvar and the recurrent state before the action.
 
-    So many of them lie shortly before a loss of the road.
+    `before_losses` of them lie shortly before a loss of the road.
     """
 
     states: NDArray[np.float16]
@@ -38,7 +37,7 @@ class RecordedStates:
 
 
 def compute_recorded_states(folder: Path, count: int) -> RecordedStates:
-    """So many of a folder's encoded drives, by its MDN-RNN, or as many as there are; equal folders give equal ones."""
+    """Compute at most `count` states of a folder's encoded drives by its MDN-RNN; equal folders give equal states."""
     paths, model = episode_paths(folder, ENCODED), MDNRNN(load_config(folder / CHECKPOINT, MDNRNNConfig))
     load_checkpoint(folder / CHECKPOINT, model, None)
     drawn = sample_steps([load_steps(path)["reward"] for path in paths], count, np.random.default_rng(SEED))
@@ -49,14 +48,14 @@ def compute_recorded_states(folder: Path, count: int) -> RecordedStates:
 
 
 def _batch_by_drive(moments: Sequence[DriveStep]) -> Iterator[list[DriveStep]]:
-    """Sorted moments, those of few drives at a time."""
+    """Yield sorted steps in batches of a few drives."""
     drives = [list(each) for _, each in groupby(moments, key=lambda moment: moment.drive)]
     for start in range(0, len(drives), DRIVES):
         yield [moment for drive in drives[start : start + DRIVES] for moment in drive]
 
 
 def _states(paths: Sequence[Path], model: MDNRNN, moments: Sequence[DriveStep]) -> Iterator[NDArray[np.float32]]:
-    """The state of each of these moments."""
+    """Yield the state at each of these steps."""
     drives = sorted({moment.drive for moment in moments})
     rollouts = load_rollouts([paths[drive] for drive in drives])
     _, remembered = teacher_force(model, rollouts)

@@ -1,15 +1,15 @@
-"""A controller for another world model: what it chooses on recorded drives, imitated there by least squares.
+"""Refit a controller to another world model: imitate its choices on recorded drives by least squares.
 
-Weights on [z, h] mean nothing to another encoder's z, and little to an MDN-RNN's h once that has learnt on. So both
-models follow the same drives, and the controller's first layer is fitted on what the new one sees and remembers to what
-it gives on what its own does, before it is squashed: ridge regression, in closed form. Layers above stay as they are.
-It is behavioural cloning (Pomerleau 1991) of a controller by itself, on states that others may have driven to.
+Weights on [z, h] do not fit another encoder's z, nor an MDN-RNN's h after further training. So both models follow the
+same drives, and ridge regression fits the first layer on the new model's [z, h] to the values, before tanh, that the
+old first layer gives on its own model's. Later layers stay as they are. This is behavioural cloning (Pomerleau 1991)
+of the controller, on drives that other drivers may have driven.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,42 +19,28 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER, Bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
+from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.training.data.dataset import (
-    check_whole,
-    episode_paths,
-    load_pictures,
-    load_steps,
-    pad,
-    preprocessing_of,
-)
 from dreamfleet.worker.training.data.drive_steps import on_road_mask
-from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, RewardLabel
+from dreamfleet.worker.training.drive_regression import (
+    FeatureExtractor,
+    LeastSquaresSums,
+    SplitSums,
+    check_drives,
+    load_in_batches,
+)
 
-RIDGE = 0.01  # against the mean square of a feature, which is below 1 for h and about 1 for what z tells
-TANH_BOUND = 2.5  # tanh has 0.987 there: how much further a value lies makes no action
-BOUND_MARGIN = 0.3  # how far behind its action's bound a value stays: a search can find the way back from there
-HELD_OUT_EVERY = 5  # every fifth drive tells how well it went
-DRIVES_AT_ONCE = 16  # drives that are followed at once
-PICTURES_AT_ONCE = 100  # that are encoded at once
+RIDGE = 0.01  # relative to a feature's mean square, which is below 1 for h and about 1 for informative latents
+TANH_BOUND = 2.5  # tanh is 0.987 there; larger values change the action little
+BOUND_MARGIN = 0.3  # how far a value may lie beyond its action's bound, so that a search can still move it back
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class DriveArrays:
-    """T recorded steps: `pictures` (T, side, side, 3), `action` (T, actions), `reward` (T,)."""
-
-    pictures: NDArray[np.uint8]
-    action: Floats
-    reward: Floats
-
-
-@dataclass(frozen=True)
 class RefitResult:
-    """The fitted controller; on how many drives and steps, and R² of each of the first layer's values on others."""
+    """The fitted controller, the drives and steps it was fitted on, and R² per first-layer value on held-out ones."""
 
     controller: Controller
     drives: int
@@ -62,91 +48,15 @@ class RefitResult:
     r_squared: tuple[float, ...]
 
 
-class FeatureExtractor:
-    """What a controller of one world model would see while others drive."""
-
-    def __init__(self, bundle: Bundle) -> None:
-        self._encoder, self._memory, self._label = Encoder(bundle), DreamStep(bundle), RewardLabel(bundle)
-        hidden = bundle.controller_shape.features > bundle.manifest.latent
-        self._hidden = bundle.manifest.hidden if hidden else 0
-
-    def encode_drives(self, drives: Sequence[DriveArrays]) -> Floats:
-        """The latents of their pictures `(N, T, latent)`, zero behind a drive's end."""
-        return pad([self._encode(drive.pictures) for drive in drives])
-
-    def features(self, drives: Sequence[DriveArrays], latent: Floats) -> Floats:
-        """[z, h], or z alone, before each step `(N, T, features)`; behind a drive's end they mean nothing."""
-        action, reward = pad([drive.action for drive in drives]), pad([drive.reward for drive in drives])
-        state, seen = self._memory.zero_state(len(drives)), []
-        for step in range(latent.shape[1]):
-            seen.append(np.concatenate([latent[:, step], state[:, : self._hidden]], axis=1))
-            state = self._memory.advance(latent[:, step], action[:, step], state)
-            self._label.write(state, reward[:, step].astype(np.float64))
-        return np.stack(seen, axis=1)
-
-    def _encode(self, pictures: NDArray[np.uint8]) -> Floats:
-        starts = range(0, len(pictures), PICTURES_AT_ONCE)
-        return np.concatenate([self._encoder.encode(pictures[start : start + PICTURES_AT_ONCE])[0] for start in starts])
-
-
-@dataclass(frozen=True)
-class LeastSquaresSums:
-    """Everything that least squares ask of inputs X `(steps, inputs)` and targets Y `(steps, outputs)`."""
-
-    steps: int
-    inputs: Doubles  # X'X
-    cross: Doubles  # X'Y
-    targets: Doubles  # the sums of Y, and of its squares `(2, outputs)`
-
-    @classmethod
-    def of(cls, inputs: Floats, targets: Doubles) -> LeastSquaresSums:
-        """Those of some steps; inputs have a last column of ones added."""
-        wide = np.concatenate([inputs, np.ones((len(inputs), 1), np.float32)], axis=1).astype(np.float64)
-        return cls(len(wide), wide.T @ wide, wide.T @ targets, np.stack([targets.sum(0), (targets**2).sum(0)]))
-
-    def __add__(self, other: LeastSquaresSums) -> LeastSquaresSums:
-        return LeastSquaresSums(
-            self.steps + other.steps, self.inputs + other.inputs, self.cross + other.cross, self.targets + other.targets
-        )
-
-    def solve(self, ridge: float) -> Doubles:
-        """The map `(inputs + 1, outputs)`; the offsets, its last row, are not held small."""
-        held = np.full(len(self.inputs), ridge * self.steps)
-        held[-1] = 0
-        return np.asarray(np.linalg.solve(self.inputs + np.diag(held), self.cross), dtype=np.float64)
-
-    def r_squared(self, solved: Doubles) -> Doubles:
-        """How much of each target's variance a map tells `(outputs,)`; NaN of one that does not vary."""
-        missed = self.targets[1] - 2 * (solved * self.cross).sum(0) + (solved * (self.inputs @ solved)).sum(0)
-        varies = self.targets[1] - self.targets[0] ** 2 / self.steps
-        found: Doubles = np.full_like(varies, np.nan)
-        np.divide(varies - missed, varies, out=found, where=varies > 1e-9 * self.steps)
-        return found
-
-
-class SplitSums:
-    """Sums over drives: of those that a map is fitted to, `used`, and of every fifth, which tells how well it went."""
-
-    def __init__(self) -> None:
-        self.used: LeastSquaresSums | None = None
-        self.others: LeastSquaresSums | None = None
-
-    def add(self, number: int, sums: LeastSquaresSums) -> None:
-        """Those of the drive of this number, counted from 0."""
-        side = "others" if number % HELD_OUT_EVERY == HELD_OUT_EVERY - 1 else "used"
-        so_far = getattr(self, side)
-        setattr(self, side, sums if so_far is None else so_far + sums)
-
-
 def refit(
     controller: Controller, own: Bundle, bundle: Bundle, paths: Sequence[Path], on_progress: Callable[[int], None]
 ) -> RefitResult:
-    """The controller of the world model `own` for `bundle`, by these drives; `on_progress` gets how many are followed.
+    """Refit a controller of the world model `own` to `bundle`; `on_progress` gets the number of drives processed.
 
-    It is left as it is where that one sees and remembers as its own does, to the bit.
+    The parameters stay the same if both models have the same encoder and dream graph.
 
-    `ControllerError` if the two worlds or their pictures differ; `DatasetError` if the drives have other pictures or
-    actions or are damaged; `UsageError` if it looks at its own last choices, or if none of them keeps to its road.
+    `ControllerError` if the two worlds or their pictures differ. `DatasetError` for damaged drives or other pictures or
+    actions. `UsageError` if the controller sees its own last choices, or if no drive stays on its road.
     """
     if all(own.read(part) == bundle.read(part) for part in (ENCODER, DREAM_GRAPH)):
         return RefitResult(replace(controller, bundle=bundle.sha256), 0, 0, ())
@@ -184,16 +94,11 @@ def refit(
     return RefitResult(moved, len(paths), whole.steps, tuple(float(each) for each in r_squared))
 
 
-def last_drives(folder: Path, count: int) -> list[Path]:
-    """A folder's last drives, so many at most; those of controllers lie behind random ones."""
-    return episode_paths(folder)[-count:]
-
-
 def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles]:
-    """The values of the first layer `(outputs,)` below and above which nothing is told apart.
+    """The lower and upper bounds `(outputs,)` to which the first layer's target values are clipped.
 
-    An action that is cut off at a bound, such as a brake below 0, is the same however far behind it a value lies.
-    Values that are compared, of choices, are told apart wherever they lie.
+    An action that is clipped, such as a brake below 0, does not depend on how far the value lies beyond the bound.
+    Values of discrete choices are compared with each other, so they are not clipped.
     """
     outputs = controller.shape.layers[0][0]
     lowest, highest = np.full(outputs, -TANH_BOUND), np.full(outputs, TANH_BOUND)
@@ -210,7 +115,7 @@ def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles
         for bound, beyond in ((low, -1), (high, 1)):
             squashed = (bound - shift) / scale
             if abs(squashed) >= 1:
-                continue  # tanh never comes there
+                continue  # tanh does not reach it
             rest = math.atanh(squashed)
             if beyond * scale < 0:
                 lowest[output] = max(lowest[output], rest - BOUND_MARGIN)
@@ -220,7 +125,7 @@ def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles
 
 
 def output_names(controller: Controller, own: Bundle) -> tuple[str, ...]:
-    """The outputs of a controller's first layer for people: actions where each has one of its own."""
+    """Names for the outputs of a controller's first layer: the actions' names if they correspond one to one."""
     names, count = find_task(own.manifest.task).world.action_names, controller.shape.layers[0][0]
     plain = controller.variant.is_default or not (
         controller.variant.controls.output_indices or controller.variant.controls.choices
@@ -244,26 +149,3 @@ def _check_compatible(controller: Controller, own: Bundle, bundle: Bundle, paths
     if controller.variant.extra_features:
         raise UsageError("it looks at its own last choices, which no recorded drive holds: it cannot be refitted")
     check_drives(paths, sees[0][1])
-
-
-def check_drives(paths: Sequence[Path], preprocessing: str) -> None:
-    """`DatasetError` for a drive that is not whole, or holds other pictures than a model of these sees."""
-    check_whole(paths, "picture", "preprocessing", "action", "reward", "ended")
-    for path in paths:
-        if (found := preprocessing_of(path)) != preprocessing:
-            raise DatasetError(f"{path} holds pictures {found!r}, and the world model sees {preprocessing!r}")
-
-
-def load_in_batches(paths: Sequence[Path], actions: int) -> Iterator[tuple[int, list[DriveArrays]]]:
-    """The drives, few at a time, with the number of the first of them."""
-    for first in range(0, len(paths), DRIVES_AT_ONCE):
-        yield first, [_load_drive(path, actions) for path in paths[first : first + DRIVES_AT_ONCE]]
-
-
-def _load_drive(path: Path, actions: int) -> DriveArrays:
-    steps, pictures = load_steps(path), load_pictures(path)
-    if len(pictures) != len(steps["reward"]):
-        raise DatasetError(f"{path} holds {len(pictures)} pictures and another number of actions; delete it")
-    if steps["action"].shape[1] != actions or not all(np.isfinite(steps[name]).all() for name in ("action", "reward")):
-        raise DatasetError(f"{path} holds other actions than {actions} numbers a step, or NaN or infinity; delete it")
-    return DriveArrays(pictures, steps["action"], steps["reward"])

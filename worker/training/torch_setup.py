@@ -1,23 +1,23 @@
-"""What a training asks of its process before torch is loaded, so that it leaves the processor to whoever can use it."""
+"""Configure a process before torch is loaded: threads and heap; and run torch on one thread."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-# Of glibc's malloc.h: what to set, and to what.
-M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4  # parameters of mallopt, from glibc's malloc.h
 LARGEST, GROWTH = 2**31 - 1, 1 << 28  # bytes
 
 
 def configure_process() -> None:
-    """Let threads that wait sleep, and the heap keep what is freed; no result depends on either.
+    """Let waiting threads sleep, and let the heap keep freed memory; results do not depend on either.
 
-    Threads that spin until the others are through take the time of whatever else runs: beside one busy process an
-    update of the article's VAE on two threads took 0.61 s, and 0.38 s where they sleep; alone it is the same. Each
-    update's tensors were given back to the system and asked for again, page by page: an eighth of the time
-    of a VAE's update, a quarter of an MDN-RNN's (docs/measurements.md).
-    What the user set in the environment stays.
+    Threads that spin while they wait take time from other processes: beside one busy process an update of the article's
+    VAE on two threads took 0.61 s, and 0.38 s with sleeping threads; alone the times are equal. Returning each update's
+    memory to the system and requesting it again cost an eighth of a VAE's update and a quarter of an MDN-RNN's
+    (docs/measurements.md). Environment variables that the user has set take precedence.
     """
     os.environ["OMP_WAIT_POLICY"] = os.environ.get("OMP_WAIT_POLICY") or "PASSIVE"
     if not any(name.startswith("MALLOC_") for name in os.environ):
@@ -25,7 +25,7 @@ def configure_process() -> None:
 
 
 def _keep_freed_memory() -> None:
-    """Where the C library is glibc; elsewhere nothing is known to be needed."""
+    """Set glibc's allocator; do nothing with another C library."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, TypeError, AttributeError):
@@ -33,3 +33,16 @@ def _keep_freed_memory() -> None:
     mallopt(M_MMAP_MAX, 0)
     mallopt(M_TRIM_THRESHOLD, LARGEST)
     mallopt(M_TOP_PAD, GROWTH)
+
+
+@contextmanager
+def on_one_thread() -> Iterator[None]:
+    """Run torch on one thread: bits do not depend on the host's cores, and small steps are much faster."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,4 +1,4 @@
-"""Training the MDN-RNN on encoded rollouts."""
+"""Train the MDN-RNN on encoded rollouts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels, load
 from dreamfleet.worker.training.encode import ENCODED, encodes_mirrored, latents_encoder_hash
 from dreamfleet.worker.training.loss_curve import AddPoint, open_loss_curve
 from dreamfleet.worker.training.prediction_quality import foresight
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.train_vae import ReportProgress
 from dreamfleet.worker.training.training_state import TrainingState
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss, reward_labels, reward_loss
@@ -34,10 +34,10 @@ def train_mdnrnn(
     device: torch.device | None = None, continue_from: Path | None = None, stop: Stop = never_stop, new: bool = False,
     events: Path | None = None,
 ) -> dict[str, float]:  # fmt: skip
-    """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
+    """Train, or resume, up to `config.updates`; return the quality on held-out episodes.
 
-    A stop changes nothing: all follows from the seed and the update alone. `StoppedError` if `stop` asks for one.
-    `events`: a folder for TensorBoard's.
+    An interruption changes no bit: batches and noise depend on the seed and the update alone. `StoppedError` if `stop`
+    asks for a stop. `events` is a folder for TensorBoard events.
     """
     train, held_out = split_held_out(episode_paths(folder, ENCODED))
     vae, mirrors = latents_encoder_hash(folder), encodes_mirrored(folder)
@@ -56,7 +56,7 @@ def train_mdnrnn(
             schedule.set_rate(update * config.batch // len(train) if config.decay < 1 else 0)
             random = np.random.default_rng([config.seed, update])
             noise = torch.Generator().manual_seed(config.seed * 1_000_003 + update)
-            torch.manual_seed(config.seed * 1_000_003 + update)  # of the dropout
+            torch.manual_seed(config.seed * 1_000_003 + update)  # for the dropout
             chosen = random.choice(len(train), size=min(config.batch, len(train)), replace=False)
             flipped = (random.random(len(chosen)) < 0.5) & mirrors
             rollouts = load_rollouts([train[index] for index in chosen], flipped)
@@ -75,21 +75,21 @@ def train_mdnrnn(
 def _record_validation(
     model: MDNRNN, paths: Sequence[Path], point: AddPoint, update: int, device: torch.device | None
 ) -> float:
-    """The held-out loss that counts; a point of the curve."""
+    """Validate, add a point to the curve, and return the weighted held-out loss."""
     parts = validate(model, paths, device)
     point(update=update, **{f"held_out_{name}": part for name, part in parts.items()})
     return sum(weight_losses(model.config, parts).values())
 
 
 def mdnrnn_vae_hash(folder: Path) -> str:
-    """Hash of the VAE checkpoint whose latents the folder's MDN-RNN was trained on."""
+    """The hash of the encoder on whose latents the folder's MDN-RNN was trained."""
     return str(load_progress(folder / CHECKPOINT).get("vae"))
 
 
 def backward(
     model: MDNRNN, rollouts: Rollouts, noise: torch.Generator, device: torch.device | None = None
 ) -> dict[str, float]:
-    """Gradients of a batch, few rollouts at a time, so that memory does not grow with it; returns the plain losses."""
+    """Accumulate a batch's gradients, a few rollouts at a time to bound memory; return the unweighted losses."""
     values: dict[str, float] = {}
     for chunk in rollouts.chunks():
         parts = scale_to_batch(losses(model, chunk.to(device), noise), chunk, rollouts)
@@ -99,7 +99,7 @@ def backward(
 
 
 def validate(model: MDNRNN, paths: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
-    """Losses on held-out rollouts."""
+    """The unweighted losses on held-out rollouts."""
     model.eval()
     noise, values, weight = torch.Generator().manual_seed(0), dict[str, float](), 0.0
     with torch.no_grad():
@@ -114,7 +114,7 @@ def validate(model: MDNRNN, paths: Sequence[Path], device: torch.device | None =
 
 
 def losses(model: MDNRNN, rollouts: Rollouts, noise: torch.Generator) -> dict[str, Tensor]:
-    """The loss of the latents and of each other head, in one pass; the latents are drawn anew from mu and logvar."""
+    """The losses of the latents and of each other head, in one pass on latents sampled from mu and logvar."""
     config = model.config
     drawn = torch.randn(rollouts.mu.shape, generator=noise).to(rollouts.mu.device)
     sampled = rollouts.mu + torch.exp(0.5 * rollouts.logvar) * drawn
@@ -130,19 +130,19 @@ def losses(model: MDNRNN, rollouts: Rollouts, noise: torch.Generator) -> dict[st
 
 
 def weight_losses(config: MDNRNNConfig, parts: Mapping[str, N]) -> dict[str, N]:
-    """Losses as they count in what is learnt."""
+    """Multiply each part of the loss by its factor."""
     return {name: config.factors[name] * part for name, part in parts.items()}
 
 
 def scale_to_batch(parts: dict[str, Tensor], chunk: Rollouts, rollouts: Rollouts) -> dict[str, Tensor]:
-    """A chunk's mean losses as what they add to those of all rollouts."""
+    """Scale a chunk's mean losses to their contribution to the mean over all rollouts."""
     ahead = float(chunk.mask[:, 1:].sum() / rollouts.mask[:, 1:].sum())
     every = float(chunk.mask.sum() / rollouts.mask.sum())
     return {name: part * (ahead if name == "latent" else every) for name, part in parts.items()}
 
 
 def measure_quality(model: MDNRNN, held_out: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
-    """Nats a latent dimension, each head's loss, and how well heads foresee, on held-out rollouts."""
+    """Nats per latent dimension, each head's loss, and the prediction quality on held-out rollouts."""
     parts = validate(model, held_out, device)
     figures = {"nats_per_dimension": round(parts.pop("latent"), 3)}
     return figures | {f"{name}_loss": round(value, 4) for name, value in parts.items()} | foresight(model, held_out)

@@ -1,4 +1,4 @@
-"""Training the VAE on recorded pictures."""
+"""Train the VAE on recorded pictures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dreamfleet.worker.training.data.dataset import (
     split_held_out,
 )
 from dreamfleet.worker.training.loss_curve import AddPoint, open_loss_curve
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.training_state import TrainingState
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
@@ -32,14 +32,14 @@ log = logging.getLogger(__name__)
 
 CHECKPOINT, CURVE = "vae.safetensors", "vae.jsonl"
 VALIDATION_PICTURES = 2000
-CURVE_PICTURES = 500  # of them, for the curve while training
-ACTIVE_NATS = 0.1  # a picture, on average over the held-out ones, above which a latent carries something
+CURVE_PICTURES = 500  # of them, for the curve during training
+ACTIVE_NATS = 0.1  # mean KL divergence per held-out picture above which a latent counts as active
 
 ReportProgress = Callable[[int, str], None]
 
 
 class VAELossValues(NamedTuple):
-    """Of a VAE, as `VAELoss` has them."""
+    """The values of `VAELoss` as floats."""
 
     weighted: float
     plain: float
@@ -52,11 +52,11 @@ def train_vae(
     device: torch.device | None = None, continue_from: Path | None = None, decoder_only: bool = False,
     stop: Stop = never_stop, new: bool = False, events: Path | None = None,
 ) -> dict[str, float]:  # fmt: skip
-    """Train, or go on, to `config.updates`; returns the quality on held-out episodes.
+    """Train, or resume, up to `config.updates`; return the quality on held-out episodes.
 
-    With `decoder_only` the encoder stays as it is, and with it latents, MDN-RNNs and controllers. A stop changes
-    nothing: batches and chance follow from the seed and the update alone. `StoppedError` if `stop` asks for one.
-    `events`: a folder for TensorBoard's.
+    With `decoder_only` the encoder is frozen, so that latents, MDN-RNNs and controllers stay valid. An interruption
+    changes no bit: batches and noise depend on the seed and the update alone. `StoppedError` if `stop` asks for a stop.
+    `events` is a folder for TensorBoard events.
     """
     train, held_out = split_held_out(episode_paths(folder))
     check_whole([*train, *held_out], "picture", "preprocessing")
@@ -86,8 +86,8 @@ def train_vae(
     figures = measure_quality(model, held_out, device)
     if figures["reconstruction_error"] >= figures["mean_picture_error"]:
         log.warning(
-            "held-out pictures are nearer to their mean (squared error %.4g) than to what this VAE makes of them "
-            "(%.4g): it holds nothing to evolve on yet; give it more --updates",
+            "held-out pictures are nearer to their mean (squared error %.4g) than to this VAE's reconstructions "
+            "(%.4g): it is not good enough to evolve on; give it more --updates",
             figures["mean_picture_error"], figures["reconstruction_error"],
         )  # fmt: skip
     return figures
@@ -96,7 +96,7 @@ def train_vae(
 def _record_validation(
     model: VAE, pictures: NDArray[np.uint8], point: AddPoint, update: int, device: torch.device | None
 ) -> float:
-    """The held-out loss that counts; a point of the curve."""
+    """Validate, add a point to the curve, and return the weighted held-out loss."""
     loss = validate(model, pictures, device)
     parts = {"held_out": loss.plain, "held_out_error": loss.error, "held_out_kl": loss.divergence}
     point(update=update, **parts)
@@ -104,7 +104,7 @@ def _record_validation(
 
 
 def backward(model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device: torch.device | None) -> VAELossValues:
-    """Gradients of a batch; returns its losses."""
+    """Compute a batch's gradients; return its losses."""
     model.train()
     if decoder_only:
         model.freeze_encoder()
@@ -115,7 +115,7 @@ def backward(model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device
 
 
 def validate(model: VAE, pictures: NDArray[np.uint8], device: torch.device | None) -> VAELossValues:
-    """Losses on held-out pictures, at the latents' means."""
+    """Losses on held-out pictures, decoded from the latents' means."""
     model.eval()
     with torch.no_grad():
         parts = [
@@ -126,7 +126,7 @@ def validate(model: VAE, pictures: NDArray[np.uint8], device: torch.device | Non
 
 
 def held_out_pictures(held_out: Sequence[Path], most: int) -> NDArray[np.uint8]:
-    """Every fifth picture of held-out episodes, until there are enough."""
+    """Every fifth picture of held-out episodes, `most` at most: `(N, side, side, 3)`."""
     found: list[NDArray[np.uint8]] = []
     for path in held_out:
         found.append(load_pictures(path)[::5])
@@ -136,7 +136,7 @@ def held_out_pictures(held_out: Sequence[Path], most: int) -> NDArray[np.uint8]:
 
 
 def measure_quality(model: VAE, held_out: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
-    """Summed squared error a picture, beside that of the mean picture, and how many latents are active."""
+    """Squared error per picture of reconstructions and of the mean picture, and the number of active latents."""
     pictures = held_out_pictures(held_out, VALIDATION_PICTURES)
     mean = pictures.mean(axis=0, dtype=np.float64) / 255
     errors, baseline, nats = [], [], []
@@ -157,5 +157,5 @@ def measure_quality(model: VAE, held_out: Sequence[Path], device: torch.device |
 
 
 def as_tensor(pictures: NDArray[np.uint8], device: torch.device | None = None) -> torch.Tensor:
-    """Pictures `(N, side, side, 3)` uint8 as `(N, 3, side, side)` in [0, 1]."""
+    """Convert pictures `(N, side, side, 3)` uint8 to a tensor `(N, 3, side, side)` in [0, 1]."""
     return torch.from_numpy(pictures).to(device).permute(0, 3, 1, 2).float() / 255

@@ -1,4 +1,4 @@
-"""When training ends, at which rate it learns, and on what."""
+"""The state of a training: progress, optimiser and checkpoints, early stopping; and the device it runs on."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from dreamfleet.worker.training.checkpoint import (
     load_progress,
     save_checkpoint,
 )
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 
 
 class TrainingState:
-    """A training's progress on disk: goes on where it stopped, and ends early when held-out rollouts gain nothing."""
+    """A training that resumes from its last checkpoint, and stops early when the held-out loss no longer improves."""
 
     def __init__(
         self, path: Path, model: torch.nn.Module, config: TrainConfig, episodes: int, other: Path | None = None,
         new: bool = False, extensible: frozenset[str] = frozenset(),
     ) -> None:  # fmt: skip
-        """`episodes` to train on, in all; `other` is a checkpoint to begin from where `path` has none.
+        """Load the checkpoint at `path`, or begin with the weights of the checkpoint `other`, or with the model's.
 
-        `new`: what `path` has is not gone on with, and replaced. What is `extensible` of the configuration, as for
-        `load_checkpoint`, is so of `other`, and of what `path` has while it has made no update.
+        `episodes` is the number to train on. `new` replaces a checkpoint at `path` rather than resume it. Fields in
+        `extensible` (see `load_checkpoint`) may be added to `other`, and to `path` while it has made no update.
         """
         if new and other is not None and other.resolve() == path.resolve():
             raise UsageError(f"--new replaces {path}, which --continue-from names: leave one of the two out")
@@ -46,7 +46,7 @@ class TrainingState:
             _check_seed(path, found.get("seed", config.seed), config.seed)
         elif other is not None and load_checkpoint(other, model, self.optimiser, extensible) is None:
             raise UsageError(f"--continue-from: no checkpoint at {other}")
-        # Ended early: only something new to learn from, or no patience at all, makes it go on.
+        # A training that stopped early resumes only with other data, or with patience 0.
         if self.progress.get("stopped") not in (None, episodes) or not config.patience:
             self.progress |= {"stopped": None, "idle": 0}
         self.progress["seed"] = config.seed
@@ -55,18 +55,18 @@ class TrainingState:
 
     @property
     def update(self) -> int:
-        """Updates made."""
+        """The number of updates made."""
         return int(self.progress["update"])
 
     @property
     def done(self) -> bool:
-        """Whether to make no more updates."""
+        """Whether no more updates are to be made."""
         return self.update >= self._config.updates or self.progress.get("stopped") is not None
 
     def should_continue(self, stop: Stop) -> bool:
-        """Whether to make another update; `StoppedError` between two of them, the last one saved, if told to stop.
+        """Whether to make another update; if `stop` asks for a stop, save and raise `StoppedError`.
 
-        Between two updates, because what a stop keeps must lead to the weights that no stop would have led to.
+        It stops between updates only, so that a resumed training gives the same weights as an uninterrupted one.
         """
         if self.done:
             return False
@@ -79,12 +79,12 @@ class TrainingState:
         return True
 
     def set_rate(self, epoch: int) -> None:
-        """The rate of an epoch."""
+        """Set the learning rate of an epoch."""
         for group in self.optimiser.param_groups:
             group["lr"] = self._config.rate * self._config.decay**epoch
 
     def step(self, loss: float) -> None:
-        """One update from the gradients as they are; `DatasetError` where the loss they are of is no number."""
+        """Make an update from the present gradients; `DatasetError` if their loss is NaN or infinite."""
         if not math.isfinite(loss):
             raise DatasetError(
                 f"the loss of update {self.update + 1} is {loss}: the data holds NaN or the rate is too high; what was "
@@ -97,13 +97,13 @@ class TrainingState:
         self.progress["update"] += 1
 
     def save(self, path: Path | None = None) -> None:
-        """Keep the present state."""
+        """Write the present state to `path`, by default the training's checkpoint."""
         save_checkpoint(path or self._path, self._model, self.optimiser, self.progress)
 
     def finish_update(self, validate: Callable[[], float]) -> None:
-        """End an update: where it is due, `validate` on held-out rollouts and save; the best, if patience is over.
+        """End an update: if due, `validate` on held-out rollouts and save; restore the best state if patience is over.
 
-        The last checkpoint is written last and once: a kill before it leads to the same files again.
+        The last checkpoint is written last and once, so that a kill before it leads to the same files again.
         """
         due = self.update % self._config.validate_every == 0 or self.update == self._config.updates
         better = due and self._record_held_out_loss(validate())
@@ -118,7 +118,7 @@ class TrainingState:
         self.save()
 
     def _record_held_out_loss(self, loss: float) -> bool:
-        """Take a held-out loss; whether it is the best so far, of those whose state is there to end with."""
+        """Record a held-out loss; return whether it is the best one so far with a saved state."""
         better = loss < self.progress.get("best", math.inf) or (
             self._config.patience > 0 and not self._has_best_checkpoint()
         )
@@ -131,14 +131,14 @@ class TrainingState:
         self.progress = {**best, "stopped": self._episodes, "idle": 0, "given_up_at": update}
 
     def _has_best_checkpoint(self) -> bool:
-        """Whether the best state lies there; without patience it was not kept, or it is another training's."""
+        """Whether the saved best state is this training's; without patience none is saved."""
         try:
             return bool(load_progress(self._best_path).get("best") == self.progress.get("best"))
-        except DatasetError:  # it is not there, or damaged
+        except DatasetError:  # missing or damaged
             return False
 
     def _replace(self, other: Path | None) -> None:
-        """Write the first checkpoint where one may lie; only then remove what belongs to that, except `other`."""
+        """Write the first checkpoint, then delete the files of the replaced training, except `other`."""
         self.save()
         kept = self._path.parent.glob(f"{self._path.stem}.[0-9]*.safetensors")
         for each in (self._best_path, self._path.with_suffix(".jsonl"), *kept):
@@ -147,7 +147,7 @@ class TrainingState:
 
 
 def _check_seed(path: Path, own: Any, given: int) -> None:
-    """`UsageError` where a training would go on by another seed than it was begun with."""
+    """`UsageError` if a training would resume with another seed."""
     if own != given:
         raise UsageError(
             f"{path} was begun with --seed {own}, and this is --seed {given}: give --seed {own} to go on with it; "
@@ -156,17 +156,17 @@ def _check_seed(path: Path, own: Any, given: int) -> None:
 
 
 def numbered_path(path: Path, update: int) -> Path:
-    """Where the checkpoint of an update is kept beside the last one, which lies at `path`."""
+    """The path of the kept checkpoint of an update, beside the last one at `path`."""
     return path.with_name(f"{path.stem}.{update:06d}{path.suffix}")
 
 
 def resume_command(new: bool) -> str:
-    """What goes on with a training."""
+    """Describe the command that resumes a training."""
     return "the same command without --new" if new else "the same command"
 
 
 def select_device(name: str) -> torch.device:
-    """`cpu`, `cuda`, or `auto`: cuda where there is one."""
+    """The device `cpu`, `cuda`, or `auto` (cuda if available); `UsageError` for an unavailable or unknown one."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and not torch.cuda.is_available():
@@ -177,7 +177,7 @@ def select_device(name: str) -> torch.device:
 
 
 def summarise_model(model: torch.nn.Module, other: Path | None = None, extensible: frozenset[str] = frozenset()) -> str:
-    """Layers and how many parameters of each are learnt; `DatasetError` if `other` is of another model."""
+    """Format the layers and their trainable parameters; `DatasetError` if the checkpoint `other` differs."""
     if other is not None:
         check_config(other, model.config, extensible)
     rows = []
@@ -190,19 +190,19 @@ def summarise_model(model: torch.nn.Module, other: Path | None = None, extensibl
 
 
 def count_parameters(model: torch.nn.Module) -> int:
-    """How many numbers a training changes."""
+    """The number of trainable parameters."""
     return sum(each.numel() for each in model.parameters() if each.requires_grad)
 
 
 def disable_triton_after_mesa(maps: Path = Path("/proc/self/maps")) -> None:
-    """Let torch do without triton in a process that has drawn through Mesa: to load it there crashes.
+    """Prevent torch from importing triton in a process that has loaded Mesa, where that import crashes.
 
-    An optimiser of torch imports triton wherever it is installed, which is in torch's CUDA builds. Triton carries an
-    LLVM of its own, whose start-up code meets the symbols of Mesa's. Nothing here compiles models, so it is not missed.
+    Torch's optimisers import triton if it is installed, as in torch's CUDA builds. Triton brings its own LLVM, whose
+    start-up code clashes with the symbols of Mesa's. Nothing here compiles models, so triton is not needed.
     """
     try:
         drawn = "libLLVM" in maps.read_text()
     except OSError:  # not Linux
         return
     if drawn and "triton" not in sys.modules:
-        sys.modules["triton"] = None  # type: ignore[assignment] # what an import of it meets: ModuleNotFoundError
+        sys.modules["triton"] = None  # type: ignore[assignment] # makes its import raise ModuleNotFoundError

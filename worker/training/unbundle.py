@@ -1,4 +1,4 @@
-"""From a bundle back to what training goes on from."""
+"""Turn a bundle back into checkpoints from which training can resume."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from dreamfleet.common.printable import one_line
 from dreamfleet.common.serialization.validation import MalformedError, from_plain
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import save_checkpoint
+from dreamfleet.worker.training.data.data_folder import explain_folder_errors
 from dreamfleet.worker.training.encode import encoder_hash
 from dreamfleet.worker.worldmodel.export import export_decoder, export_dream, export_encoder
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
@@ -26,10 +27,10 @@ from dreamfleet.worker.worldmodel.weights_from_graphs import Weights, mdnrnn_wei
 
 
 def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:
-    """Write a bundle's VAE and MDN-RNN into a data folder, as checkpoints that have made no update yet.
+    """Write a bundle's VAE and MDN-RNN into a data folder as checkpoints with no updates made.
 
-    `BundleError` if its models cannot be had again, to the bytes of its graphs; `UsageError` where the folder has one
-    of them already; `DatasetError` where nothing can be written.
+    `BundleError` if its models cannot be restored to the bytes of its graphs; `UsageError` if the folder already has
+    such a checkpoint; `DatasetError` if it cannot be written.
     """
     paths = folder / train_vae.CHECKPOINT, folder / train_mdnrnn.CHECKPOINT
     for path in paths:
@@ -39,10 +40,8 @@ def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:
         vae, rnn = _rebuild_models(bundle)
     except (BundleError, MalformedError, UsageError, RuntimeError, ValueError, TypeError, SafetensorError) as error:
         raise BundleError(f"{bundle.path}: {one_line(str(error))}") from error
-    try:
+    with explain_folder_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
     try:
         _save(paths[0], vae)
         _save(paths[1], rnn, vae=encoder_hash(folder))
@@ -54,12 +53,12 @@ def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:
 
 
 def _rebuild_models(bundle: Bundle) -> tuple[VAE, MDNRNN]:
-    told = bundle.manifest.models
-    if not told:
-        raise BundleError("its manifest does not tell its models' layers: it is too old to train on from")
-    seeing, remembering = from_plain(VAEConfig, told.get("vae")), from_plain(MDNRNNConfig, told.get("mdnrnn"))
+    models = bundle.manifest.models
+    if not models:
+        raise BundleError("its manifest lacks its models' layers: it is too old to resume training from")
+    seeing, remembering = from_plain(VAEConfig, models.get("vae")), from_plain(MDNRNNConfig, models.get("mdnrnn"))
     weights = _weights(bundle, seeing, remembering)
-    with torch.device("meta"):  # shapes alone: what the manifest tells need not be true
+    with torch.device("meta"):  # check shapes without memory: the manifest may be wrong
         for model, arrays in zip((VAE(seeing), MDNRNN(remembering)), weights, strict=True):
             model.load_state_dict(_tensors(arrays, "meta"))
     vae, rnn = VAE(seeing), MDNRNN(remembering)
@@ -70,7 +69,7 @@ def _rebuild_models(bundle: Bundle) -> tuple[VAE, MDNRNN]:
 
 
 def _weights(bundle: Bundle, vae: VAEConfig, rnn: MDNRNNConfig) -> tuple[Weights, Weights]:
-    """As they were trained, where the bundle keeps them; otherwise as its graphs hold them."""
+    """The trained weights if the bundle has them, otherwise those in its graphs."""
     if WEIGHTS in bundle.manifest.parts:
         kept = load(bundle.read(WEIGHTS))
         return _select_model("vae", kept), _select_model("mdnrnn", kept)
@@ -89,12 +88,12 @@ def _tensors(weights: Weights, device: str = "cpu") -> dict[str, torch.Tensor]:
 
 
 def _check_graphs(bundle: Bundle, weights: tuple[Weights, Weights], vae: VAEConfig, rnn: MDNRNNConfig) -> None:
-    """`BundleError` if frozen again they are not what the bundle has: neither manifest nor weights need be true."""
+    """`BundleError` unless exporting the weights gives the bundle's graphs again: manifest or weights may be wrong."""
     again = {ENCODER: export_encoder(weights[0], vae), DECODER: export_decoder(weights[0], vae),
              DREAM_GRAPH: export_dream(weights[1], rnn)}  # fmt: skip
     for name, graph in again.items():
         if graph != bundle.read(name):
-            raise BundleError(f"its {name} is not what its weights and its manifest make, so it cannot be trained on")
+            raise BundleError(f"its {name} does not match its weights and manifest, so training cannot resume from it")
 
 
 def _save(path: Path, model: VAE | MDNRNN, **more: Any) -> None:

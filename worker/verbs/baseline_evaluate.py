@@ -17,7 +17,7 @@ EXTRAS = ("worker",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from dreamfleet.worker.baselines.names import NAMES
+    from dreamfleet.worker.baselines.presets import NAMES
 
     parser.add_argument("agent", choices=NAMES, help="who drives")
     parser.add_argument("--data", type=Path, help="of drqn: the folder of its training")

@@ -15,7 +15,7 @@ EXTRAS = ("train",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from dreamfleet.worker.baselines.names import NAMES
+    from dreamfleet.worker.baselines.presets import NAMES
 
     parser.add_argument("agent", choices=NAMES, help="drqn; random drivers are none without their chance")
     parser.add_argument("--data", type=Path, required=True, help="the folder of its training")
@@ -25,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export and print the agent's identity."""
-    from dreamfleet.worker.baselines.names import DRQN
+    from dreamfleet.worker.baselines.presets import DRQN
 
     if args.agent != DRQN:
         raise UsageError(f"{args.agent} learns nothing: there is nothing to export")

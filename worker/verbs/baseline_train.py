@@ -21,8 +21,7 @@ EXTRAS = ("train",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from dreamfleet.worker.baselines.names import NAMES
-    from dreamfleet.worker.baselines.presets import PRESETS
+    from dreamfleet.worker.baselines.presets import NAMES, PRESETS
     from dreamfleet.worker.training.config_flags import add_config_flags
 
     parser.add_argument("agent", choices=NAMES, help="drqn; random drivers learn nothing")
@@ -37,8 +36,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train, with a report every few episodes on stderr, and print the figures."""
-    from dreamfleet.worker.baselines.names import DRQN
-    from dreamfleet.worker.baselines.presets import find_preset
+    from dreamfleet.worker.baselines.presets import DRQN, find_preset
     from dreamfleet.worker.training.config_flags import apply_flags
 
     if args.agent != DRQN:

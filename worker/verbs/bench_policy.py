@@ -10,14 +10,14 @@ EXTRAS = ("worker",)
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from dreamfleet.worker.bench import command
+    from dreamfleet.worker.bench.measurement import add_bundle_flags
 
-    command.configure(parser)
+    add_bundle_flags(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure on one thread and print."""
-    from dreamfleet.worker.bench.command import print_figures
+    from dreamfleet.worker.bench.measurement import print_figures
     from dreamfleet.worker.bench.policy import bench_policy
 
     return print_figures(bench_policy, args)

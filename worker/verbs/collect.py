@@ -50,8 +50,9 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.common.host.stop_signals import stop_on_signals
     from dreamfleet.worker.training.config_flags import apply_flags
-    from dreamfleet.worker.training.data.collect import collect, existing_episodes, missing_numbers
-    from dreamfleet.worker.training.data.dataset_preset import resolve_preset, store_preset
+    from dreamfleet.worker.training.data.collect import collect, missing_numbers
+    from dreamfleet.worker.training.data.data_folder import resolve_preset, store_preset
+    from dreamfleet.worker.training.data.dataset import existing_episodes
     from dreamfleet.worker.training.presets import find_preset
 
     preset = find_preset(resolve_preset(args.data, args.preset))
@@ -97,8 +98,8 @@ def _load_pilots(args: argparse.Namespace) -> tuple[Pilot, ...]:
 
 def _import_run(args: argparse.Namespace) -> int:
     from dreamfleet.common.runs.run_folder import open_run
-    from dreamfleet.worker.training.data.collect import existing_episodes
-    from dreamfleet.worker.training.data.import_rollouts import import_rollouts
+    from dreamfleet.worker.training.data.collect import import_rollouts
+    from dreamfleet.worker.training.data.dataset import existing_episodes
 
     if args.controller:
         raise UsageError("--from-run drives nothing: leave --controller out")

@@ -48,7 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Go through the stages, each of which does what is left of it."""
     from dreamfleet.common.files.atomic_write import check_output_path
-    from dreamfleet.worker.training.data.dataset_preset import check_seed, resolve_preset
+    from dreamfleet.worker.training.data.data_folder import check_seed, resolve_preset
     from dreamfleet.worker.training.pipeline import Pipeline
     from dreamfleet.worker.training.presets import find_preset
 

@@ -40,7 +40,8 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
-    from dreamfleet.worker.training.refit import last_drives, output_names, refit
+    from dreamfleet.worker.training.drive_regression import last_drives
+    from dreamfleet.worker.training.refit import output_names, refit
 
     controller, beside = find_controller(args.controller, args.runs_dir)
     own = find_bundle_of(controller, args.bundle, beside)

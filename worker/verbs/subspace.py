@@ -40,8 +40,8 @@ def run(args: argparse.Namespace) -> int:
     check_output_path(args.out)
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.worker.training.drive_regression import last_drives
     from dreamfleet.worker.training.fit_subspace import find_subspace
-    from dreamfleet.worker.training.refit import last_drives
 
     bundle, paths = find_bundle(args.bundle), last_drives(args.data, args.episodes)
     with progress_bar("subspace", len(paths), "drives") as bar:

@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
 
     configure_process()  # before torch is loaded
     from dreamfleet.worker.training.config_flags import apply_flags
-    from dreamfleet.worker.training.data.dataset_preset import resolve_preset
+    from dreamfleet.worker.training.data.data_folder import resolve_preset
     from dreamfleet.worker.training.encode import count_unencoded
     from dreamfleet.worker.training.presets import find_preset
     from dreamfleet.worker.training.train_mdnrnn import CHECKPOINT, train_mdnrnn

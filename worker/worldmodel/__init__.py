@@ -1,1 +1,1 @@
-"""The frozen world model: ONNX Runtime for inference; torch modules and the export stand apart."""
+"""The world model: frozen in ONNX Runtime for inference, as torch modules for training, and the export between them."""

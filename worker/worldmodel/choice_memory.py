@@ -1,7 +1,7 @@
-"""What controllers keep of their own choices from step to step, and how those of a variant choose.
+"""The memory of a controller's last choices, for variants that repeat choices or see them, and their actions.
 
-It lies in columns behind the world model's state, and so goes wherever a state goes: rows leave a batch with theirs,
-and a dream that begins at a step of a drive holds on to what the drive held.
+It is kept in the last columns of the recurrent state. So it moves with the state: when rows leave a batch, and when a
+dream begins at a step of a drive.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ Layer = tuple[Floats, Floats]
 
 
 class ChoiceMemory:
-    """Columns `(N, columns)`: the last choice, the one before it, and the steps that the last one was held.
+    """Columns `(N, columns)` of the state: the last choice, the one before it, and how long the last one was held.
 
-    There are none where each step is decided anew and no choice is seen.
+    There are no columns if each step makes a new choice and the controller does not see its choices.
     """
 
     def __init__(self, variant: Variant) -> None:
         self._every, self._actions = variant.decide_every, variant.controls
         self._size = self._actions.actions
-        self.extra_features = variant.extra_features > 0  # whether they are features too
+        self.extra_features = variant.extra_features > 0  # whether the controller sees its choices
         self.columns = 2 * self._size + 1 if self.extra_features or self._every > 1 else 0
 
     def features(self, state: Floats) -> Floats:
-        """What a controller sees of them `(N, 2 * outputs)`: the last choice, and its change from the one before."""
+        """The controller's inputs from it `(N, 2 * outputs)`: the last choice, and its difference to the one before."""
         last, before = (self._actions.to_outputs(each) for each in (self._last(state), self._before(state)))
         return np.concatenate([last, last - before], axis=1)
 
     def choose(self, state: Floats, decide_anew: Callable[[], Floats]) -> Floats:
-        """The choice of each row `(N, actions)`: `decide_anew` where it is time to, else the one that is held."""
+        """The choice of each row `(N, actions)`: a new one by `decide_anew` where it is due, else the held one."""
         if not self.columns:
             return decide_anew()
         due = state[:, -1:] == 0
@@ -45,7 +45,7 @@ class ChoiceMemory:
         return np.where(due, decide_anew(), self._last(state))
 
     def next_columns(self, state: Floats, chosen: Floats) -> Floats:
-        """The columns after a step at which this was the choice."""
+        """The columns `(N, columns)` after a step with the choice `chosen` `(N, actions)`."""
         before = np.where(state[:, -1:] == 0, self._last(state), self._before(state))
         held = (state[:, -1:] + 1) % self._every
         return np.concatenate([chosen, before, held], axis=1)
@@ -58,10 +58,10 @@ class ChoiceMemory:
 
 
 def compute_actions(layers: Sequence[Layer], features: Floats, actions: Continuous) -> Floats:
-    """The action `(N, actions)` of controllers, a row each, on `features` (N, F).
+    """The actions `(N, actions)` of N controllers, one per row, on `features` (N, F).
 
-    A layer is weights `(N, outputs, inputs)` and biases `(N, outputs)`; between two there are tanh units. Each row is a
-    product of its own, so that its bits do not depend on its batch.
+    A layer is weights `(N, outputs, inputs)` and biases `(N, outputs)`, with tanh between layers. Each row has its own
+    matrix product, so its bits do not depend on the batch.
     """
     *before, last = layers
     value = features

@@ -1,7 +1,7 @@
-"""ONNX graphs of the frozen world model, written node by node from its weights.
+"""Write the ONNX graphs of a world model node by node from its weights.
 
-Written by hand rather than traced, because the bits of a row must not depend on its batch: weights are constant
-initializers, and nothing gathers, loops or reshapes by a traced batch size.
+They are written by hand rather than traced, because a row's bits must not depend on the batch: weights are constant
+initializers, and no node gathers, loops or reshapes by a traced batch size.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ EPSILON = 1e-5  # of torch's batch normalisation
 
 
 def export_encoder(vae: Weights, config: VAEConfig) -> bytes:
-    """`picture` (N, side, side, 3) uint8 to `mu` and `logvar` (N, latent)."""
+    """Export the encoder: `picture` (N, side, side, 3) uint8 to `mu` and `logvar` (N, latent)."""
     graph = GraphBuilder("encoder")
     flat = _encode(graph, graph.add_input("picture", TensorProto.UINT8, config.picture, config.picture, 3), vae, config)
     for name in ("mu", "logvar"):
@@ -33,7 +33,10 @@ def export_encoder(vae: Weights, config: VAEConfig) -> bytes:
 
 
 def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
-    """`latent` (N, latent) to `picture` (N, side, side, 3) uint8; weights in half precision, sums in single."""
+    """Export the decoder: `latent` (N, latent) to `picture` (N, side, side, 3) uint8.
+
+    Weights are stored in half precision and computed with in single precision.
+    """
     graph = GraphBuilder("decoder")
     latent = graph.add_input("latent", TensorProto.FLOAT, config.latent)
     kernel, bias = graph.weight(vae["dense.weight"]), graph.weight(vae["dense.bias"])
@@ -54,11 +57,11 @@ def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
 def export_policy(
     vae: Weights, rnn: Weights, vae_config: VAEConfig, rnn_config: MDNRNNConfig, actions: Continuous
 ) -> bytes:
-    """One step: picture, controllers and state to action, next state and latent.
+    """Export one policy step: `picture`, `parameters` and `state` to `action`, `next_state` and `latent`.
 
-    The controller acts on (z_t, h_t), then the MDN-RNN advances on (z_t, a_t). `parameters` (N, size) holds a linear
-    controller a row, packed as `common.controller.ControllerShape` says; z is the encoder's mean, h the first columns
-    of `state` (N, state).
+    The controller acts on (z_t, h_t), then the MDN-RNN advances on (z_t, a_t). Each row of `parameters` (N, size) is a
+    linear controller, packed as in `common.artifacts.controller.ControllerShape`. z is the encoder's mean, h the first
+    columns of `state` (N, state).
     """
     graph, count = GraphBuilder("policy"), rnn_config.actions
     size = count * (rnn_config.latent + rnn_config.hidden + 1)
@@ -77,10 +80,10 @@ def export_policy(
 
 
 def export_controller(actions: Continuous, *, hidden: bool) -> bytes:
-    """Controllers of any size, one a row: `features` (N, F) to `action` (N, A).
+    """Export controllers of any size, one per row: `features` (N, F) to `action` (N, A).
 
-    `weights0` (N, A, F) and `biases0` (N, A); with a layer of K units `weights0` (N, K, F), `biases0` (N, K), then
-    `weights1` (N, A, K), `biases1` (N, A).
+    Inputs `weights0` (N, A, F) and `biases0` (N, A). With a `hidden` layer of K units: `weights0` (N, K, F), `biases0`
+    (N, K), `weights1` (N, A, K), `biases1` (N, A).
     """
     graph, kind = GraphBuilder("controller"), TensorProto.FLOAT
     value, sizes = graph.add_input("features", kind, "F"), ["F", "K", "A"] if hidden else ["F", "A"]
@@ -92,7 +95,7 @@ def export_controller(actions: Continuous, *, hidden: bool) -> bytes:
 
 
 def _encode(graph: GraphBuilder, picture: str, vae: Weights, config: VAEConfig) -> str:
-    """Convolutions over the picture; its scale of 1/255 is folded into the first."""
+    """Add the encoder's convolutions; the scale of 1/255 is folded into the first one's weights."""
     value = graph.node("Cast", graph.node("Transpose", picture, perm=[0, 3, 1, 2]), to=TensorProto.FLOAT)
     for index, layer in enumerate(config.down):
         kernel, bias = _folded(vae, "encoder", index, config)
@@ -114,14 +117,14 @@ def _activate(graph: GraphBuilder, value: str, config: VAEConfig) -> str:
 
 
 def _folded(vae: Weights, part: str, layer: int, config: VAEConfig) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Kernel and bias of a layer, its batch normalisation folded into them."""
+    """Kernel and bias of a layer with its batch normalisation folded in."""
     index = layer * config.modules_a_layer
     kernel, bias = vae[f"{part}.{index}.weight"], vae[f"{part}.{index}.bias"]
     norm = f"{part}.{index + 1}"
     if f"{norm}.running_var" not in vae:
         return kernel, bias
     scale = vae[f"{norm}.weight"] / np.sqrt(vae[f"{norm}.running_var"] + EPSILON)
-    outputs = 0 if part == "encoder" else 1  # the axis of a kernel's outputs: torch turns it round in the decoder
+    outputs = 0 if part == "encoder" else 1  # the kernel's output axis, which torch swaps in transposed convolutions
     kernel = kernel * np.expand_dims(scale, [axis for axis in range(4) if axis != outputs])
     return kernel, (bias - vae[f"{norm}.running_mean"]) * scale + vae[f"{norm}.bias"]
 
@@ -131,13 +134,13 @@ def _linear(graph: GraphBuilder, value: str, weights: Weights, name: str) -> str
 
 
 def _layer(graph: GraphBuilder, features: str, weights: str, biases: str) -> str:
-    """Tanh of each row's own weights on its own features."""
+    """Add a tanh layer in which each row has its own weights."""
     product = graph.node("MatMul", weights, graph.node("Unsqueeze", features, graph.shape(2)))
     return str(graph.node("Tanh", graph.node("Add", graph.node("Squeeze", product, graph.shape(2)), biases)))
 
 
 def _squash(graph: GraphBuilder, squashed: str, actions: Continuous) -> str:
-    """To the world's ranges, as `actions` says; a bound that no output can pass is left out."""
+    """Scale tanh outputs to the ranges of `actions`; clipping at an unreachable bound is left out."""
     scale, shift, low, high = (
         np.array(each, np.float32) for each in (actions.scale, actions.shift, actions.low, actions.high)
     )

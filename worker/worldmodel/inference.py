@@ -1,4 +1,4 @@
-"""The frozen world model on ONNX Runtime: one thread, and a row's bits do not depend on its batch."""
+"""Run the frozen world model in ONNX Runtime: on one thread, and a row's bits do not depend on its batch."""
 
 from __future__ import annotations
 
@@ -23,27 +23,35 @@ from dreamfleet.worker.worldmodel.choice_memory import ChoiceMemory, Layer, comp
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]
-NAMES = ("weights", "biases")  # of a layer
-ATTENTION = "attention"  # an output of dreams with a window
+NAMES = ("weights", "biases")  # inputs of a controller's layer
+ATTENTION = "attention"  # output of dream graphs with attention
 
 
 def open_part(bundle: Bundle, name: str) -> onnxruntime.InferenceSession:
-    """A session on one of a bundle's graphs; one thread, because scoring processes are one a core."""
+    """Open one of a bundle's graphs on one thread, because each core has its own scoring process."""
     graph = bundle.read(name)
     try:
-        check_self_contained(graph)
-        return open_graph(graph, threads=1)
+        return open_untrusted_graph(graph)
     except Exception as error:  # the runtime's errors share no public base
         raise BundleError(f"{bundle.path}: {name} cannot be run ({error})") from error
 
 
+def open_untrusted_graph(graph: bytes) -> onnxruntime.InferenceSession:
+    """Open a graph from an untrusted file on one thread.
+
+    `ValueError` if it names other files; the runtime's own errors, which share no base, if it cannot be run.
+    """
+    check_self_contained(graph)
+    return open_graph(graph, threads=1)
+
+
 def open_graph(graph: bytes, threads: int) -> onnxruntime.InferenceSession:
-    """A session on an ONNX graph, on so many threads; a row's bits do not depend on their number."""
+    """Open an ONNX graph on `threads` threads; a row's bits do not depend on their number."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.add_session_config_entry("session.load_model_format", "ONNX")  # whatever its first bytes say
+    options.add_session_config_entry("session.load_model_format", "ONNX")  # not the format that its first bytes suggest
     options.log_severity_level = 3
     return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
@@ -51,7 +59,7 @@ def open_graph(graph: bytes, threads: int) -> onnxruntime.InferenceSession:
 def check_sizes(
     bundle: Bundle, name: str, session: onnxruntime.InferenceSession, expected: dict[str, list[int]]
 ) -> None:
-    """`BundleError` if a graph's inputs or outputs are not as large as the manifest says."""
+    """`BundleError` if a graph's inputs or outputs do not have the `expected` sizes (without the batch)."""
     found = {each.name: each.shape[1:] for each in (*session.get_inputs(), *session.get_outputs())}
     for value, shape in expected.items():
         if found.get(value) != shape:
@@ -62,9 +70,9 @@ def check_sizes(
 
 
 class PolicyOutput(NamedTuple):
-    """What one policy step gives, a row an episode.
+    """The outputs of a policy step, one row per episode: `action` (N, actions), `state` and `latent`.
 
-    `state` is for the next step: its first columns are h, its last ones what the controller keeps of its choices.
+    `state` is the next step's: h comes first, the controller's memory of its choices last.
     """
 
     action: Floats
@@ -73,7 +81,7 @@ class PolicyOutput(NamedTuple):
 
 
 class PolicyStep:
-    """Encoder, controller and MDN-RNN: one graph under the default controllers, three under others."""
+    """Encoder, controller and MDN-RNN: a single graph for default controllers, three graphs for others."""
 
     def __init__(self, bundle: Bundle) -> None:
         self.shape = bundle.controller_shape
@@ -96,7 +104,7 @@ class PolicyStep:
             self.state_size = self._memory.state_size
 
     def step(self, picture: Pictures, parameters: Floats, state: Floats) -> PolicyOutput:
-        """Act and advance: `picture` (N, side, side, 3), `parameters` (N, size), `state` (N, state_size)."""
+        """Act and advance on `picture` (N, side, side, 3), `parameters` (N, size) and `state` (N, state_size)."""
         if not self._one_graph:
             latent, _ = self._encoder.encode(picture)
             action = self._controllers.act(parameters, latent, state)
@@ -109,12 +117,12 @@ class PolicyStep:
         return self._reward.begin(np.zeros((rows, self.state_size), dtype=np.float32))
 
     def write_rewards(self, state: Floats, rewards: NDArray[np.float64]) -> None:
-        """Write the rewards (N,) that followed the last step into `state`, where the model looks at them."""
+        """Write the last step's rewards (N,) into `state`, if the model takes them as input."""
         self._reward.write(state, rewards)
 
 
 class RewardLabel:
-    """Where the previous reward lies in a state, and what the model sees of it."""
+    """The previous reward in a state, in the form that the model takes as input; it does nothing for other models."""
 
     def __init__(self, bundle: Bundle) -> None:
         model = bundle.manifest.models.get("mdnrnn", {})
@@ -123,13 +131,13 @@ class RewardLabel:
         self._first = float(model.get("first_reward", 0.0))
 
     def begin(self, state: Floats) -> Floats:
-        """A zero state, in which the model sees before its first step what training began with."""
+        """Set the previous reward of a first step, as in training, in a zero state; return the state."""
         if self._column is not None:
             state[:, self._column] = self._first
         return state
 
     def write(self, state: Floats, rewards: NDArray[np.float64]) -> None:
-        """Label `rewards` (N,) of steps that did not end their episodes, as the reward head does."""
+        """Write the reward head's label of `rewards` (N,) into `state`; no step may have ended its episode."""
         if self._column is None:
             return
         labels = rewards if self._kind == "value" else (rewards > 0) == (self._kind == "positive")
@@ -137,7 +145,7 @@ class RewardLabel:
 
 
 class Controllers:
-    """Controllers of the bundle's shape, a row each, apart from the policy's graph; a variant's are no graph at all."""
+    """Controllers of the bundle's shape, one per row, outside the policy's graph; in NumPy for variants."""
 
     def __init__(self, bundle: Bundle) -> None:
         self.shape, variant = bundle.controller_shape, bundle.variant
@@ -155,7 +163,7 @@ class Controllers:
         self._feed: dict[str, Floats] = {}
 
     def act(self, parameters: Floats, latent: Floats, state: Floats) -> Floats:
-        """`action` (N, actions) of `parameters` (N, size); these are unpacked once, so do not change them in place."""
+        """The actions (N, actions) of `parameters` (N, size), which are unpacked once: do not change them in place."""
         if parameters is not self._parameters:
             self._unpack(parameters)
         return self.choices.choose(state, lambda: self._decide(latent, state))
@@ -177,10 +185,10 @@ class Controllers:
 
 
 class DreamOutput(NamedTuple):
-    """What one step of the dream gives, a row a dreamer.
+    """The outputs of a dream step, one row per dream: `action`, `latent`, `state`, and the heads' outputs (N,).
 
-    `reward` is the probability that the reward head's label is true, or the value; `done` a probability; (N,), zero
-    without such a head.
+    `reward` is the probability of the reward head's label, or the predicted value; `done` is a probability. Without
+    such a head they are zero.
     """
 
     action: Floats
@@ -191,7 +199,7 @@ class DreamOutput(NamedTuple):
 
 
 class NoiseSize(NamedTuple):
-    """How much chance one step of a dream takes: numbers a row, and the rate of dropout; 0: none."""
+    """The random numbers of one dream step: how many per row, and the dropout rate (0: none)."""
 
     latent: int
     hidden: int
@@ -199,7 +207,7 @@ class NoiseSize(NamedTuple):
 
 
 class DreamStep:
-    """Controller and MDN-RNN, which dreams the next latent."""
+    """Controller and MDN-RNN, which samples the next latent."""
 
     def __init__(self, bundle: Bundle) -> None:
         session, manifest = open_part(bundle, DREAM_GRAPH), bundle.manifest
@@ -216,7 +224,7 @@ class DreamStep:
         self._zero_noise: dict[str, Floats] = {}
         self.shape = bundle.controller_shape
         self.hidden_size = bundle.manifest.hidden
-        self.memory_size: int = sizes["state"][1]  # the world model's part of a state
+        self.memory_size: int = sizes["state"][1]  # columns of the state that are the world model's
         self.state_size = self.memory_size + self._choices.columns
         self.latent_size: int = sizes["latent"][1]
         dropout = float(manifest.models["mdnrnn"]["dropout"]) if "mask" in sizes else 0.0
@@ -226,10 +234,10 @@ class DreamStep:
         self, latent: Floats, parameters: Floats, state: Floats, uniform: Floats, normal: Floats,
         temperature: float, mask: Floats | None = None,
     ) -> DreamOutput:  # fmt: skip
-        """Act on `latent` (N, latent) and `state` (N, state_size) by `parameters` (N, size), and dream on.
+        """Act on `latent` (N, latent) and `state` (N, state_size) by `parameters` (N, size), and dream the next step.
 
-        `uniform` in [0, 1) and `normal` (N, latent) are chance; `mask` (N, hidden) is the dropout, for models that were
-        trained with it: 0 or 1 / (1 - rate), and none keeps all.
+        `uniform` in [0, 1) and `normal` (N, latent) are random numbers. `mask` (N, hidden) is the dropout of models
+        trained with it: 0 or 1 / (1 - rate); without a mask nothing is dropped.
         """
         action = self._controllers.act(parameters, latent, state)
         return self.imagine(latent, action, state, uniform, normal, temperature, mask)
@@ -238,7 +246,7 @@ class DreamStep:
         self, latent: Floats, action: Floats, state: Floats, uniform: Floats, normal: Floats,
         temperature: float, mask: Floats | None = None, chosen: Floats | None = None,
     ) -> DreamOutput:  # fmt: skip
-        """Dream on under these actions `(N, actions)`; `chosen` are the controllers' where others are done."""
+        """Dream the next step under actions `(N, actions)`; `chosen` are the controllers' own if others are applied."""
         own = self._model_state(state)
         feed = {"latent": latent, "action": action, "state": own, "uniform": uniform, "normal": normal}
         feed["temperature"] = np.array([temperature], dtype=np.float32)
@@ -246,22 +254,22 @@ class DreamStep:
             feed["mask"] = np.ones((len(latent), self.hidden_size), np.float32) if mask is None else mask
         given = dict(zip(self._names, self._run(self._names, feed), strict=True))
         none = np.zeros(len(latent), dtype=np.float32)
-        told = given.get("reward", none), given.get("done", none)
+        heads = given.get("reward", none), given.get("done", none)
         after = self._next_state(given["next_state"], state, action if chosen is None else chosen)
-        return DreamOutput(action, given["next_latent"], after, *told)
+        return DreamOutput(action, given["next_latent"], after, *heads)
 
     def advance(self, latent: Floats, action: Floats, state: Floats, chosen: Floats | None = None) -> Floats:
-        """The next state alone, as in reality, where the next latent is seen and not dreamt; `chosen` as above."""
+        """The next state alone, for reality, where the next latent is seen; `chosen` as in `imagine`."""
         return self._next_state(
             self._run_output("next_state", latent, action, state), state, action if chosen is None else chosen
         )
 
     def attend(self, latent: Floats, action: Floats, state: Floats) -> Floats:
-        """The weights (N, window) that attention gives its inputs at this step, the oldest first."""
+        """The attention weights (N, window) of the last inputs at this step, oldest first."""
         return self._run_output(ATTENTION, latent, action, state)
 
     def _run_output(self, output: str, latent: Floats, action: Floats, state: Floats) -> Floats:
-        """One output that chance has no part in."""
+        """Compute one output that does not depend on the random numbers."""
         if len(self._zero_noise.get("uniform", "")) != len(latent):
             zeros = np.zeros((len(latent), self.latent_size), dtype=np.float32)
             self._zero_noise = {"uniform": zeros, "normal": zeros, "temperature": np.ones(1, np.float32)}
@@ -272,11 +280,11 @@ class DreamStep:
         return np.asarray(found, dtype=np.float32)
 
     def _model_state(self, state: Floats) -> Floats:
-        """The world model's part of a state."""
+        """The columns of a state that are the world model's."""
         return np.ascontiguousarray(state[:, : self.memory_size]) if self._choices.columns else state
 
     def _next_state(self, models: Floats, state: Floats, chosen: Floats) -> Floats:
-        """The world model's next state with what the controllers keep behind it."""
+        """The world model's next state followed by the controllers' memory of their choices."""
         if not self._choices.columns:
             return models
         return np.concatenate([models, self._choices.next_columns(state, chosen)], axis=1)
@@ -287,7 +295,7 @@ class DreamStep:
 
 
 class Encoder:
-    """Pictures to latents."""
+    """The encoder, from pictures to latents."""
 
     def __init__(self, bundle: Bundle) -> None:
         session, manifest = open_part(bundle, ENCODER), bundle.manifest
@@ -301,7 +309,7 @@ class Encoder:
 
 
 class Decoder:
-    """Latents to pictures."""
+    """The decoder, from latents to pictures."""
 
     def __init__(self, bundle: Bundle) -> None:
         self._run = open_part(bundle, DECODER).run

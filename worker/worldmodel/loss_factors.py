@@ -1,4 +1,4 @@
-"""Factors that weigh the parts of a loss against each other."""
+"""Configuration fields for factors that weight the parts of a loss."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from typing import Any
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 
-LEAST, MOST = 1e-6, 1e6  # beyond which float32 loses the lighter part beside the heavier one
+LEAST, MOST = 1e-6, 1e6  # beyond these, float32 loses the smaller part of the sum
 
 
 def added_option(default: Any, text: str) -> Any:
-    """A field that a later version added: at its default it is not written."""
+    """A field that a later version added: it is not serialised at its default."""
     return field(default=default, metadata={**OPTIONAL, "help": text})
 
 
 def loss_factor(text: str) -> Any:
-    """A field of a model's configuration that weighs a part of its loss; 1, which is not written: as it stands."""
+    """A field with the factor of a part of a model's loss; the default 1 is not serialised."""
     return added_option(1.0, f"{text}; 1 as its source has it")
 
 
 def check_factors(config: Any, *names: str) -> None:
-    """`UsageError` names the first of these fields that weighs nothing, or too much."""
+    """`UsageError` names the first of these fields that is out of bounds."""
     for name in names:
         if not LEAST <= getattr(config, name) <= MOST:
             raise UsageError(

@@ -1,9 +1,8 @@
-"""The MDN-RNN: an LSTM that predicts the next latents as mixtures of Gaussians, and what comes with them.
+"""The MDN-RNN: an LSTM that predicts the next latents as mixtures of Gaussians, and optionally reward and end.
 
-Mixtures a latent dimension as in hardmaru/WorldModelsExperiments. Heads of its successors: the reward in three forms,
-and whether the episode ends (the paper's Doom). Additive attention over past inputs is what
-miketynes/AttentiveWorldModels means; in its code the softmax runs over the batch and the state stays zero, so that it
-never attended.
+A mixture for each latent dimension as in hardmaru/WorldModelsExperiments. Heads from its successors: the reward in
+three forms, and whether the episode ends (the paper's Doom). The additive attention over past inputs is the intended
+one of miketynes/AttentiveWorldModels; its code takes the softmax over the batch on a state that stays zero.
 """
 
 from __future__ import annotations
@@ -19,9 +18,9 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig, Reward
 
 
 class Prediction(NamedTuple):
-    """Of the next latents: log weights, means, log deviations `(..., latent, mixtures)`.
+    """The mixtures of the next latents: log weights, means and log deviations `(..., latent, mixtures)`.
 
-    `reward` (logit or value) and `done` (logit) `(...)`; zero without such a head.
+    `reward` (logit or value) and `done` (logit) are `(...)`, and zero without such a head.
     """
 
     log_weights: Tensor
@@ -32,18 +31,18 @@ class Prediction(NamedTuple):
 
 
 class MDNRNN(nn.Module):
-    """Latents, actions and previous reward `(N, T, inputs)` to a prediction for each step.
+    """From latents, actions and previous reward `(N, T, inputs)` to a prediction for each step.
 
-    Attention: score_i = v tanh(W1 x_i + W2 h) over the last `window` inputs x = (z, a), the current one included and
-    zeros before the first; a softmax over these steps; the weighted inputs enter the LSTM beside the current input, so
-    that the plain model is the special case of zero weights on them.
+    Attention (Bahdanau et al. 2015, arXiv:1409.0473): score_i = v tanh(W1 x_i + W2 h) over the last `window` inputs
+    x = (z, a), the current one included, zeros before the first; softmax over these steps. The weighted sum of inputs
+    enters the LSTM beside the current input, so the plain model is the special case of zero weights on it.
     """
 
     def __init__(self, config: MDNRNNConfig) -> None:
         super().__init__()
         self.config = config
         self.lstm = nn.LSTM(config.lstm_inputs, config.hidden, batch_first=True)
-        with torch.no_grad():  # one bias, as in the sources; torch has two that add
+        with torch.no_grad():  # one bias as in the sources, though torch adds two
             self._second_bias.zero_()
         self._second_bias.requires_grad_(False)
         self.heads = nn.Linear(config.hidden, config.outputs)
@@ -57,12 +56,12 @@ class MDNRNN(nn.Module):
         return self.lstm.get_parameter("bias_hh_l0")
 
     def forward(self, inputs: Tensor) -> Prediction:
-        """Predict from a zero state at the first step on."""
+        """Predict each step of sequences that begin with a zero state."""
         hidden: Tensor = self._run_with_attention(inputs) if self.config.window else self.lstm(inputs)[0]
         return self.predict(hidden)
 
     def predict(self, hidden: Tensor) -> Prediction:
-        """The heads on hidden states `(..., hidden)`."""
+        """Apply the heads to hidden states `(..., hidden)`."""
         config = self.config
         out = self.heads(functional.dropout(hidden, config.dropout, self.training))
         ends = 3 * config.mixtures * config.latent
@@ -74,9 +73,9 @@ class MDNRNN(nn.Module):
         return Prediction(functional.log_softmax(weights, dim=-1), means, deviations, reward, done)
 
     def advance(self, steps: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """One step on latents and actions `(N, latent + actions)` from a state `(N, state)`: hidden and next state.
+        """Step on latents and actions `(N, latent + actions)` from a state `(N, state)`; return hidden and next state.
 
-        The previous reward is the state's; the next state keeps it until the caller knows the next.
+        The previous reward comes from the state; the next state keeps it until the caller writes the new one.
         """
         config = self.config
         sizes = [config.hidden, config.hidden, int(config.previous_reward), config.window * steps.shape[1]]
@@ -103,7 +102,7 @@ class MDNRNN(nn.Module):
         return torch.stack(outputs, dim=1)
 
     def _attend(self, seen: Tensor, keys: Tensor, hidden: Tensor) -> Tensor:
-        """The inputs `seen` `(N, window, latent + actions)`, weighted over their steps."""
+        """The attention-weighted sum over the steps of the inputs `seen` `(N, window, latent + actions)`."""
         scores = self.score(torch.tanh(keys + self.query(hidden)[:, None]))
         weighted: Tensor = (torch.softmax(scores, dim=1) * seen).sum(dim=1)
         return weighted
@@ -118,7 +117,7 @@ class MDNRNN(nn.Module):
 
 
 def latent_loss(prediction: Prediction, targets: Tensor, mask: Tensor) -> Tensor:
-    """Negative log likelihood in nats a latent dimension; `targets` `(N, T, latent)`, `mask` `(N, T)` 1 where real."""
+    """Negative log likelihood in nats per latent dimension of `targets` `(N, T, latent)` where `mask` `(N, T)` is 1."""
     scaled = (targets[..., None] - prediction.means) * torch.exp(-prediction.log_deviations)
     log_normal = -0.5 * scaled.square() - prediction.log_deviations - 0.5 * math.log(2 * math.pi)
     likelihood = torch.logsumexp(prediction.log_weights + log_normal, dim=-1).mean(dim=-1)
@@ -126,7 +125,7 @@ def latent_loss(prediction: Prediction, targets: Tensor, mask: Tensor) -> Tensor
 
 
 def reward_labels(kind: Reward, rewards: Tensor, done: Tensor) -> Tensor:
-    """What the reward head shall tell `(N, T)`; `done` is 1 where a step ended its episode."""
+    """The reward head's targets `(N, T)`; `done` is 1 where a step ended its episode."""
     if kind == "value":
         return rewards
     positive = (rewards > 0).float()
@@ -141,6 +140,6 @@ def reward_loss(kind: Reward, predicted: Tensor, labels: Tensor, mask: Tensor) -
 
 
 def binary_loss(logits: Tensor, labels: Tensor, mask: Tensor) -> Tensor:
-    """Binary cross-entropy in nats a step."""
+    """Binary cross-entropy in nats per step."""
     losses = functional.binary_cross_entropy_with_logits(logits, labels, reduction="none")
     return (losses * mask).sum() / mask.sum().clamp(min=1)

@@ -1,4 +1,4 @@
-"""The MDN-RNN's step as ONNX nodes: what the policy's graph and the dream's have in common, and the dream itself."""
+"""The MDN-RNN's step as ONNX nodes, for the policy's and the dream's graph, and the export of the dream."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Weights = Mapping[str, NDArray[np.float32]]
 
 
 class RecurrentGraph:
-    """The LSTM, and the attention before it, of a graph that has a `state` (N, S)."""
+    """The LSTM, and the attention before it, in a graph with an input `state` (N, state)."""
 
     def __init__(self, graph: GraphBuilder, state: str, rnn: Weights, config: MDNRNNConfig) -> None:
         self._graph, self._rnn, self._config = graph, rnn, config
@@ -28,7 +28,7 @@ class RecurrentGraph:
         self.attention = ""  # weights (N, window, 1) of the last step
 
     def advance(self, latent: str, action: str) -> str:
-        """One step: `hidden` becomes the next."""
+        """Add one step; return the next hidden state, which is `hidden` from now on."""
         graph, step = self._graph, window_input(self._graph, latent, action, self._config)
         inputs = [latent, action, self._previous]
         if self._config.window:
@@ -39,7 +39,7 @@ class RecurrentGraph:
         return self.hidden
 
     def next_state(self, previous: str = "") -> str:
-        """The state behind `advance`, as `MDNRNNConfig.state` lays it out; `previous` is what the reward head tells."""
+        """The state after `advance`, laid out as in `MDNRNNConfig.state`; `previous` is the reward head's label."""
         return self._graph.join(self.hidden, self._cell, previous or self._previous, self._window)
 
     def _attend(self) -> str:
@@ -56,9 +56,9 @@ class RecurrentGraph:
 
 
 def lstm(graph: GraphBuilder, inputs: Sequence[str], hidden: str, cell: str, weights: Weights) -> tuple[str, str]:
-    """A step of an LSTM, whose `weights` are named as torch names them: its next hidden and cell state.
+    """Add a step of an LSTM with torch's names of `weights`; return its next hidden and cell state.
 
-    A matrix product a gate: of one for all, the cuts would copy more than the products save (5 % of a step).
+    Each gate has its own matrix product: splitting a common one costs more copies than it saves (5 % of a step).
     """
     size = weights["lstm.weight_hh_l0"].shape[1]
     kernel = np.concatenate([weights["lstm.weight_ih_l0"], weights["lstm.weight_hh_l0"]], axis=1)
@@ -75,20 +75,20 @@ def lstm(graph: GraphBuilder, inputs: Sequence[str], hidden: str, cell: str, wei
 
 
 def window_input(graph: GraphBuilder, latent: str, action: str, config: MDNRNNConfig) -> str:
-    """What enters the window."""
+    """The entry `(N, latent + actions)` of the attention's window; empty without one."""
     return graph.join(latent, action) if config.window else ""
 
 
 def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
-    """A step of the dream: latent, action and state, and what chance gives, to the next ones.
+    """Export a step of the dream.
 
-    Inputs `latent` (N, latent), `action` (N, actions), `state` (N, state), `uniform` and `normal` (N, latent),
-    `temperature` (1,), and with dropout `mask` (N, hidden), which the LSTM's output is multiplied by. Outputs
-    `next_latent`, `next_state`, of heads that exist `reward` (probability or value) and `done` (N,), and with a window
+    Inputs: `latent` (N, latent), `action` (N, actions), `state` (N, state), the random numbers `uniform` and `normal`
+    (N, latent), `temperature` (1,), and with dropout `mask` (N, hidden), a factor of the LSTM's output. Outputs:
+    `next_latent`, `next_state`, for existing heads `reward` (probability or value) and `done` (N,), and with attention
     `attention` (N, window).
 
-    Sampling (Ha & Schmidhuber 2018): log weights divided by the temperature, deviations times its root. The mixture is
-    the first whose cumulated weight exceeds `uniform`: `Where`s from the first to the last, no Gather.
+    Sampling (Ha & Schmidhuber 2018): log weights divided by the temperature, deviations times its square root. The
+    mixture is the first whose cumulative weight exceeds `uniform`, selected by `Where` nodes rather than Gather.
     """
     graph, kind = GraphBuilder("dream"), TensorProto.FLOAT
     latent, action = graph.add_input("latent", kind, config.latent), graph.add_input("action", kind, config.actions)
@@ -100,7 +100,7 @@ def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
     if config.dropout:
         hidden = graph.node("Mul", hidden, graph.add_input("mask", kind, config.hidden))
     order = mixture_major_order(config)
-    # Half precision: the bundle holds the LSTM twice already, and its size has a limit.
+    # In half precision: the bundle holds the LSTM twice already, and its size is limited.
     kernel, bias = graph.weight(rnn["heads.weight"][order].T), graph.constant(rnn["heads.bias"][order])
     heads = graph.node("Gemm", hidden, kernel, bias)
     columns = graph.split(
@@ -111,8 +111,8 @@ def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
     noise = graph.node("Mul", normal, graph.node("Sqrt", temperature))
     spread = graph.node("Mul", graph.node("Exp", deviation), noise)
     graph.add_output(graph.node("Add", mean, spread), "next_latent", kind, config.latent)
-    told = _dreamt_reward_label(graph, reward, config) if config.previous_reward else ""
-    graph.add_output(recurrent.next_state(told), "next_state", kind, config.state)
+    label = _dreamt_reward_label(graph, reward, config) if config.previous_reward else ""
+    graph.add_output(recurrent.next_state(label), "next_state", kind, config.state)
     if recurrent.attention:
         weights = graph.node("Squeeze", recurrent.attention, graph.shape(2))
         graph.add_output(weights, "attention", kind, config.window)
@@ -124,14 +124,14 @@ def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
 
 
 def mixture_major_order(config: MDNRNNConfig) -> NDArray[Any]:
-    """The heads' rows by (kind, mixture, latent) instead of (kind, latent, mixture): mixtures are then slices."""
+    """The heads' rows in the order (kind, mixture, latent) instead of (kind, latent, mixture), to slice mixtures."""
     width = config.mixtures * config.latent
     rows = np.arange(3 * width).reshape(3, config.latent, config.mixtures).transpose(0, 2, 1).ravel()
     return np.concatenate([rows, np.arange(3 * width, config.outputs)])
 
 
 def _select_mixture(graph: GraphBuilder, mixtures: Sequence[str], uniform: str, temperature: str) -> tuple[str, str]:
-    """Mean and log deviation (N, latent) of the mixture that `uniform` falls in; `mixtures` are the heads' columns."""
+    """Mean and log deviation (N, latent) of the mixture selected by `uniform`; `mixtures` are the heads' columns."""
     count = len(mixtures) // 3
     logits, means, deviations = mixtures[:count], mixtures[count : 2 * count], mixtures[2 * count :]
     if count == 1:
@@ -151,7 +151,7 @@ def _select_mixture(graph: GraphBuilder, mixtures: Sequence[str], uniform: str, 
 
 
 def _dreamt_reward_label(graph: GraphBuilder, reward: str, config: MDNRNNConfig) -> str:
-    """What the next step's previous reward is in the dream: the value, or the likelier label."""
+    """The previous reward of a dream's next step: the predicted value, or the likelier label."""
     if config.reward == "value":
         return reward
     positive = graph.node("Greater", reward, graph.constant(np.array(0, np.float32)))

@@ -1,4 +1,4 @@
-"""What an agent of one's own observes of a world model: the same in its dream and in reality."""
+"""The observations of agents trained outside dreamfleet, equal in the dream and in reality."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ FEATURES = ("z", "zh")
 
 
 class Observation:
-    """`z`: the latent. `zh`: behind it the MDN-RNN's hidden state, which alone tells of movement."""
+    """`z`: the latent. `zh`: the latent and the MDN-RNN's hidden state, without which movement is invisible."""
 
     def __init__(self, bundle: Bundle, features: str) -> None:
-        """`UsageError` for features that are neither."""
+        """`UsageError` for features other than `z` and `zh`."""
         if features not in FEATURES:
             raise UsageError(f"an agent's features are {' or '.join(FEATURES)}, not {features!r}")
         self._hidden = bundle.manifest.hidden if features == "zh" else 0
@@ -28,15 +28,15 @@ class Observation:
 
     @property
     def space(self) -> Any:
-        """Any numbers `(size,)`: a Gaussian has no bounds."""
+        """The observation space: unbounded numbers `(size,)`."""
         most = float(np.finfo(np.float32).max)
         return spaces.Box(-most, most, (self.size,), np.float32)
 
     def observe(self, latent: Floats, state: Floats) -> Floats:
-        """The observations `(N, size)`, a copy, of `latent` `(N, latent)` and the model's `state` `(N, state)`."""
+        """Copy the observations `(N, size)` from `latent` `(N, latent)` and the model's `state` `(N, state)`."""
         return np.concatenate([latent, state[:, : self._hidden]], axis=1)
 
 
 def open_bundle(bundle: Bundle | str) -> Bundle:
-    """A bundle, or the one of that name or file."""
+    """Return a bundle as it is, or find one by its name or file."""
     return find_bundle(bundle) if isinstance(bundle, str) else bundle

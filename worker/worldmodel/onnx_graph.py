@@ -1,4 +1,4 @@
-"""Building ONNX graphs node by node."""
+"""Build ONNX graphs node by node."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ IR_VERSION = 8
 
 
 class GraphBuilder:
-    """Collects nodes and constants; each method returns the name of what it made."""
+    """Collects nodes and constants; each method returns the name of the value it adds."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -24,39 +24,39 @@ class GraphBuilder:
         self._outputs: list[onnx.ValueInfoProto] = []
 
     def add_input(self, name: str, kind: int, *shape: int | str) -> str:
-        """An input of `kind` and shape `(N, *shape)`; a name stands for any size."""
+        """Add an input of type `kind` and shape `(N, *shape)`; a name in `shape` stands for any size."""
         self._inputs.append(helper.make_tensor_value_info(name, kind, ["N", *shape]))
         return name
 
     def add_scalar_input(self, name: str) -> str:
-        """An input of one number `(1,)`."""
+        """Add an input of one number `(1,)`."""
         self._inputs.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]))
         return name
 
     def add_output(self, value: str, name: str, kind: int, *shape: int) -> None:
-        """An output of `kind` and shape `(N, *shape)`."""
-        for node in self._nodes:  # renamed where it is made and used: an Identity node would cost a copy
+        """Make `value` an output `name` of type `kind` and shape `(N, *shape)`."""
+        for node in self._nodes:  # rename the value itself: an Identity node would cost a copy
             for names in (node.input, node.output):
                 names[:] = [name if each == value else each for each in names]
         self._outputs.append(helper.make_tensor_value_info(name, kind, ["N", *shape]))
 
     def constant(self, array: NDArray[Any]) -> str:
-        """A weight."""
+        """Add a constant."""
         name = f"c{len(self._constants)}"
         self._constants.append(numpy_helper.from_array(np.ascontiguousarray(array), name))
         return name
 
     def weight(self, array: NDArray[Any]) -> str:
-        """A weight kept in half precision; the runtime widens it once, as it loads."""
+        """Add a weight in half precision; the runtime widens it once, as it loads."""
         return str(self.node("Cast", self.constant(array.astype(np.float16)), to=TensorProto.FLOAT))
 
     def linear(self, value: str, kernel: NDArray[Any], bias: NDArray[Any] | None = None) -> str:
-        """`value` times `kernel` (inputs, outputs), plus `bias`."""
+        """Multiply `value` by `kernel` (inputs, outputs) and add `bias`."""
         constants = [self.constant(each) for each in (kernel, bias) if each is not None]
         return str(self.node("Gemm", value, *constants))
 
     def split(self, value: str, *sizes: int) -> list[str]:
-        """The columns of `value`, cut into these sizes; a size of 0 gives an empty name."""
+        """Split the columns of `value` into these sizes; a size of 0 gives an empty name."""
         real = [size for size in sizes if size]
         if len(real) == 1:
             names = iter([value])
@@ -65,22 +65,22 @@ class GraphBuilder:
         return [next(names) if size else "" for size in sizes]
 
     def join(self, *values: str) -> str:
-        """Columns side by side; empty names are left out."""
+        """Concatenate columns; empty names are left out."""
         real = [value for value in values if value]
         return str(self.node("Concat", *real, axis=1)) if len(real) > 1 else real[0]
 
     def node(self, operator: str, *inputs: str, outputs: int = 1, **attributes: Any) -> Any:
-        """One operator; a tuple of names where it has several outputs."""
+        """Add an operator; returns a tuple of names if it has several outputs."""
         names = [f"n{len(self._nodes)}_{index}" for index in range(outputs)]
         self._nodes.append(helper.make_node(operator, list(inputs), names, **attributes))
         return names[0] if outputs == 1 else tuple(names)
 
     def shape(self, *sizes: int) -> str:
-        """A shape to reshape to."""
+        """Add a constant of integers: a shape, sizes or axes."""
         return self.constant(np.array(sizes, dtype=np.int64))
 
     def build(self) -> bytes:
-        """The checked model."""
+        """Serialise the model after ONNX's own check."""
         graph = helper.make_graph(self._nodes, self._name, self._inputs, self._outputs, self._constants)
         opsets = [helper.make_opsetid("", OPSET)]
         model = helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="dreamfleet")

@@ -1,4 +1,4 @@
-"""What a world model sees and remembers of a drive, whoever drives."""
+"""A world model's latent and recurrent state along a drive, under any driver."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Floats = NDArray[np.float32]
 
 
 class RecurrentState:
-    """The latent `(1, latent)` of the last picture, and the state `(1, state)` before the action that follows it."""
+    """The latent `(1, latent)` of the last picture, and the recurrent state `(1, state)` before the next action."""
 
     def __init__(self, bundle: Bundle) -> None:
         self._encoder, self._memory, self._label = Encoder(bundle), DreamStep(bundle), RewardLabel(bundle)
@@ -20,18 +20,18 @@ class RecurrentState:
         self.begin()
 
     def begin(self) -> None:
-        """Begin an episode: nothing is remembered."""
+        """Begin an episode with a zero state."""
         self.latent = np.zeros((1, self._memory.latent_size), dtype=np.float32)
         self.state = self._memory.zero_state(1)
 
     def see(self, picture: NDArray[np.uint8]) -> None:
-        """Look at a picture `(side, side, 3)`."""
+        """Encode a picture `(side, side, 3)`."""
         self.latent, _ = self._encoder.encode(picture[None])
 
     def advance(self, action: Floats, chosen: Floats | None = None) -> None:
-        """Advance by the action `(1, actions)` that was done; `chosen` is the controller's, where it is another."""
+        """Advance by the applied action `(1, actions)`; `chosen` is the controller's if it differs."""
         self.state = self._memory.advance(self.latent, action, self.state, chosen)
 
     def reward(self, value: float) -> None:
-        """What the action brought; some models see it in the next step."""
+        """Record the reward of the last action, which some models see in the next step."""
         self._label.write(self.state, np.array([value]))

@@ -1,4 +1,4 @@
-"""The variational autoencoder of Ha & Schmidhuber 2018 (appendix A.1) and its successors': a picture as latents."""
+"""The variational autoencoder of Ha & Schmidhuber 2018 (appendix A.1) and of its successors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dreamfleet.worker.worldmodel.vae_config import LEAK, ConvolutionLayer, VAEC
 
 
 class VAELoss(NamedTuple):
-    """What is learnt from, the same at an error factor of 1, and of each picture: squared error, KL in nats."""
+    """The loss to minimise, the same with error factor 1, and its parts per picture: squared error, KL in nats."""
 
     weighted: Tensor
     plain: Tensor
@@ -21,7 +21,7 @@ class VAELoss(NamedTuple):
 
 
 class Down(nn.Conv2d):
-    """A convolution that may pad one row and column more behind than before."""
+    """A convolution that may pad one more row and column at the end than at the beginning."""
 
     def __init__(self, layer: ConvolutionLayer) -> None:
         super().__init__(layer.inputs, layer.outputs, layer.kernel, layer.stride, layer.before)
@@ -33,7 +33,7 @@ class Down(nn.Conv2d):
 
 
 class Up(nn.ConvTranspose2d):
-    """A transposed convolution that may crop one row and column more behind than before."""
+    """A transposed convolution that may crop one more row and column at the end than at the beginning."""
 
     def __init__(self, layer: ConvolutionLayer) -> None:
         super().__init__(layer.inputs, layer.outputs, layer.kernel, layer.stride, layer.before)
@@ -46,7 +46,7 @@ class Up(nn.ConvTranspose2d):
 
 
 class VAE(nn.Module):
-    """Pictures `(N, 3, side, side)` in [0, 1] to mu and logvar `(N, latent)`, and back."""
+    """Maps pictures `(N, 3, side, side)` in [0, 1] to mu and logvar `(N, latent)`, and latents back to pictures."""
 
     def __init__(self, config: VAEConfig) -> None:
         super().__init__()
@@ -65,24 +65,25 @@ class VAE(nn.Module):
         self.decoder = nn.Sequential(*layers[: 1 - config.modules_a_layer], nn.Sigmoid())
 
     def encode(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log variance of each latent."""
+        """Mean and log variance `(N, latent)` of pictures."""
         flat = self.encoder(pictures)
         return self.mu(flat), self.logvar(flat)
 
     def freeze_encoder(self) -> None:
-        """Let only the decoder learn: latents stay as they are, and with them what was trained on them."""
+        """Let only the decoder learn, so that latents, and models trained on them, stay valid."""
         for part in (self.encoder, self.mu, self.logvar):
             part.eval().requires_grad_(requires_grad=False)
 
     def decode(self, latents: Tensor) -> Tensor:
-        """Pictures `(N, 3, side, side)` in [0, 1]."""
+        """Decode latents `(N, latent)` to pictures `(N, 3, side, side)` in [0, 1]."""
         pictures: Tensor = self.decoder(self.dense(latents).reshape(-1, *self._start))
         return pictures
 
     def loss(self, pictures: Tensor, noise: Tensor) -> VAELoss:
-        """The configured loss and its parts; `noise` `(N, latent)` normal.
+        """The configured loss and its parts; `noise` `(N, latent)` is standard normal.
 
-        The paper's: F error + max(KL, tolerance). The notebook's: F 1000 x mean square + KL. F is the error factor.
+        With the error factor F, the paper's is F * squared error + max(KL, tolerance), the notebook's
+        F * 1000 * mean square + KL.
         """
         mu, logvar = self.encode(pictures)
         decoded = self.decode(mu + noise * torch.exp(0.5 * logvar))
@@ -97,7 +98,7 @@ class VAE(nn.Module):
 
 
 def _layers_after(config: VAEConfig, channels: int) -> list[nn.Module]:
-    """What stands behind a convolution."""
+    """The modules after a convolution: batch normalisation, activation and dropout, as configured."""
     modules: list[nn.Module] = [nn.BatchNorm2d(channels)] if config.batch_norm else []
     modules.append(nn.ReLU() if config.activation == "relu" else nn.LeakyReLU(LEAK))
     return [*modules, nn.Dropout(config.dropout)] if config.dropout else modules

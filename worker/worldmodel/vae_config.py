@@ -1,4 +1,4 @@
-"""What a VAE is made of; apart from the module, so that what only configures needs no torch."""
+"""The configuration of a VAE, in a module of its own that needs no torch."""
 
 from __future__ import annotations
 
@@ -16,44 +16,46 @@ PAPER_SIDES = (1, 5, 13, 30, 64)  # of the paper's decoder; its kernels 5, 5, 6,
 
 
 class ConvolutionLayer(NamedTuple):
-    """A convolution, or a transposed one: of what it pads, or crops, the most lies behind, as in TensorFlow."""
+    """A convolution, or a transposed one; odd padding or cropping goes to the end, as in TensorFlow."""
 
     inputs: int
     outputs: int
     kernel: int
     stride: int
-    before: int  # rows and columns that are padded or cropped at the beginning
-    after: int  # and at the end: as many, or one more
+    before: int  # rows and columns padded or cropped at the beginning
+    after: int  # and at the end: equal or one more
 
 
 @dataclass(frozen=True)
 class VAEConfig:
-    """Layers and loss; the defaults are the paper's."""
+    """The layers and the loss; the defaults are the paper's."""
 
     picture: int = option(64, "height and width of a picture: 64, or 96 for the whole observation")
-    latent: int = option(32, "latents that a picture becomes")
+    latent: int = option(32, "latents of a picture")
     channels: tuple[int, ...] = option(
         (32, 64, 128, 256), "outputs of each of the encoder's convolutions; the decoder has as many"
     )
-    padding: Literal["valid", "same"] = option("valid", "what convolutions see beyond a picture's edge: nothing, or 0")
-    activation: Literal["relu", "leaky_relu"] = option("relu", "behind each convolution but the last")
+    padding: Literal["valid", "same"] = option(
+        "valid", "padding of the convolutions: none, or zeros beyond a picture's edges"
+    )
+    activation: Literal["relu", "leaky_relu"] = option("relu", "after each convolution but the last")
     batch_norm: bool = option(default=False, text="normalise each convolution's outputs over the batch")
-    dropout: float = option(0.0, "share of each convolution's outputs that is left out while it learns")
+    dropout: float = option(0.0, "dropout of each convolution's outputs in training")
     loss: Literal["paper", "notebook"] = option(
         "paper", "squared error and a divergence with a tolerance, or 1000 times the mean square and the divergence"
     )
-    kl_tolerance: float = option(0.5, "of the paper's loss: nats a latent below which the divergence costs nothing")
+    kl_tolerance: float = option(0.5, "of the paper's loss: nats per latent below which the divergence costs nothing")
     dense: int = option(0, "inputs of a decoder that begins at 1x1; 0: as many as the encoder's outputs")
     error_factor: float = loss_factor(
-        "weighs the reconstruction error against the divergence; above 1 latents keep more"
+        "weight of the reconstruction error against the divergence; above 1 latents keep more"
     )
     kernels: tuple[int, ...] = added_option((), "kernel of each of the encoder's convolutions, else 4")
-    strides: tuple[int, ...] = added_option((), "stride of each; the decoder's are the same from behind, else 2")
+    strides: tuple[int, ...] = added_option((), "stride of each, else 2; the decoder's are the same in reverse")
     decoder_channels: tuple[int, ...] = added_option(
-        (), "outputs of the decoder's transposed convolutions but the last, else the encoder's from behind"
+        (), "outputs of the decoder's transposed convolutions but the last, else the encoder's in reverse"
     )
     decoder_kernels: tuple[int, ...] = added_option(
-        (), "kernel of each of the decoder's transposed convolutions, else what leads to the picture's size"
+        (), "kernel of each of the decoder's transposed convolutions, else such that the picture's size results"
     )
 
     def __post_init__(self) -> None:
@@ -81,7 +83,7 @@ class VAEConfig:
 
     @property
     def sides(self) -> tuple[int, ...]:
-        """Height and width of the picture and after each convolution."""
+        """Height (= width) of the picture, then after each convolution."""
         sides = [self.picture]
         for kernel, stride in zip(self._down_kernels, self._strides, strict=True):
             inside = (sides[-1] - kernel) // stride + 1
@@ -90,7 +92,7 @@ class VAEConfig:
 
     @property
     def flat(self) -> int:
-        """Outputs of the last convolution."""
+        """The number of outputs of the last convolution."""
         return self.channels[-1] * self.sides[-1] ** 2
 
     @property
@@ -115,9 +117,9 @@ class VAEConfig:
 
     @property
     def decoder_sides(self) -> tuple[int, ...]:
-        """Height and width before and after each transposed convolution.
+        """Height (= width) before the first and after each transposed convolution.
 
-        The paper's, or those that the kernels lead to; else the encoder's from behind. 0 where there are none.
+        The paper's, or computed from `decoder_kernels`, else the encoder's in reverse. 0 marks impossible sizes.
         """
         if self.padding == "valid" and self.decoder_kernels:
             sides = [self.picture]
@@ -130,7 +132,7 @@ class VAEConfig:
 
     @property
     def modules_a_layer(self) -> int:
-        """Modules of a layer: convolution, activation, and between and behind them what is configured."""
+        """The number of modules per layer: convolution, activation, and configured normalisation and dropout."""
         return 2 + self.batch_norm + (self.dropout > 0)
 
     @property
@@ -149,7 +151,7 @@ class VAEConfig:
 
     @property
     def _up_kernels(self) -> tuple[int, ...]:
-        """Kernels that were given, the encoder's from behind, or such that nothing is cropped."""
+        """The configured kernels, else the encoder's in reverse with `same` padding, else those without cropping."""
         if self.decoder_kernels or self.padding == "same":
             return self.decoder_kernels or self._down_kernels[::-1]
         sizes = zip(pairwise(self.decoder_sides), self._strides[::-1], strict=True)
@@ -157,7 +159,7 @@ class VAEConfig:
 
 
 def _layer(inputs: int, outputs: int, kernel: int, stride: int, beyond: int) -> ConvolutionLayer:
-    """`beyond`: rows and columns to pad or crop in all."""
+    """Make a layer with `beyond` rows and columns of padding or cropping in total."""
     return ConvolutionLayer(inputs, outputs, kernel, stride, beyond // 2, beyond - beyond // 2)
 
 

@@ -1,7 +1,7 @@
-"""The weights that a bundle's graphs were written from, so that training goes on with a model that came as a bundle.
+"""Recover a model's weights from a bundle's graphs, so that training can resume from a bundle.
 
-The inverse of `export`: constants are taken in the order in which it writes them. What it kept in half precision, the
-decoder's weights and the heads', comes back so; written again, all gives the same bytes.
+This is the inverse of `export`: it reads constants in the order in which that writes them. The decoder's and the heads'
+weights stay rounded to half precision; exporting them again gives the same bytes.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ Weights = dict[str, NDArray[np.float32]]
 
 
 def vae_weights(encoder: bytes, decoder: bytes, config: VAEConfig) -> Weights:
-    """Of the encoder's graph and the decoder's, by torch's names.
+    """Weights from the encoder's and the decoder's graph, by torch's names.
 
-    `BundleError` with batch normalisation, which is folded into its neighbours, and for graphs of another make.
+    `BundleError` with batch normalisation, which is folded into other weights, and for graphs with another layout.
     """
     if config.batch_norm:
         raise BundleError("its batch normalisation is folded into other weights, so it cannot be trained on")
@@ -34,7 +34,7 @@ def vae_weights(encoder: bytes, decoder: bytes, config: VAEConfig) -> Weights:
     found: Weights = {}
     for layer in layers:
         found |= _pair(f"encoder.{layer}", seen)
-    # Divided by 255 as it was written: of all single-precision numbers the nearest product is what it came from.
+    # The export divided it by 255; the single-precision number nearest to the product is the original.
     found["encoder.0.weight"] = (found["encoder.0.weight"].astype(np.float64) * 255).astype(np.float32)
     for name in ("mu", "logvar"):
         found |= _pair(name, seen, transposed=True)
@@ -44,7 +44,7 @@ def vae_weights(encoder: bytes, decoder: bytes, config: VAEConfig) -> Weights:
 
 
 def mdnrnn_weights(dream: bytes, config: MDNRNNConfig) -> Weights:
-    """Of the dream's graph, by torch's names; `BundleError` for a graph of another make."""
+    """Weights from the dream's graph, by torch's names; `BundleError` for a graph with another layout."""
     constants = _constants(dream)
     found: Weights = {}
     if config.window:
@@ -64,10 +64,10 @@ def mdnrnn_weights(dream: bytes, config: MDNRNNConfig) -> Weights:
 
 
 def _constants(model: bytes) -> Iterator[NDArray[np.float32]]:
-    """The floating-point constants of a graph in order; whole numbers are shapes."""
+    """Yield the floating-point constants of a graph in order; integer constants are shapes."""
     try:
         graph = onnx.load_model_from_string(model).graph
-    except Exception as error:  # protobuf's own, which is no dependency of ours
+    except Exception as error:  # protobuf's, which is not a dependency of ours
         raise _unknown_layout() from error
     for each in graph.initializer:
         array: NDArray[Any] = numpy_helper.to_array(each)

@@ -1,4 +1,4 @@
-"""An exported agent drives as the network that was trained does, without torch; any other file is refused."""
+"""An exported agent drives like the trained network, without torch; any other file is refused."""
 
 import hashlib
 import json
@@ -43,7 +43,7 @@ def short(monkeypatch):
 
 
 def networks_of(layers, seed=0):
-    """Of weights so large that pictures make a difference."""
+    """Networks with weights so large that pictures make a difference."""
     torch.manual_seed(seed)
     networks = Networks(layers).eval()
     for each in networks.online.parameters():
@@ -91,7 +91,7 @@ def test_it_chooses_what_the_network_chooses_all_episode_long(layers, tmp_path):
     environment.close()
 
 
-def test_it_tells_the_same_worth_through_time():
+def test_it_gives_the_same_worth_through_time():
     networks = networks_of(LAYERS)
     weights = {name: tensor.numpy() for name, tensor in networks.online.state_dict().items()}
     run = open_graph(export_network(weights, LAYERS), threads=1).run
@@ -104,15 +104,15 @@ def test_it_tells_the_same_worth_through_time():
         assert worth[0] == pytest.approx(row, abs=1e-4)
 
 
-def test_a_file_tells_what_was_trained_and_is_the_same_again(tmp_path, capsys):
+def test_a_file_describes_its_training_and_is_reproducible(tmp_path, capsys):
     train_drqn(tmp_path / "training", LAYERS, LEARNING)
     words = ["baseline", "export", "drqn", "--data", str(tmp_path / "training"), "--json", "--out"]
     assert main([*words, str(tmp_path / "one.zip")]) == 0
-    told = json.loads(capsys.readouterr().out)
+    found = json.loads(capsys.readouterr().out)
     assert main([*words, str(tmp_path / "other.zip")]) == 0
     assert (tmp_path / "one.zip").read_bytes() == (tmp_path / "other.zip").read_bytes()
     agent = TrainedAgent.load(tmp_path / "one.zip")
-    assert (told["sha256"], told["episodes"], told["steps"]) == (agent.sha256, 2, 24)
+    assert (found["sha256"], found["episodes"], found["steps"]) == (agent.sha256, 2, 24)
     made = agent.manifest.provenance
     assert made["learning"] == asdict(LEARNING)
     assert made["layers"]["hidden"] == LAYERS.hidden
@@ -198,7 +198,7 @@ def rewritten(file, change=lambda about: about, network=None):
         (lambda about: about | {"more": 1}, "wrong fields"),
         (lambda about: about | {"choices": [[1e9, 0, 0]] * 5}, "is no steering, gas and brake"),
         (lambda about: about | {"choices": [[0, 0]] * 5}, "is no steering, gas and brake"),
-        (lambda about: about | {"choices": [[0, 0, 0]] * 4}, "of 4 choices"),
+        (lambda about: about | {"choices": [[0, 0, 0]] * 4}, "for 4 choices"),
         (lambda about: about | {"state": 4}, "cannot be run"),
         (lambda about: about | {"preprocessing": "raw-96"}, "cannot be run"),
         (lambda about: about | {"preprocessing": "sharp-7"}, "car-racing gives box-64 or raw-96"),
@@ -206,9 +206,9 @@ def rewritten(file, change=lambda about: about, network=None):
     ],
 )
 def test_a_wrong_manifest_is_one_line(file, tmp_path, change, says):
-    with pytest.raises(ControllerError, match=says) as told:
+    with pytest.raises(ControllerError, match=says) as caught:
         make_agent(find_agent(str(rewritten(file, change)), tmp_path)[0])
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_wrong_network_is_one_line(file, tmp_path, random_bundle):
@@ -224,9 +224,9 @@ def test_a_wrong_network_is_one_line(file, tmp_path, random_bundle):
     }
     for says, network in wrong.items():
         file.write_bytes(whole)
-        with pytest.raises(ControllerError, match=says.strip()) as told:
+        with pytest.raises(ControllerError, match=says.strip()) as caught:
             make_agent(find_agent(str(rewritten(file, network=network)), tmp_path)[0])
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(caught.value)
 
 
 def test_what_is_no_whole_file_is_one_line(file, tmp_path, capsys):
@@ -244,11 +244,11 @@ def test_what_is_no_whole_file_is_one_line(file, tmp_path, capsys):
         find_agent(str(file), tmp_path)
 
 
-def test_a_network_that_tells_no_numbers_ends_the_drive(file):
+def test_a_network_that_gives_nan_ends_the_drive(file):
     agent = TrainedAgent.load(file)
     policy = NetworkPolicy(agent)
     policy._state = np.full_like(policy._state, np.nan)
-    with pytest.raises(ControllerError, match="or no numbers"):
+    with pytest.raises(ControllerError, match="or NaN"):
         policy.choose(np.zeros((64, 64, 3), np.uint8))
 
 

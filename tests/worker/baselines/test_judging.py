@@ -1,4 +1,4 @@
-"""Baselines are judged, and recorded, in gymnasium's own environment, as controllers are."""
+"""Baselines are evaluated and recorded in gymnasium's own environment, like controllers."""
 
 import argparse
 import json
@@ -12,8 +12,8 @@ from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.agents import find_baseline
-from dreamfleet.worker.baselines.names import DISCRETE, DRQN, NAMES, RANDOM
 from dreamfleet.worker.baselines.network import Networks
+from dreamfleet.worker.baselines.presets import DISCRETE, DRQN, NAMES, RANDOM
 from dreamfleet.worker.baselines.train import CHECKPOINT
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tools import agent_evaluator
@@ -52,13 +52,13 @@ def call(verb, *words):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_judgement_is_a_controllers_and_the_same_again(name, trained, tmp_path, capsys):
-    out, data = tmp_path / "told.json", ("--data", trained) if name == DRQN else ()
+    out, data = tmp_path / "figures.json", ("--data", trained) if name == DRQN else ()
     words = (name, *data, "--episodes", 2, "--first-seed", SEED, "--jobs", 1, "--json", "--out", out)
     assert call(baseline_evaluate, *words) == 0
-    told = capsys.readouterr()
-    assert "note:" not in told.err
+    printed = capsys.readouterr()
+    assert "note:" not in printed.err
     found = read_evaluation_report(out)
-    assert json.loads(told.out)["scores"] == list(found.results.scores)
+    assert json.loads(printed.out)["scores"] == list(found.results.scores)
     assert (found.world, found.bundle, found.results.seeds) == ("car-racing", "", (SEED, SEED + 1))
     assert {each.steps for each in found.drives} == {STEPS}
     assert all(each.speed is not None and each.braking is not None for each in found.drives)

@@ -1,16 +1,17 @@
-"""Traces of replay: each within one episode, and each number where its decision was."""
+"""Traces of the replay buffer stay within one episode and keep each number at its decision; n-step returns."""
 
 import numpy as np
 import pytest
 
 from dreamfleet.worker.baselines.learning_config import LearningConfig
-from dreamfleet.worker.baselines.replay_buffer import Episode, ReplayBuffer, first_in_replay, slice_padded
+from dreamfleet.worker.baselines.replay_buffer import Episode, ReplayBuffer, first_in_replay, n_step, slice_padded
 
 CONFIG = LearningConfig(batch=16, trace=4, burn_in=3, n_step=2, gamma=0.5, replay=1000)
+REWARDS = [1.0, 2.0, 4.0, 8.0]
 
 
 def episode(number, length, terminal=True):
-    """Its pictures and choices tell the episode and the decision, both from 1."""
+    """An episode whose pictures and choices encode the numbers of episode and decision, both from 1."""
     pictures = np.zeros((length, 2, 2, 3), np.uint8)
     pictures[..., 0], pictures[..., 1] = number, np.arange(1, length + 1)[:, None, None]
     return Episode(pictures, np.arange(1, length + 1), np.full(length, float(number), np.float32), terminal)
@@ -68,3 +69,15 @@ def test_rows_beyond_an_episode_are_zero():
     assert slice_padded(np.array([1, 2, 3]), -2, 2).tolist() == [0, 0, 1, 2]
     assert slice_padded(np.array([1, 2, 3]), 2, 5).tolist() == [3, 0, 0]
     assert slice_padded(np.array([1, 2, 3]), 5, 7).tolist() == [0, 0]
+
+
+def test_rewards_of_n_decisions_are_added_up_and_discounted():
+    returns = n_step(np.array(REWARDS), terminal=True, gamma=0.5, n=2)
+    assert returns.value.tolist() == [1 + 1, 2 + 2, 4 + 4, 8]
+    assert returns.discount.tolist() == [0.25, 0.25, 0, 0]
+
+
+def test_what_a_cut_episode_hides_is_not_learnt():
+    returns = n_step(np.array(REWARDS), terminal=False, gamma=0.5, n=2)
+    assert returns.known.tolist() == [True, True, False, False]
+    assert not n_step(np.array(REWARDS[:1]), terminal=False, gamma=0.5, n=2).known.any()

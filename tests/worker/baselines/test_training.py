@@ -1,4 +1,4 @@
-"""The network learns in the real CarRacing, and whatever interrupts it, goes on to the bits that it would have had."""
+"""The network learns in the real CarRacing; an interrupted training resumes to the same bits."""
 
 import argparse
 import json
@@ -34,7 +34,7 @@ FLAGS = (
 
 
 class KilledError(BaseException):
-    """Nothing of ours runs any more."""
+    """Stands for a kill: no handler of the code under test catches it."""
 
 
 def call(*words):
@@ -44,7 +44,7 @@ def call(*words):
 
 
 def state(folder):
-    """All that a training leaves, to the bit."""
+    """The bytes of all files that a training leaves."""
     weights = {name: array.tobytes() for name, array in load_weights(folder / CHECKPOINT).items()}
     kept = {path.name: path.read_bytes() for path in (folder / "replay").iterdir()}
     return weights, load_progress(folder / CHECKPOINT), (folder / CURVE).read_text(), kept
@@ -53,19 +53,19 @@ def state(folder):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
-    told = []
-    figures = train_drqn(folder, LAYERS, SHORT, lambda done, report: told.append((done, report)))
-    return folder, figures, told
+    reports = []
+    figures = train_drqn(folder, LAYERS, SHORT, lambda done, report: reports.append((done, report)))
+    return folder, figures, reports
 
 
 def test_it_drives_learns_and_reports(whole):
-    folder, figures, told = whole
+    folder, figures, reports = whole
     progress = load_progress(folder / CHECKPOINT)
     assert (figures["episodes"], figures["goal_reached"]) == (5, False)
     assert figures["updates"] == progress["update"] == 16  # every second of 8 decisions, in four episodes
     assert [each["decisions"] for each in progress["episodes"]] == [8] * 5
-    assert [done for done, _ in told] == list(range(6))
-    assert [report.episode for _, report in told if report] == [2, 4]
+    assert [done for done, _ in reports] == list(range(6))
+    assert [report.episode for _, report in reports if report] == [2, 4]
     curve = [json.loads(line) for line in (folder / CURVE).read_text().splitlines()]
     assert [(each["episode"], each["loss"] is None) for each in curve] == [(2, False), (4, False)]
     assert sorted(path.stem for path in (folder / "replay").iterdir()) == ["000003", "000004"]  # 16 of 20 decisions
@@ -117,9 +117,9 @@ def test_the_goal_ends_it(tmp_path):
 
 def test_flags_change_what_a_preset_says(tmp_path, capsys):
     assert call("drqn", "--data", tmp_path, *FLAGS, "--episodes", 2, "--preset", "notebook", "--json") == 0
-    told = capsys.readouterr()
-    assert json.loads(told.out)["episodes"] == 2
-    assert "episode 1: mean" in told.err
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["episodes"] == 2
+    assert "episode 1: mean" in printed.err
     found = load_config(tmp_path / CHECKPOINT, AgentConfig)
     assert found == replace(LAYERS, picture=96, choices="notebook", heads="softmax")
     with pytest.raises(DatasetError, match=r"is of another model: picture 96, not 64; choices notebook.*or --new"):
@@ -157,14 +157,14 @@ def test_a_damaged_or_missing_file_is_one_line(whole, tmp_path):
         train_drqn(tmp_path, LAYERS, longer)
 
 
-def test_a_checkpoint_that_tells_nonsense_is_one_line(whole, tmp_path):
+def test_a_checkpoint_with_nonsense_is_one_line(whole, tmp_path):
     networks = Networks(LAYERS)
-    told = load_progress(whole[0] / CHECKPOINT)
-    episodes = told["episodes"]
+    good = load_progress(whole[0] / CHECKPOINT)
+    episodes = good["episodes"]
     for wrong in (
-        {"update": 1}, {**told, "oldest": -5}, {**told, "oldest": 6}, {**told, "episodes": 5}, [],
-        {**told, "episodes": [{}]}, {**told, "episodes": [{**episodes[0], "score": None}]},
-        {**told, "update": float("nan")},
+        {"update": 1}, {**good, "oldest": -5}, {**good, "oldest": 6}, {**good, "episodes": 5}, [],
+        {**good, "episodes": [{}]}, {**good, "episodes": [{**episodes[0], "score": None}]},
+        {**good, "update": float("nan")},
     ):  # fmt: skip
         save_checkpoint(tmp_path / CHECKPOINT, networks, torch.optim.Adam(networks.parameters()), wrong)
         with pytest.raises(DatasetError, match=r"drqn\.safetensors is damaged"):
@@ -204,7 +204,7 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(whole, tmp_path):
         ({"kernels": (65,)}, "leave nothing of 64 pixels"),
         ({"frame_skip": 0}, "must be at least 1"),
         ({"frame_skip": 10**9}, "--frame-skip must be at most 1000000"),
-        ({"hidden": 10**9}, "parameters, 50,000,000 at most are learnt"),
+        ({"hidden": 10**9}, "parameters, at most 50,000,000 are allowed"),
     ],
 )
 def test_an_impossible_agent_is_refused(change, said):

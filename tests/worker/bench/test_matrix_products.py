@@ -1,4 +1,4 @@
-"""The floors of `bench policy` and `bench dream`: no slow library, and no inherited setting, may flatter a step."""
+"""The lower bounds of `bench policy` and `bench dream` ignore slow libraries and inherited settings."""
 
 import argparse
 import json
@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.host.resource_limits import POOLS
-from dreamfleet.worker.bench.command import print_figures
 from dreamfleet.worker.bench.matrix_products import LIBRARIES, fastest, product_cases, product_graph
+from dreamfleet.worker.bench.measurement import print_figures
 from dreamfleet.worker.worldmodel.inference import open_graph
 
 
 def inherited(_bundle):
-    """What a measurement's own process was told."""
+    """The environment of a measurement's process."""
     return {name: value for name, value in os.environ.items() if "BLAS" in name or name.startswith("ATEN_")}
 
 
@@ -23,9 +23,9 @@ def test_no_librarys_setting_reaches_a_measurement(monkeypatch, capsys):
     for name, value in {**settings, **dict.fromkeys(POOLS, "2")}.items():
         monkeypatch.setenv(name, value)
     print_figures(inherited, argparse.Namespace(bundle="tiny", json=True))
-    told = json.loads(capsys.readouterr().out)
-    assert not settings.keys() & told.keys()
-    assert told["OPENBLAS_NUM_THREADS"] == "1"
+    printed = json.loads(capsys.readouterr().out)
+    assert not settings.keys() & printed.keys()
+    assert printed["OPENBLAS_NUM_THREADS"] == "1"
 
 
 def test_a_floor_is_each_product_by_the_library_that_is_fastest_at_it():

@@ -96,7 +96,7 @@ def test_environments_that_take_turns_do_not_see_each_other():
 
 
 def drive_all(environments, seeds, steps):
-    """Every environment's pictures, one step of each in turn."""
+    """The pictures of each environment, stepped in turn."""
     seen = [[environment.reset(seed=seed)[0]] for environment, seed in zip(environments, seeds, strict=True)]
     for step in range(steps):
         for index, (environment, seed) in enumerate(zip(environments, seeds, strict=True)):
@@ -120,7 +120,7 @@ def test_one_more_environment_adds_little_memory():
 
 
 def memory():
-    """Bytes of this process that lie in memory."""
+    """The resident memory of this process, in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 

@@ -1,4 +1,4 @@
-"""CarRacing through a world model: gymnasium's own, observed as controllers and dreams observe."""
+"""CarRacing through a world model: gymnasium's environment with the observations of controllers and dreams."""
 
 import gymnasium
 import numpy as np
@@ -31,11 +31,11 @@ def small(tmp_path):
 
 
 def drive(environment, actions):
-    """What is seen, earned and told on a track."""
-    told = [environment.reset(seed=SEED)]
-    told += [environment.step(action) for action in actions]
+    """The observations, rewards and other outputs on a track."""
+    outputs = [environment.reset(seed=SEED)]
+    outputs += [environment.step(action) for action in actions]
     environment.close()
-    return np.stack([each[0] for each in told]), [each[1:] for each in told]
+    return np.stack([each[0] for each in outputs]), [each[1:] for each in outputs]
 
 
 @pytest.mark.parametrize("features", ["z", "zh"])
@@ -64,18 +64,18 @@ def test_it_shows_what_controllers_see_and_gives_what_they_earn_to_the_bit(model
         given.append(tuple(rest))
     judge.close()
     for native in (False, True):
-        observed, told = drive(CarRacingLatent(bundle, "zh", native=native), actions)
+        observed, outputs = drive(CarRacingLatent(bundle, "zh", native=native), actions)
         assert observed[:-1].tobytes() == np.stack(seen).tobytes()
-        assert told[1:] == given
+        assert outputs[1:] == given
     latents, _ = drive(CarRacingLatent(bundle), actions)
     assert np.array_equal(latents, observed[:, : bundle.manifest.latent])
     assert np.ptp(latents, axis=0).all()
 
 
 def test_an_episode_is_gymnasiums_whole_one(small):
-    _, told = drive(gymnasium.make(LATENT, bundle=small, native=True), np.zeros((1000, 3), np.float32))
-    assert [each[2] for each in told[1:]] == [False] * 999 + [True]
-    assert not any(each[1] for each in told[1:])
+    _, outputs = drive(gymnasium.make(LATENT, bundle=small, native=True), np.zeros((1000, 3), np.float32))
+    assert [each[2] for each in outputs[1:]] == [False] * 999 + [True]
+    assert not any(each[1] for each in outputs[1:])
 
 
 def test_several_tracks_side_by_side_are_the_single_ones(small):

@@ -3,7 +3,7 @@ import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.car_racing.preprocessing import BOX, RAW, find_preprocessing
-from dreamfleet.worker.training.data.world import preprocessing_of_size
+from dreamfleet.worker.training.data.dataset import preprocessing_of_size
 
 
 def overlap(target, step, source, unit):

@@ -1,4 +1,4 @@
-"""What the simulator knows of car and road: on roads of a known shape, and in the real environment."""
+"""The true state of car and road: on roads of a known shape, and in the real environment."""
 
 import math
 
@@ -92,25 +92,25 @@ def test_a_car_beside_and_turned_to_the_left_says_so_and_to_the_right_too(enviro
 def test_bends_ahead_are_those_of_the_tracks_own_points(environment):
     track = np.array(environment.unwrapped.track)
     turned = wrap_angle(track[2:, 1] - track[:-2, 1]) / 7.0  # two steps of 3.5 metres
-    told = np.array([put(environment, tile)["curvature_5m"] for tile in range(len(track) - 2)])
-    assert np.corrcoef(told[:-2], turned[1:-1])[0, 1] > 0.95
-    assert told.mean() > 0  # a lap turns to the left as a whole
+    curvature = np.array([put(environment, tile)["curvature_5m"] for tile in range(len(track) - 2)])
+    assert np.corrcoef(curvature[:-2], turned[1:-1])[0, 1] > 0.95
+    assert curvature.mean() > 0  # a lap turns to the left as a whole
 
 
 def drive(environment, actions):
-    """Truths of a drive from the start, past the opening."""
-    told = []
+    """The true states of a drive from the start, after the opening zoom."""
+    states = []
     for action in actions:
         environment.step(np.array(action, np.float32))
-        told.append(read_true_state(environment.unwrapped))
-    return told
+        states.append(read_true_state(environment.unwrapped))
+    return states
 
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_steering_turns_wheels_car_and_offset_to_one_side(environment, side):
     put(environment, 5)
-    told = drive(environment, [(0, 0.5, 0)] * 20 + [(-0.4 * side, 0.2, 0)] * 25)  # negative steering is left
-    last = told[-1]
+    states = drive(environment, [(0, 0.5, 0)] * 20 + [(-0.4 * side, 0.2, 0)] * 25)  # negative steering is left
+    last = states[-1]
     assert last["speed"] > 5
     for name in ("wheel_angle", "yaw_rate", "heading_error", "lateral_offset"):
         assert last[name] * side > 0, name
@@ -127,14 +127,14 @@ def test_side_slip_is_speed_to_the_left(environment):
 
 
 def test_full_gas_straight_on_leaves_the_road_for_good(environment):
-    told = drive(environment, [(0, 1, 0)] * 200)
-    off = [each["off_road"] for each in told]
+    states = drive(environment, [(0, 1, 0)] * 200)
+    off = [each["off_road"] for each in states]
     assert off[:20] == [0] * 20
     assert off[-1] == 1
-    assert abs(told[-1]["lateral_offset"]) > 40 / 6  # half a road's width
+    assert abs(states[-1]["lateral_offset"]) > 40 / 6  # half a road's width
 
 
-def test_every_step_tells_the_same_names_of_both_environments(environment):
+def test_every_step_has_the_same_names_in_both_environments(environment):
     task = find_task("car-racing")
     assert isinstance(task, TaskWithTrueState)
     assert not isinstance(find_task("gym:CartPole-v1"), TaskWithTrueState)

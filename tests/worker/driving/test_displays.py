@@ -38,7 +38,7 @@ AN_OPTIMISER = """
 from pathlib import Path
 import torch
 from dreamfleet.worker.training.training_state import TrainingState
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 TrainingState(Path("nothing.safetensors"), torch.nn.Linear(2, 2), TrainConfig(updates=1, batch=1, rate=1e-3), 1)
 print("goes on")
 """

@@ -1,4 +1,4 @@
-"""What ships, as it is looked into."""
+"""The shipped bundle and controller, to inspect."""
 
 import pytest
 

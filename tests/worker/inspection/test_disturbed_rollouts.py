@@ -1,4 +1,4 @@
-"""Drives with the truth beside what a world model held."""
+"""Disturbed drives with the true state beside the world model's."""
 
 from dataclasses import replace
 from itertools import islice
@@ -13,7 +13,7 @@ from dreamfleet.worker.scoring.actors import ControllerActor, make_controller_ac
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.training.data.world import known_drivers
+from dreamfleet.worker.training.data.collect_config import known_drivers
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -68,7 +68,7 @@ def test_a_controller_of_another_world_model_drives_by_its_own(tiny, controller,
         make_controller_actor(controller, tiny, other, RecurrentState(other))
 
 
-def test_whoever_drives_for_a_data_set_drives_for_a_probe(tiny):
+def test_all_drivers_of_data_sets_drive_for_a_probe(tiny):
     for name in ("random", *known_drivers()):
         assert drive(tiny, drivers(name, tiny), steps=3).action.shape == (3, 3)
 
@@ -104,10 +104,10 @@ def test_a_driver_that_never_comes_far_begins_anywhere(tiny):
     assert one["lateral_offset"][0] == other["lateral_offset"][0]
 
 
-def test_a_world_that_tells_no_truth_is_told(tmp_path):
+def test_a_world_without_true_state_is_reported(tmp_path):
     small = VAEConfig(latent=5, channels=(4, 4, 4, 8))
     ours = write_random_bundle(tmp_path / "ours.zip", vae=small, rnn=MDNRNNConfig(latent=5, hidden=8))
     parts = {name: ours.read(name) for name in ours.manifest.parts}
     poles = write_bundle(tmp_path / "poles.zip", replace(ours.manifest, task="gym:CartPole-v1"), parts)
-    with pytest.raises(UsageError, match=r"gym:CartPole-v1 tells no truth .*docs/tasks.md"):
+    with pytest.raises(UsageError, match=r"gym:CartPole-v1 gives no true state .*docs/tasks.md"):
         next(witness(poles, RecurrentState(poles), lambda _seed: None, DisturbedDriveConfig()))

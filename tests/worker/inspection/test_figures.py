@@ -1,4 +1,4 @@
-"""`inspect --probe` and `inspect --losses`: what is printed, and who may drive."""
+"""`inspect --probe` and `inspect --losses`: what they print, and the allowed drivers."""
 
 import argparse
 import json
@@ -59,7 +59,7 @@ def test_likeness_prints_how_often_dreams_come_to_what_is_rare(call):
     assert lines[-1].startswith("shares of steps ± standard errors over drives")
 
 
-def test_as_json_both_tell_counts_values_and_errors(call):
+def test_as_json_both_have_counts_values_and_errors(call):
     found = json.loads(call("--controller", "tiny", "--probe", "--losses", "--episodes", "4", "--json"))
     assert found["bundle"] == find_bundle("tiny").sha256
     assert found["probe"]["drives"] == 4
@@ -89,7 +89,7 @@ def test_as_json_both_tell_counts_values_and_errors(call):
         (("tiny", "--losses", "--controller", "tiny", "--temperature", "0"), "temperature must be a positive number"),
     ],
 )
-def test_what_cannot_be_measured_is_told_before_anything_is_driven(call, arguments, says):
+def test_what_cannot_be_measured_is_reported_before_anything_is_driven(call, arguments, says):
     with pytest.raises(UsageError, match=says):
         call(*arguments)
 

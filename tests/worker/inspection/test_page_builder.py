@@ -25,7 +25,7 @@ LOOKS = ["reconstructions", "traversals", "latents", "samples"]
 
 
 class Links(HTMLParser):
-    """Every address that a browser would fetch, and the ids of the sections."""
+    """Collects the addresses that a browser would fetch, and the ids of the sections."""
 
     def __init__(self, text):
         super().__init__()
@@ -58,7 +58,7 @@ def test_the_pages_drive_can_be_one_action_alone(attentive):
 
 
 @pytest.mark.parametrize(
-    ("action", "told"),
+    ("action", "says"),
     [
         ((1.0,), "takes steer, gas, brake: 3 numbers, not 1"),
         ((0.0, 2.0, 0.0), "takes steer from -1 to 1, gas from 0 to 1, brake from 0 to 1, not 0 2 0"),
@@ -66,21 +66,25 @@ def test_the_pages_drive_can_be_one_action_alone(attentive):
         ((0.0, 1e40, 0.0), r"not 0 1e\+40 0"),
     ],
 )
-def test_what_is_no_action_of_the_world_is_refused(attentive, action, told):
-    with pytest.raises(UsageError, match=told):
+def test_what_is_no_action_of_the_world_is_refused(attentive, action, says):
+    with pytest.raises(UsageError, match=says):
         record_drive(attentive, None, DriveConfig(action=action))
 
 
 def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
     write_curves(tmp_path)
-    told = []
+    sections = []
     page = write_page(
-        InspectionSubject(attentive), tmp_path / "out", SHORT, [tmp_path], lambda done, name: told.append((done, name))
+        InspectionSubject(attentive),
+        tmp_path / "out",
+        SHORT,
+        [tmp_path],
+        lambda done, name: sections.append((done, name)),
     )
     found = Links(page.read_text())
     names = [*LOOKS, "dream", "rewards", "attention", "loss-vae", "loss-mdnrnn"]
     assert found.sections == names
-    assert told == list(enumerate(names, 1))
+    assert sections == list(enumerate(names, 1))
     assert all(address.startswith("data:image/png;base64,") for address in found.addresses)
     assert len(found.addresses) == len(names)
     assert not found.tags & {"script", "link", "iframe", "object"}
@@ -89,7 +93,7 @@ def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
         assert (page.parent / f"{name}.png").read_bytes().startswith(PNG)
 
 
-def test_what_a_bundle_cannot_do_is_left_out_or_told(attentive, tmp_path):
+def test_what_a_bundle_cannot_do_is_left_out_or_explained(attentive, tmp_path):
     rnn = MDNRNNConfig(latent=5, hidden=8, reward="none")
     plain = write_random_bundle(tmp_path / "plain.zip", vae=VAE, rnn=rnn)
     page = write_page(InspectionSubject(plain), tmp_path / "plain", SHORT)
@@ -101,7 +105,7 @@ def test_what_a_bundle_cannot_do_is_left_out_or_told(attentive, tmp_path):
     assert "from before dreams" in page.read_text()
 
 
-def test_the_table_tells_sizes_and_quality(tmp_path, attentive):
+def test_the_table_has_sizes_and_quality(tmp_path, attentive):
     provenance = {"quality": {"reward_auc": 0.9}, "held_out_episodes": 7}
     manifest = attentive.manifest.__class__(**{**vars(attentive.manifest), "provenance": provenance})
     parts = {name: attentive.read(name) for name in attentive.manifest.parts}
@@ -154,7 +158,7 @@ def test_a_drive_is_seen_as_its_bundle_sees(tmp_path):
     assert Links(page.read_text()).sections == [*LOOKS, "dream", "rewards"]
 
 
-def test_what_is_nowhere_is_told_before_anything_is_driven(tmp_path, attentive):
+def test_what_is_missing_is_reported_before_anything_is_driven(tmp_path, attentive):
     with pytest.raises(BundleError, match=r"no bundle 'nosuch'.*no run 'nosuch'"), find_subject("nosuch", tmp_path):
         pass
     with pytest.raises(DatasetError, match="no folder"):

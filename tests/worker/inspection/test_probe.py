@@ -1,11 +1,10 @@
-"""Maps from what is held to what is true."""
+"""Probes, cross-validation folds, R² and estimates."""
 
 import numpy as np
 import pytest
 
-from dreamfleet.worker.inspection.estimate import Estimate
 from dreamfleet.worker.inspection.knowledge import explained_variance
-from dreamfleet.worker.inspection.probe import LinearProbe, NetworkProbe, folds, other_rows
+from dreamfleet.worker.inspection.probe import Estimate, LinearProbe, NetworkProbe, folds, other_rows
 
 
 @pytest.fixture
@@ -29,10 +28,10 @@ def test_weights_say_which_samples_count(features):
 def test_a_network_finds_what_no_line_does_and_the_same_each_time(features):
     targets = np.abs(features[:, :1] - 3)
     linear, layered = (kind.fit(features[:2000], targets[:2000]) for kind in (LinearProbe, NetworkProbe))
-    told = layered.predict(features[2000:])
+    predicted = layered.predict(features[2000:])
     assert explained_variance([targets[2000:]], [linear.predict(features[2000:])])[0].value < 0.1
-    assert explained_variance([targets[2000:]], [told])[0].value > 0.9
-    assert np.array_equal(told, NetworkProbe.fit(features[:2000], targets[:2000]).predict(features[2000:]))
+    assert explained_variance([targets[2000:]], [predicted])[0].value > 0.9
+    assert np.array_equal(predicted, NetworkProbe.fit(features[:2000], targets[:2000]).predict(features[2000:]))
 
 
 @pytest.mark.parametrize("drives", [2, 3, 4, 9])

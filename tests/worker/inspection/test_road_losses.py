@@ -1,4 +1,4 @@
-"""Dreams begun before real losses, judged from the dream itself."""
+"""Dreams begun before real losses of the road, judged by probes on the dream."""
 
 from dataclasses import replace
 
@@ -10,8 +10,14 @@ from dreamfleet.worker.inspection import likeness, probe
 from dreamfleet.worker.inspection.disturbed_rollouts import OFF, DisturbedDriveConfig, witness
 from dreamfleet.worker.inspection.drive_dreams import DreamSegment, DriveDreamer
 from dreamfleet.worker.inspection.knowledge import cross_validate_probes
-from dreamfleet.worker.inspection.road_losses import CALM, RoadLossConfig, collect_losing_drives, compare
-from dreamfleet.worker.inspection.road_probe import RoadOutcome, RoadProbe
+from dreamfleet.worker.inspection.road_losses import (
+    CALM,
+    RoadLossConfig,
+    RoadOutcome,
+    RoadProbe,
+    collect_losing_drives,
+    compare,
+)
 from dreamfleet.worker.inspection.tables import knowledge_rows, loss_rows
 from dreamfleet.worker.scoring.actors import ControllerActor
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
@@ -34,12 +40,12 @@ def test_as_many_losses_are_gathered_as_are_wanted(drives):
         assert each.truth[OFF][each.lost : each.lost + DRIVEN.lasting].all()
 
 
-def test_losses_that_do_not_come_are_told(drives):
+def test_too_few_losses_are_reported(drives):
     calm = [replace(each, lost=None) for each in drives]
     with pytest.raises(UsageError, match=r"lost the road 0 times, not 6: raise --noise"):
         collect_losing_drives(iter(calm), CONFIG, DRIVEN)
     blind = [replace(each, truth={"speed": each.truth["speed"]}) for each in drives]
-    with pytest.raises(UsageError, match="does not tell lateral_offset and off_road"):
+    with pytest.raises(UsageError, match="lacks lateral_offset and off_road"):
         collect_losing_drives(iter(blind), CONFIG, DRIVEN)
 
 
@@ -79,8 +85,8 @@ def test_in_a_dream_of_the_same_actions_nobody_chooses(drives, tiny, controller)
 def test_the_controllers_dream_is_pushed_as_reality_was(drives, tiny, controller):
     calm = replace(drives[0], push=np.zeros_like(drives[0].push))
     imagination = DriveDreamer(tiny, controller, 1.0, 2)
-    told = [imagination.dream(DreamSegment(each, 120, 15), own=True)[0] for each in (drives[0], calm)]
-    assert not np.array_equal(*told)
+    found = [imagination.dream(DreamSegment(each, 120, 15), own=True)[0] for each in (drives[0], calm)]
+    assert not np.array_equal(*found)
 
 
 def test_what_is_foreseen_has_the_memory_of_reality(drives, tiny, controller):
@@ -93,7 +99,7 @@ def test_what_is_foreseen_has_the_memory_of_reality(drives, tiny, controller):
     assert max(near) > 0.8
 
 
-def test_a_judge_tells_off_the_road_from_features(drives, tiny, controller):
+def test_a_probe_estimates_off_the_road_from_features(drives, tiny, controller):
     imagination = DriveDreamer(tiny, controller, 1.0, 1)
     foreseen = [imagination.predict_next(each)[0] for each in drives]
     judge = RoadProbe(drives[:-1], foreseen[:-1], DRIVEN.opening)
@@ -104,12 +110,12 @@ def test_a_judge_tells_off_the_road_from_features(drives, tiny, controller):
     assert outcome.offset[0][off].mean() > outcome.offset[0][~off].mean() + 3
 
 
-def test_a_course_tells_its_figures_over_dreams():
+def test_an_outcome_is_summarised_over_dreams():
     off = np.zeros((2, 20), bool)
     off[0, 5:10] = True
     off[1, 17:] = True
-    told = RoadOutcome(off, np.where(off, 8.0, 2.0), np.full((2, 20), 0.5)).summarise(lasting=4)
-    assert told == {"lost": 0.5, "off_at_end": 3 / 8, "offset_at_end": 2 + 6 * 3 / 8, "reward": 10}
+    found = RoadOutcome(off, np.where(off, 8.0, 2.0), np.full((2, 20), 0.5)).summarise(lasting=4)
+    assert found == {"lost": 0.5, "off_at_end": 3 / 8, "offset_at_end": 2 + 6 * 3 / 8, "reward": 10}
 
 
 def test_a_world_model_knows_yaw_from_what_it_remembers_not_from_a_picture(drives, monkeypatch):
@@ -123,18 +129,18 @@ def test_a_world_model_knows_yaw_from_what_it_remembers_not_from_a_picture(drive
 
 
 def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
-    told = {each.quantity: each for each in likeness.compare(drives, tiny, controller, DRIVEN.opening, 2, 1.0)}
-    assert OFF not in told
-    for each in told.values():
+    found = {each.quantity: each for each in likeness.compare(drives, tiny, controller, DRIVEN.opening, 2, 1.0)}
+    assert OFF not in found
+    for each in found.values():
         assert each.found["reality"].value == pytest.approx(0.1, abs=0.05)  # over drives of unequal lengths
         assert 0 <= each.found["dream"].value <= 1
-    assert told["yaw_rate"].found["foreseen"].value == pytest.approx(0.1, abs=0.05)
-    assert told["speed"].rare > 20
-    with pytest.raises(UsageError, match="two drives at least that keep to the road for 100 steps"):
+    assert found["yaw_rate"].found["foreseen"].value == pytest.approx(0.1, abs=0.05)
+    assert found["speed"].rare > 20
+    with pytest.raises(UsageError, match="two drives at least that stay on the road for 100 steps"):
         likeness.compare(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
 
 
-def test_dreams_that_all_end_as_they_begin_tell_nothing(drives, tiny, controller, monkeypatch):
+def test_dreams_that_all_end_as_they_begin_are_refused(drives, tiny, controller, monkeypatch):
     monkeypatch.setattr(likeness, "_before_ends", lambda features: features[0, :0])
     with pytest.raises(UsageError, match="end as they begin"):
         likeness.compare(drives, tiny, controller, DRIVEN.opening, 2, 1.0)

@@ -16,8 +16,8 @@ from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.worker.inspection import measurements
 from dreamfleet.worker.inspection.encoded_rollout import DriveConfig, record_drive
-from dreamfleet.worker.inspection.estimate import Estimate
 from dreamfleet.worker.inspection.page_builder import find_subject, write_page
+from dreamfleet.worker.inspection.probe import Estimate
 from dreamfleet.worker.inspection.road_losses import RoadLossComparison
 from dreamfleet.worker.verbs import inspect as verb
 from tests.support.samples import SPEC

@@ -1,4 +1,4 @@
-"""Trainings as their loss curves tell of them: whole, stopped, gone back, side by side, damaged."""
+"""Trainings loaded from their loss curves: whole, stopped, gone back, side by side, damaged."""
 
 import argparse
 import json
@@ -13,7 +13,7 @@ from dreamfleet.worker.inspection.page_builder import InspectionSubject, write_p
 from dreamfleet.worker.inspection.training_curves import load_trainings, merge_points
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.verbs import inspect as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -100,12 +100,12 @@ def test_trainings_stand_side_by_side_each_under_its_folders_name(trained, tmp_p
     ]
 
 
-def test_folders_of_one_name_are_told_apart_by_their_paths(tmp_path):
+def test_folders_of_one_name_are_distinguished_by_their_paths(tmp_path):
     one, other = (write(tmp_path / seed / "data" / "vae.jsonl", {"update": 1, "kl": 1.0}) for seed in "ab")
     assert [each.name for each in load_trainings([one, other])] == [str(one), str(other)]
 
 
-def test_a_training_that_went_back_tells_the_updates_behind_its_checkpoint_anew():
+def test_a_training_that_went_back_replaces_the_updates_after_its_checkpoint():
     before = [{"update": 10, "a": 1.0}, {"update": 10, "held_out_a": 2.0}, {"update": 20, "a": 3.0}]
     assert merge_points([*before, {"update": 10, "a": 4.0}]) == {10: {"a": 4.0}}
     assert merge_points([*before, {"update": 20, "a": 5.0}]) == {10: {"a": 1.0, "held_out_a": 2.0}, 20: {"a": 5.0}}
@@ -128,16 +128,16 @@ def test_a_curve_from_before_the_held_out_divergence_is_drawn(tmp_path):
     ["", "{", "[]", "1", '{"error": 1}', '{"update": 1}', '{"update": 1, "error": NaN}', '{"update": 1, "error": "9"}',
      '{"update": 1, "error": 1e31}', '{"update": 1, "error": true}', '{"update": 1, "guessed": 2}'],
 )  # fmt: skip
-def test_a_damaged_curve_is_told(tmp_path, text):
+def test_a_damaged_curve_is_reported(tmp_path, text):
     (tmp_path / "vae.jsonl").write_text(text)
     with pytest.raises(DatasetError, match="holds no loss curve"):
         load_trainings([tmp_path])
 
 
-def test_a_folder_without_a_training_is_told(tmp_path):
-    with pytest.raises(DatasetError, match=r"no folder .*stands before it"):
+def test_a_folder_without_a_training_is_reported(tmp_path):
+    with pytest.raises(DatasetError, match=r"no folder .*goes before it"):
         load_trainings([tmp_path / "tiny"])
-    with pytest.raises(DatasetError, match=r"holds no loss curve: give --data a folder that was trained in"):
+    with pytest.raises(DatasetError, match=r"holds no loss curve: give --data the folder of a training"):
         load_trainings([tmp_path])
 
 

@@ -1,4 +1,4 @@
-"""A VAE before there is an MDN-RNN or a bundle, and pictures of one's own."""
+"""Pages of a VAE without an MDN-RNN or a bundle, and of the user's own pictures."""
 
 import re
 
@@ -9,12 +9,12 @@ import pytest
 from dreamfleet.common.errors import DatasetError, MissingExtraError, UsageError
 from dreamfleet.worker.inspection import vae_view as module
 from dreamfleet.worker.inspection.encoded_rollout import DriveConfig
-from dreamfleet.worker.inspection.own_pictures import fit_picture
 from dreamfleet.worker.inspection.page_builder import InspectionSubject, write_page
+from dreamfleet.worker.inspection.vae_sections import fit_picture
 from dreamfleet.worker.inspection.vae_view import VAEView, held_out_drive
 from dreamfleet.worker.training import train_vae
-from dreamfleet.worker.training.data.world import preprocessing_of_size
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.data.dataset import preprocessing_of_size
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 from tests.support.drives import write_drives

@@ -1,4 +1,4 @@
-"""Figures of a world model under a controller that holds its choices."""
+"""Figures of a world model under a controller that repeats its choices."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ VARIANT = Variant(pedals="one", pedal_shift=0.25, decide_every=3, feedback="last
 
 
 def witnessed(observing_model, own, noise):
-    """A drive of eleven steps by a controller of `own`, with `watching` looking on."""
+    """A drive of eleven steps by a controller of `own`, observed by `watching`."""
     driving = DriverChoice(controller_of(own.with_controllers(None, VARIANT)), own)
     mind = RecurrentState(driving.observing_model(observing_model))
     drives = witness(observing_model, mind, driving.hands(observing_model, mind), DisturbedDriveConfig(noise, steps=11))

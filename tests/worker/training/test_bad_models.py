@@ -1,4 +1,4 @@
-"""Bundles and data sets that are wrong are refused before anything runs, in one clear line."""
+"""Malformed bundles and data sets are refused in one line before anything runs."""
 
 import shutil
 from dataclasses import replace
@@ -15,7 +15,7 @@ from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble, export_graphs, make_manifest
 from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -90,9 +90,11 @@ def test_a_dream_begins_at_real_latents(random_bundle, tmp_path, initial, said):
 )
 def test_damaged_recorded_states_are_one_clear_line(random_bundle, tmp_path, recorded, said):
     parts = {**parts_of(random_bundle), RECORDED_STATES: recorded}
-    with pytest.raises(BundleError, match=rf"b\.zip: recorded_states\.npy .*{said}.*; build the bundle again") as told:
+    with pytest.raises(
+        BundleError, match=rf"b\.zip: recorded_states\.npy .*{said}.*; build the bundle again"
+    ) as caught:
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_graphs_of_other_sizes_than_the_manifest_says_are_refused(random_bundle, tmp_path):
@@ -178,7 +180,7 @@ def test_a_whole_folder_still_makes_a_bundle(folder):
 
 
 def with_weights_elsewhere(model):
-    """The first initialiser's numbers lie in a file beside the model."""
+    """A model whose first initialiser is stored in another file."""
     tensor = model.graph.initializer[0]
     elsewhere(tensor)
 

@@ -1,11 +1,11 @@
-"""Recorded drives that others collected, damaged in thousands of ways: each is read, or is one line."""
+"""Recorded drives damaged in thousands of ways: each is read, or refused in one line."""
 
 import numpy as np
 import pytest
 
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.training.data.collect import import_rollouts
 from dreamfleet.worker.training.data.dataset import check_whole, load_arrays, load_pictures, load_steps
-from dreamfleet.worker.training.data.import_rollouts import import_rollouts
 from dreamfleet.worker.training.data.rollouts import load_rollouts
 from tests.support.drives import write_drive
 from tests.support.mutations import Watched, archives

@@ -12,7 +12,7 @@ CONFIG = MDNRNNConfig(latent=1, hidden=4, done=True, lost=3)
 
 
 def drives(*rewards, ended=False):
-    """Rollouts of these rewards, padded; the last of them ended if it is said so."""
+    """Rollouts with these rewards, padded; `ended` says whether the last one ended."""
     length = max(map(len, rewards))
     reward, mask, done = (np.zeros((len(rewards), length), np.float32) for _ in range(3))
     for row, each in enumerate(rewards):
@@ -56,5 +56,5 @@ def test_where_an_episode_ended_it_ends_too():
 
 @pytest.mark.parametrize("values", [{"lost": -1}, {"lost": 5, "done": False}])
 def test_steps_of_a_loss_need_a_done_head(values):
-    with pytest.raises(UsageError, match="--lost is a number of steps that a done head foretells"):
+    with pytest.raises(UsageError, match="--lost is a number of steps that a done head predicts"):
         replace(CONFIG, **values)

@@ -1,4 +1,4 @@
-"""Factors weigh the parts of a loss; at 1 nothing is written of them, and what is reported is never weighed."""
+"""Factors weight the parts of a loss; the default 1 is not serialised, and reported losses are unweighted."""
 
 import argparse
 import json
@@ -15,7 +15,7 @@ from dreamfleet.worker.training.assemble import assemble, make_manifest
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.data.rollouts import load_rollouts
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.verbs import train_vae as verb
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -62,30 +62,30 @@ def test_the_error_is_weighed_against_the_divergence(loss, scale):
 
 
 def test_a_factor_changes_what_is_learnt_and_held_out_losses_stay_comparable(trained, tmp_path):
-    layers, told, learnt = replace(LAYERS, loss="notebook"), [], []
+    layers, reported, learnt = replace(LAYERS, loss="notebook"), [], []
     for factor in (1.0, 4.0):
         folder = tmp_path / f"{factor}"
         folder.mkdir()
         linked(trained, folder, "episodes")
         still = replace(SHORT, updates=1, rate=1e-12)
         train_vae.train_vae(folder, still, ignore, replace(layers, error_factor=factor))
-        told.append(points(folder / "vae.jsonl")[-1])
+        reported.append(points(folder / "vae.jsonl")[-1])
         train_vae.train_vae(folder, SHORT, ignore, replace(layers, error_factor=factor))
         learnt.append(load_weights(folder / train_vae.CHECKPOINT))
-    assert told[0] == pytest.approx(told[1])
-    assert list(told[0]) == ["update", "held_out", "held_out_error", "held_out_kl"]
+    assert reported[0] == pytest.approx(reported[1])
+    assert list(reported[0]) == ["update", "held_out", "held_out_error", "held_out_kl"]
     assert not np.array_equal(learnt[0]["mu.weight"], learnt[1]["mu.weight"])
 
 
-def test_latents_and_rewards_are_weighed_in_the_gradients_and_not_in_what_is_told(trained):
+def test_latents_and_rewards_are_weighted_in_the_gradients_and_not_in_reported_losses(trained):
     rollouts = load_rollouts(sorted((trained / "encoded").glob("*.npz")))
-    gradients, told = [], []
+    gradients, reported = [], []
     for z, reward in ((1.0, 1.0), (1.0, 3.0), (2.0, 1.0), (2.0, 3.0)):
         torch.manual_seed(0)
         model = MDNRNN(replace(RNN, z_factor=z, reward_factor=reward))
-        told.append(train_mdnrnn.backward(model, rollouts, torch.Generator().manual_seed(0)))
+        reported.append(train_mdnrnn.backward(model, rollouts, torch.Generator().manual_seed(0)))
         gradients.append(model.heads.weight.grad)
-    assert all(each == told[0] for each in told)
+    assert all(each == reported[0] for each in reported)
     plain, rewards, latents, both = gradients
     torch.testing.assert_close(both, rewards + latents - plain)
     torch.testing.assert_close(rewards[-1], 3 * plain[-1])  # the reward head's row

@@ -1,4 +1,4 @@
-"""Features that foretell what a driver will do and earn."""
+"""A subspace of features that predict a driver's actions and rewards."""
 
 import argparse
 import json
@@ -10,8 +10,8 @@ from dreamfleet.common.artifacts.actions import Continuous, Discrete
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.tasks.api import World
+from dreamfleet.worker.training.drive_regression import DriveArrays, FeatureExtractor
 from dreamfleet.worker.training.fit_subspace import PredictionTarget, find_subspace, make_targets
-from dreamfleet.worker.training.refit import DriveArrays, FeatureExtractor
 from dreamfleet.worker.verbs import subspace as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -32,7 +32,7 @@ def bundle(folder):
 
 @pytest.fixture(scope="module")
 def drives(folder):
-    """Drives in which the steering follows what is seen, slowly; each pays every third step."""
+    """Drives in which the steering slowly follows the pictures, with a reward at each third step."""
     paths = []
     for number in range(20):
         path = write_drive(folder / "data", number, steps=120)
@@ -68,7 +68,7 @@ def test_all_windows_are_asked_of_what_goes_both_ways_alone():
     assert len(make_targets(World(Discrete(3)), 3)) == 6
 
 
-def test_its_features_foretell_held_out_drives_and_have_one_size(bundle, drives):
+def test_its_features_predict_held_out_drives_and_have_one_size(bundle, drives):
     found = find_subspace(bundle, drives[:15], ignore)
     subspace = found.subspace
     assert (subspace.bundle, found.drives) == (bundle.sha256, 15)
@@ -84,16 +84,16 @@ def test_its_features_foretell_held_out_drives_and_have_one_size(bundle, drives)
     features = np.concatenate(looked) @ subspace.weights.T + subspace.offsets
     np.testing.assert_allclose(features.mean(axis=0), 0, atol=0.3)
     np.testing.assert_allclose(features.std(axis=0), 1, atol=0.3)
-    told = features[:, subspace.names.index("steer 0-3")]
-    assert np.corrcoef(told, np.concatenate(steering))[0, 1] > 0.8
+    values = features[:, subspace.names.index("steer 0-3")]
+    assert np.corrcoef(values, np.concatenate(steering))[0, 1] > 0.8
 
 
-def test_views_are_directions_that_tell_where_the_model_itself_will_be(bundle, drives):
+def test_views_are_directions_that_predict_the_models_later_state(bundle, drives):
     plain, wide = (find_subspace(bundle, drives[:15], ignore, views) for views in (0, 3))
     count = len(plain.subspace.names)
     assert wide.subspace.names[:count] == plain.subspace.names
     views = len(wide.subspace.names) - count
-    assert 1 <= views <= 3, "as many as are foretold"
+    assert 1 <= views <= 3, "as many as are predictable"
     assert wide.subspace.names[count:] == tuple(f"view {number} 15-16" for number in range(1, views + 1))
     np.testing.assert_array_equal(wide.subspace.weights[:count], plain.subspace.weights)
     looking, now, then = FeatureExtractor(bundle), [], []
@@ -103,18 +103,18 @@ def test_views_are_directions_that_tell_where_the_model_itself_will_be(bundle, d
         seen = looking.features([drive], looking.encode_drives([drive]))[0]
         now.append(seen[20:80] @ wide.subspace.weights[count:].T + wide.subspace.offsets[count:])
         then.append(seen[35:95])
-    told, later = np.concatenate(now), np.concatenate(then)
-    np.testing.assert_allclose(told.std(axis=0), 1, atol=0.3)
-    for column, r_squared in zip(told.T, wide.r_squared[count:], strict=True):
+    values, later = np.concatenate(now), np.concatenate(then)
+    np.testing.assert_allclose(values.std(axis=0), 1, atol=0.3)
+    for column, r_squared in zip(values.T, wide.r_squared[count:], strict=True):
         design = np.column_stack([later, np.ones(len(later))])
         missed = column - design @ np.linalg.lstsq(design, column, rcond=None)[0]
-        assert 1 - missed.var() / column.var() >= r_squared - 0.2, "what was seen later tells it, too"
+        assert 1 - missed.var() / column.var() >= r_squared - 0.2, "it is predictable from the later state, too"
     assert all(0.05 <= each <= 1 for each in wide.r_squared)
     everything = find_subspace(bundle, drives[:15], ignore, 1000)
     assert len(everything.subspace.names) <= count + 10, "no more than [z, h] has"
 
 
-def test_what_foretells_nothing_is_said(bundle, drives, tmp_path):
+def test_unpredictable_drives_are_refused(bundle, drives, tmp_path):
     with pytest.raises(UsageError, match="5 drives of 0 steps that count are too few"):
         find_subspace(bundle, [write_drive(tmp_path / "short", number, steps=30) for number in range(5)], ignore)
     always = [write_drive(tmp_path / "always", number, steps=150) for number in range(10)]
@@ -122,7 +122,7 @@ def test_what_foretells_nothing_is_said(bundle, drives, tmp_path):
         with np.load(path) as drive:
             arrays = dict(drive)
         np.savez(path, **{**arrays, "action": np.ones((150, 3), np.float32), "reward": np.ones(150, np.float32)})
-    with pytest.raises(UsageError, match="foretells nothing of these 10 drives"):
+    with pytest.raises(UsageError, match="predicts nothing of these 10 drives"):
         find_subspace(bundle, always, ignore)
     with pytest.raises(UsageError, match=r"4 drives of .* steps that count are too few"):
         find_subspace(bundle, drives[:4], ignore)
@@ -136,14 +136,14 @@ def call(*arguments):
     return verb.run(parser.parse_args([str(each) for each in arguments]))
 
 
-def test_the_verb_writes_one_and_tells_what_it_foretells(bundle, drives, folder, tmp_path, capsys):
+def test_the_verb_writes_one_and_prints_what_it_predicts(bundle, drives, folder, tmp_path, capsys):
     flags = (bundle.path, "--data", folder / "data", "--out", tmp_path / "few.npz")
     assert call(*flags, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     subspace = Subspace.load(tmp_path / "few.npz")
-    assert (told["sha256"], told["bundle"], told["drives"]) == (subspace.sha256, bundle.sha256, 20)
-    assert tuple(told["features"]) == subspace.names
-    assert len(told["r_squared"]) == len(subspace.names)
+    assert (printed["sha256"], printed["bundle"], printed["drives"]) == (subspace.sha256, bundle.sha256, 20)
+    assert tuple(printed["features"]) == subspace.names
+    assert len(printed["r_squared"]) == len(subspace.names)
     assert call(*flags) == 0
     assert "steer 0-3" in capsys.readouterr().out
     assert Subspace.load(tmp_path / "few.npz").sha256 == subspace.sha256, "equal drives make equal subspaces"

@@ -1,4 +1,4 @@
-"""A training that is interrupted, killed, or without room for its files goes on to the bits that it would have had."""
+"""A training that is interrupted, killed, or out of disk space resumes to the same bits."""
 
 import argparse
 import json
@@ -15,7 +15,7 @@ from dreamfleet.worker.training import checkpoint, train_mdnrnn, train_vae, trai
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.loss_curve import append_point
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.training_cli import run_training
 from dreamfleet.worker.training.training_state import numbered_path
 from dreamfleet.worker.verbs import train_vae as verb
@@ -29,7 +29,7 @@ SHORT = TrainConfig(updates=6, batch=8, rate=1e-3, validate_every=2)
 
 
 class KilledError(BaseException):
-    """Nothing of ours runs any more."""
+    """Stands for a kill: no handler of the code under test catches it."""
 
 
 def ignore(_done, _note):
@@ -55,7 +55,7 @@ def train(data, config=SHORT, report=ignore, **more):
     return train_vae.train_vae(data, config, report, LAYERS, **more)
 
 
-def test_a_vae_that_knows_less_than_the_mean_picture_is_told(data, caplog):
+def test_a_vae_that_is_worse_than_the_mean_picture_logs_a_warning(data, caplog):
     figures = train(data)
     assert figures["reconstruction_error"] > figures["mean_picture_error"]
     assert "it holds nothing to evolve on yet; give it more --updates" in caplog.text
@@ -199,9 +199,9 @@ def test_checkpoints_are_kept_beside_the_last_one(drives, data):
 def test_an_early_end_is_said_and_again_where_nothing_is_left_to_do(data, capsys):
     words = ("--data", data, "--updates", 20, "--validate-every", 1, "--rate", 1e-12, "--patience", 2)
     assert call(*words) == 0
-    told = capsys.readouterr().out
-    assert "ended early after update 3, as --patience says: the checkpoint is that of update 1, the best" in told
-    assert "reconstruction_error" in told
+    printed = capsys.readouterr().out
+    assert "ended early after update 3, as --patience says: the checkpoint is that of update 1, the best" in printed
+    assert "reconstruction_error" in printed
     assert call(*words, "--json") == 0
     ended = json.loads(capsys.readouterr().out)["ended_early"]
     assert (ended["update"], ended["given_up_at"]) == (1, 3)
@@ -224,9 +224,9 @@ def test_patience_that_comes_later_counts_from_then(data):
 def test_new_begins_anew_and_leaves_nothing_of_the_old_training(drives, data, capsys):
     train(data, replace(SHORT, updates=3, patience=2, keep_every=2, seed=7))
     before = load_weights(data / train_vae.CHECKPOINT)
-    told = []
-    train(data, report=lambda done, _: told.append(done), new=True)
-    assert told == list(range(7))
+    updates = []
+    train(data, report=lambda done, _: updates.append(done), new=True)
+    assert updates == list(range(7))
     assert made(data) == ["vae.jsonl", "vae.safetensors"]
     assert state(data / train_vae.CHECKPOINT) == state(drives / train_vae.CHECKPOINT)
     assert (data / "vae.jsonl").read_text() == (drives / "vae.jsonl").read_text()

@@ -17,8 +17,7 @@ from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.pipeline import STAGES, Pipeline
 from dreamfleet.worker.training.prediction_quality import area_under_curve
-from dreamfleet.worker.training.presets import PRESETS, find_preset
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import PRESETS, TrainConfig, find_preset
 from dreamfleet.worker.verbs import encode as encode_verb
 from dreamfleet.worker.verbs import pipeline
 from dreamfleet.worker.worldmodel.inference import Encoder, PolicyStep

@@ -1,4 +1,4 @@
-"""Presets are their sources; the folder keeps the one that it was begun with."""
+"""Presets match their sources; a data folder keeps the preset it was begun with."""
 
 import argparse
 import json
@@ -11,13 +11,11 @@ from dreamfleet.common.cli.presets import NAMES
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.data.collect_config import CollectConfig
+from dreamfleet.worker.training.data.data_folder import check_seed, load_preset, resolve_preset, store_preset
 from dreamfleet.worker.training.data.dataset import load_arrays
-from dreamfleet.worker.training.data.dataset_preset import check_seed, load_preset, resolve_preset, store_preset
-from dreamfleet.worker.training.data.rollouts import Rollouts, load_rollouts, model_inputs
+from dreamfleet.worker.training.data.rollouts import Rollouts, load_rollouts, model_inputs, teacher_force
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.presets import PRESETS
-from dreamfleet.worker.training.teacher_forcing import teacher_force
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.verbs import collect
 from dreamfleet.worker.verbs import train_mdnrnn as mdnrnn_verb
 from dreamfleet.worker.verbs import train_vae as vae_verb
@@ -161,7 +159,7 @@ def test_a_data_set_from_before_presets_were_kept_stays_without_one(tmp_path):
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"preset": 5}', '{"preset": "dream"}', "[" * 900])
-def test_a_damaged_note_of_the_preset_is_told_in_a_line(tmp_path, content):
+def test_a_damaged_preset_file_is_reported_in_a_line(tmp_path, content):
     (tmp_path / "preset.json").write_text(content)
     with pytest.raises(DatasetError, match="names no preset"):
         resolve_preset(tmp_path, None)

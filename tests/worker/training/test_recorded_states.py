@@ -13,7 +13,7 @@ from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.verbs import bundle as verb
 from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -34,7 +34,7 @@ MODELS = {
 
 @pytest.fixture(scope="module")
 def encoded(tmp_path_factory):
-    """Drives of which each second one stays without a reward from step 40 on."""
+    """Drives, each second one without a reward from step 40 on."""
     folder = tmp_path_factory.mktemp("data")
     drives = [write_drive(folder, number, STEPS - number) for number in range(4)]
     train_vae.train_vae(folder, SHORT, ignore, VAEConfig(latent=LATENT, channels=(2, 2, 2, 2)))
@@ -65,7 +65,7 @@ def ignore(_done, _note):
 
 @pytest.fixture
 def trained(encoded, tmp_path):
-    """A folder with these drives and an MDN-RNN of its own."""
+    """A folder with these drives and a trained MDN-RNN."""
 
     def folder(layers):
         made = tmp_path / "data"
@@ -77,7 +77,7 @@ def trained(encoded, tmp_path):
 
 
 def remembered(bundle, folder):
-    """By latents of each step of each drive: them, and what a drive by the bundle's graphs remembers before it."""
+    """The latents of each step of each drive, and the state before it by the bundle's graphs, keyed by the latents."""
     model, label, found = DreamStep(bundle), RewardLabel(bundle), {}
     for path in sorted((folder / "encoded").iterdir()):
         arrays = load_arrays(path, "mu", "logvar", "action", "reward")
@@ -138,7 +138,7 @@ def call(capsys, folder, *flags):
     return capsys.readouterr().out
 
 
-def test_the_verb_and_the_page_tell_how_many_there_are(trained, capsys):
+def test_the_verb_and_the_page_show_how_many_there_are(trained, capsys):
     folder = trained(MODELS["plain"])
     every = sum(STEPS - number - 20 for number in range(4))
     assert json.loads(call(capsys, folder, "--json"))["recorded"] == every < 512
@@ -162,10 +162,10 @@ FIGURES = {
 
 
 def test_figures_that_were_measured_stay_with_the_bundle(trained, tmp_path, capsys):
-    folder, told = trained(MODELS["plain"]), tmp_path / "told.json"
+    folder, figures = trained(MODELS["plain"]), tmp_path / "figures.json"
     bare = json.loads(call(capsys, folder, "--json"))["sha256"]
-    told.write_text(json.dumps({"bundle": bare, **FIGURES}))
-    assert json.loads(call(capsys, folder, "--measured", str(told), "--json"))["sha256"] != bare
+    figures.write_text(json.dumps({"bundle": bare, **FIGURES}))
+    assert json.loads(call(capsys, folder, "--measured", str(figures), "--json"))["sha256"] != bare
     bundle = Bundle.open(folder / "b.zip")
     assert bundle.manifest.provenance["measured"] == [FIGURES]
     rows = dict(manifest_facts(bundle))
@@ -173,19 +173,19 @@ def test_figures_that_were_measured_stay_with_the_bundle(trained, tmp_path, caps
     assert rows["dreamt share of yaw above 3"] == "0.20 ± 0.01"
     assert rows["road lost in dreams begun 40 steps before"] == "0.60 ± 0.07"
     for content, said in (
-        (json.dumps({"bundle": "0" * 64, **FIGURES}), "was measured of the world model 000000000000"),
+        (json.dumps({"bundle": "0" * 64, **FIGURES}), "was measured on the world model 000000000000"),
         (json.dumps({"bundle": bare, **FIGURES, "noise": float("nan")}), "holds no figures"),
         (json.dumps({"bundle": bare, "driver": "", "noise": 0, "first_seed": 0}), "holds no figures"),
         ("{}", "holds no figures"), ("[" * 100_000, "holds no figures"), ("", "holds no figures"),
     ):  # fmt: skip
-        told.write_text(content)
+        figures.write_text(content)
         with pytest.raises(DatasetError, match=said):
-            call(capsys, folder, "--measured", str(told))
+            call(capsys, folder, "--measured", str(figures))
         assert Bundle.open(folder / "b.zip").sha256 == bundle.sha256
 
 
-@pytest.mark.parametrize("told", [7, [7], [{"probe": 7}], [{"probe": {"known": [{"quantity": 1}]}}]])
-def test_a_manifest_that_holds_anything_there_tells_nothing(tmp_path, told):
+@pytest.mark.parametrize("content", [7, [7], [{"probe": 7}], [{"probe": {"known": [{"quantity": 1}]}}]])
+def test_malformed_figures_in_a_manifest_are_left_out(tmp_path, content):
     bundle = write_random_bundle(tmp_path / "b.zip")
-    bundle.manifest.provenance["measured"] = told
+    bundle.manifest.provenance["measured"] = content
     assert not [name for name, _ in manifest_facts(bundle) if "R²" in name]

@@ -11,7 +11,8 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.car_racing_variants import DEFAULT_VARIANT, Variant
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
-from dreamfleet.worker.training.refit import DriveArrays, FeatureExtractor, LeastSquaresSums, output_bounds, refit
+from dreamfleet.worker.training.drive_regression import DriveArrays, FeatureExtractor, LeastSquaresSums
+from dreamfleet.worker.training.refit import output_bounds, refit
 from dreamfleet.worker.verbs import refit as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -29,7 +30,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def bundles(folder):
-    """Two world models that were trained by nobody, each with eyes and a memory of its own."""
+    """Two random world models with different encoders and MDN-RNNs."""
     return [write_random_bundle(folder / f"{seed}.zip", seed, EYES, MEMORY) for seed in (1, 2)]
 
 
@@ -49,7 +50,7 @@ def ignore(_):
 
 
 def first_values(chosen, bundle, paths):
-    """What its first layer gives on drives `(N, T, outputs)`."""
+    """The outputs of its first layer along drives `(N, T, outputs)`."""
     with_pictures = []
     for path in paths:
         with np.load(path) as drive:
@@ -76,14 +77,14 @@ def test_what_lies_behind_an_actions_bound_is_kept_near_it(bundles):
 def test_it_chooses_by_other_eyes_much_as_it_chose(bundles, drives, features, hidden):
     old, new = bundles
     before = controller(old, features, hidden)
-    told = []
-    found = refit(before, old, new, drives[:16], told.append)
+    counts = []
+    found = refit(before, old, new, drives[:16], counts.append)
     after = found.controller
     assert (after.bundle, after.shape, after.task) == (new.sha256, before.shape, before.task)
     assert after.provenance == {"refitted_from": before.sha256, "of_world_model": old.sha256}
     assert found.drives == 16
     assert 16 * 55 < found.steps < 16 * 60  # nothing is known behind a drive's last reward
-    assert told == [16]
+    assert counts == [16]
     for (above, offsets), (same, unchanged) in zip(
         before.shape.unpack(before.parameters)[1:], after.shape.unpack(after.parameters)[1:], strict=True
     ):
@@ -99,7 +100,7 @@ def test_the_model_that_it_has_leaves_it_as_it_is(bundles, drives):
     assert refit(before, bundles[0], bundles[0], drives, ignore).controller == before
 
 
-def test_least_squares_find_a_map_and_tell_how_much_it_explains():
+def test_least_squares_find_a_map_and_how_much_it_explains():
     random = np.random.default_rng(0)
     inputs = random.normal(size=(200, 3)).astype(np.float32)
     weights, noise = random.normal(size=(4, 2)), random.normal(size=(200, 2)) * [0, 1]
@@ -149,10 +150,10 @@ def test_the_verb_writes_a_controller_of_the_other_model(bundles, drives, folder
     controller(old).save(tmp_path / "before.npz")
     flags = ("--bundle", old.path, "--data", folder / "data", "--out", tmp_path / "after.npz", "--runs-dir", tmp_path)
     assert call(tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 10, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     after = Controller.load(tmp_path / "after.npz")
-    assert (told["sha256"], told["bundle"], told["drives"]) == (after.sha256, Bundle.open(new.path).sha256, 10)
-    assert len(told["r_squared"]) == 3
+    assert (printed["sha256"], printed["bundle"], printed["drives"]) == (after.sha256, Bundle.open(new.path).sha256, 10)
+    assert len(printed["r_squared"]) == 3
     with pytest.raises(UsageError, match="--episodes must be at least 2"):
         call(tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 1)
     with pytest.raises(UsageError, match="is a folder"):

@@ -21,8 +21,8 @@ print(os.environ["OMP_WAIT_POLICY"], layer.weight.grad.double().sum().item().hex
 
 
 @pytest.fixture
-def told(monkeypatch):
-    """What the C library was told."""
+def allocator_calls(monkeypatch):
+    """The calls of the C library's allocator settings."""
     calls = []
     for name in [each for each in os.environ if each.startswith(("MALLOC_", "OMP_WAIT"))]:
         monkeypatch.delenv(name)
@@ -31,16 +31,16 @@ def told(monkeypatch):
     os.environ.pop("OMP_WAIT_POLICY", None)
 
 
-def test_threads_that_wait_sleep_and_the_heap_keeps_what_is_freed(told):
+def test_threads_that_wait_sleep_and_the_heap_keeps_what_is_freed(allocator_calls):
     torch_setup.configure_process()
-    assert (os.environ["OMP_WAIT_POLICY"], told) == ("PASSIVE", ["keep"])
+    assert (os.environ["OMP_WAIT_POLICY"], allocator_calls) == ("PASSIVE", ["keep"])
 
 
-def test_what_the_user_set_stays(told, monkeypatch):
+def test_what_the_user_set_stays(allocator_calls, monkeypatch):
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
     monkeypatch.setenv("MALLOC_ARENA_MAX", "2")
     torch_setup.configure_process()
-    assert (os.environ["OMP_WAIT_POLICY"], told) == ("ACTIVE", [])
+    assert (os.environ["OMP_WAIT_POLICY"], allocator_calls) == ("ACTIVE", [])
 
 
 def test_a_system_without_such_a_heap_is_left_alone(monkeypatch):
@@ -49,7 +49,7 @@ def test_a_system_without_such_a_heap_is_left_alone(monkeypatch):
 
 
 def test_nothing_that_is_learnt_depends_on_it():
-    """Gradients in a process that was asked, and in one whose environment says otherwise."""
+    """The gradients are equal in a configured process and in one with other settings in its environment."""
     own = {name: text for name, text in os.environ.items() if not name.startswith(("OMP_", "MALLOC_"))}
     other = own | {"OMP_WAIT_POLICY": "ACTIVE", "MALLOC_ARENA_MAX": "2"}
     first, second = (

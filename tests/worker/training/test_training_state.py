@@ -14,8 +14,7 @@ from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config, load_progress, load_weights
 from dreamfleet.worker.training.data.rollouts import load_rollouts
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.presets import PRESETS
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.training.training_state import select_device, summarise_model
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import ADDABLE_HEADS, MDNRNNConfig
@@ -61,7 +60,7 @@ def test_the_vae_goes_on_to_the_same_weights_as_without_a_stop(encoded, tmp_path
 
 
 @pytest.mark.parametrize("after", [1, 3])  # neither is an update after which the held-out rollouts are looked at
-def test_told_to_stop_it_keeps_every_update_and_goes_on_to_the_same_weights(encoded, tmp_path, after):
+def test_a_stopped_training_keeps_every_update_and_resumes_to_the_same_weights(encoded, tmp_path, after):
     (tmp_path / "episodes").symlink_to(encoded / "episodes")
     made = []
     with pytest.raises(
@@ -73,7 +72,7 @@ def test_told_to_stop_it_keeps_every_update_and_goes_on_to_the_same_weights(enco
     assert equal(encoded / train_vae.CHECKPOINT, tmp_path / train_vae.CHECKPOINT)
 
 
-def test_an_mdnrnn_that_is_told_to_stop_goes_on_to_the_same_weights(encoded, tmp_path):
+def test_a_stopped_mdnrnn_resumes_to_the_same_weights(encoded, tmp_path):
     whole, parts = (tmp_path / name for name in ("whole", "parts"))
     for folder in (whole, parts):
         folder.mkdir()
@@ -115,8 +114,8 @@ def test_a_checkpoint_keeps_its_layers_and_refuses_others(encoded):
         train_vae.train_vae(encoded, SHORT, ignore, replace(LAYERS, latent=5))
 
 
-def test_a_trained_memory_may_be_given_a_head_that_foretells_ends(encoded, tmp_path):
-    """What it knew stays, to the bit; Adam goes on where it was, but for the tensors that grew."""
+def test_a_done_head_can_be_added_to_a_trained_mdnrnn(encoded, tmp_path):
+    """Its weights stay, to the bit; Adam's moments too, except those of extended tensors."""
     before, folder = tmp_path / "before.safetensors", tmp_path / "data"
     shutil.copytree(encoded, folder)
     checkpoint = folder / train_mdnrnn.CHECKPOINT

@@ -1,4 +1,4 @@
-"""A bundle's models as what training goes on from."""
+"""Checkpoints from a bundle's models, from which training resumes."""
 
 import json
 from dataclasses import replace
@@ -14,7 +14,7 @@ from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import export_graphs
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
 from dreamfleet.worker.training.encode import encode, encoder_hash
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.unbundle import unbundle
 from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -102,7 +102,7 @@ def test_weights_that_a_bundle_keeps_are_taken_as_they_were(tmp_path):
     for wrong in (np.float32(np.nan), np.float32(1)):
         other = save({name: values + wrong if name == "vae.mu.bias" else values for name, values in kept.items()})
         lying = write_bundle(tmp_path / "c.zip", plain.manifest, parts | {WEIGHTS: other})
-        with pytest.raises(BundleError, match="is not what its weights and its manifest make"):
+        with pytest.raises(BundleError, match="does not match its weights and manifest"):
             unbundle(lying, tmp_path / "other")
 
 
@@ -113,18 +113,18 @@ def test_weights_that_a_bundle_keeps_are_taken_as_they_were(tmp_path):
         (EYES, replace(MEMORY, window=2), "laid out|size mismatch"),
         (EYES, replace(MEMORY, done=True), "laid out"),
         (replace(EYES, channels=(2, 2, 2, 2)), MEMORY, "size mismatch"),
-        (replace(EYES, activation="leaky_relu"), MEMORY, r"encoder.onnx is not what"),
-        (EYES, replace(MEMORY, reward="value"), "dream.onnx is not what"),
+        (replace(EYES, activation="leaky_relu"), MEMORY, r"encoder.onnx does not match"),
+        (EYES, replace(MEMORY, reward="value"), "dream.onnx does not match"),
     ],
 )
-def test_models_that_cannot_be_had_again_are_refused(tmp_path, eyes, memory, said):
-    """As a manifest tells of graphs that are of other models."""
+def test_models_that_cannot_be_restored_are_refused(tmp_path, eyes, memory, said):
+    """The manifest of one bundle with the graphs of another."""
     plain = write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
     other = write_random_bundle(tmp_path / "b.zip", 3, eyes, memory)
     parts = {name: plain.read(name) for name in plain.manifest.parts}
-    told = replace(plain.manifest, models=other.manifest.models)
+    manifest = replace(plain.manifest, models=other.manifest.models)
     with pytest.raises(BundleError, match=said):
-        unbundle(write_bundle(tmp_path / "c.zip", told, parts), tmp_path / "data")
+        unbundle(write_bundle(tmp_path / "c.zip", manifest, parts), tmp_path / "data")
     assert not list(tmp_path.glob("data/*"))
 
 
@@ -157,8 +157,8 @@ def test_where_one_of_both_cannot_be_written_neither_is(tmp_path, monkeypatch):
 def test_models_that_are_there_stay(tmp_path, capsys):
     write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
     assert main(["unbundle", str(tmp_path / "a.zip"), "--data", str(tmp_path / "data"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["bundle"] == Bundle.open(tmp_path / "a.zip").sha256
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["bundle"] == Bundle.open(tmp_path / "a.zip").sha256
     before = (tmp_path / "data" / "vae.safetensors").read_bytes()
     with pytest.raises(UsageError, match="is there already"):
         unbundle(Bundle.open(tmp_path / "a.zip"), tmp_path / "data")

@@ -43,10 +43,10 @@ def test_a_set_that_has_more_than_is_asked_for_is_counted_whole(tmp_path, capsys
     write_drive(tmp_path, 7, steps=4)
     flags = ("--episodes", "4", "--jobs", "1", "--preset", "tiny")
     assert call(collect, "--data", str(tmp_path), *flags) == 0
-    told = capsys.readouterr()
-    assert ": 1 episodes, " in told.out
-    assert "5 episodes in all" in told.out
-    assert "5/5" in told.err
+    printed = capsys.readouterr()
+    assert ": 1 episodes, " in printed.out
+    assert "5 episodes in all" in printed.out
+    assert "5/5" in printed.err
 
 
 @pytest.mark.parametrize(("verb", "count"), [(train_vae, "4,348,547"), (train_mdnrnn, "422,368")])

@@ -1,4 +1,4 @@
-"""World models of the whole 96x96 observation: from rollouts in CarRacing to scores, and no mixture of kinds."""
+"""World models of the whole 96x96 observation, from rollouts in CarRacing to scores; kinds cannot be mixed."""
 
 from dataclasses import replace
 
@@ -18,13 +18,11 @@ from dreamfleet.worker.tools.evaluation import evaluate
 from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
-from dreamfleet.worker.training.data.collect import collect, episode_path
+from dreamfleet.worker.training.data.collect import collect, import_rollouts
 from dreamfleet.worker.training.data.collect_config import CollectConfig
-from dreamfleet.worker.training.data.dataset import load_pictures
-from dreamfleet.worker.training.data.import_rollouts import import_rollouts
+from dreamfleet.worker.training.data.dataset import episode_path, load_pictures
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.presets import PRESETS
-from dreamfleet.worker.training.train_config import TrainConfig
+from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.worldmodel import vae_config
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from tests.support.drives import write_drive, write_drives
@@ -48,7 +46,7 @@ def ignore(_done, _note):
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """A data folder that has been through every stage; read only."""
+    """A data folder after all stages; read only."""
     folder = tmp_path_factory.mktemp("data")
     assert list(collect(folder, COLLECT, jobs=1)) == [8, 8, 8]
     train_vae.train_vae(folder, SHORT, ignore, VAE)

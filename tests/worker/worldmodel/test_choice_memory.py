@@ -1,4 +1,4 @@
-"""Controllers of a variant: by their formula, held as long as they say, and the same bits in any batch."""
+"""A variant's controllers follow their formula, repeat choices as configured, and give the same bits in any batch."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -23,7 +23,7 @@ def varied(request, random_bundle):
 
 
 def feed(step, rows, seed=0):
-    """A batch in the middle of its dreams: rows are not all at the same step of what they hold."""
+    """A batch in the middle of dreams whose rows have repeated their choices for different times."""
     random = np.random.default_rng(seed)
     state = random.normal(0, 0.5, (rows, step.state_size)).astype(np.float32)
     state[:, -1] = random.integers(0, 2, rows)
@@ -76,8 +76,8 @@ def test_a_controller_acts_by_its_formula_in_the_dream_and_in_reality(random_bun
     seen = [real.latent, given["state"][:, :256]] if features == "zh" else [real.latent]
     if variant.feedback == "last":
         last, before = given["state"][:, -7:-4], given["state"][:, -4:-1]
-        told = [variant.controls.to_outputs(each) for each in (last, before)]
-        seen += [told[0], told[0] - told[1]]
+        outputs = [variant.controls.to_outputs(each) for each in (last, before)]
+        seen += [outputs[0], outputs[0] - outputs[1]]
     for row, value in enumerate(np.concatenate(seen, axis=1)):
         expected = act(bundle.controller_shape, parameters[row], value, variant.controls)
         np.testing.assert_allclose(real.action[row], expected, atol=1e-5)

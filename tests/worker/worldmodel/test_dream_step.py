@@ -30,7 +30,7 @@ VARIANTS = {
 
 
 def chance(config, rows=ROWS, seed=0):
-    """What a step takes beside the temperature."""
+    """The inputs of a step besides the temperature."""
     random = np.random.default_rng(seed)
     shapes = {"latent": config.latent, "action": config.actions, "state": config.state}
     feed = {name: random.normal(0, 0.5, (rows, size)).astype(np.float32) for name, size in shapes.items()}
@@ -40,21 +40,23 @@ def chance(config, rows=ROWS, seed=0):
 
 
 def dreamt_in_torch(model, feed, temperature, mask):
-    """The same step by the book: softmax, its running sum, the first beyond `uniform`."""
+    """The same step in torch: softmax, cumulative sum, the first entry beyond `uniform`."""
     config = model.config
     model.heads.weight.data = model.heads.weight.data.half().float()  # as the bundle keeps them
     tensors = {name: torch.from_numpy(each) for name, each in feed.items()}
     with torch.no_grad():
         hidden, state = model.advance(torch.cat([tensors["latent"], tensors["action"]], dim=1), tensors["state"])
-        told = model.predict(hidden * torch.as_tensor(mask))
-    weights = torch.softmax(told.log_weights / temperature, dim=-1)
+        predicted = model.predict(hidden * torch.as_tensor(mask))
+    weights = torch.softmax(predicted.log_weights / temperature, dim=-1)
     index = (weights.cumsum(dim=-1) <= tensors["uniform"][..., None]).sum(dim=-1).clamp(max=config.mixtures - 1)
-    mean, deviation = (each.gather(-1, index[..., None])[..., 0] for each in (told.means, told.log_deviations))
+    mean, deviation = (
+        each.gather(-1, index[..., None])[..., 0] for each in (predicted.means, predicted.log_deviations)
+    )
     latent = mean + deviation.exp() * temperature**0.5 * tensors["normal"]
-    reward = told.reward if config.reward in ("value", "none") else torch.sigmoid(told.reward)
+    reward = predicted.reward if config.reward in ("value", "none") else torch.sigmoid(predicted.reward)
     if config.previous_reward:
-        state[:, 2 * config.hidden] = reward if config.reward == "value" else (told.reward > 0).float()
-    done = torch.sigmoid(told.done) if config.done else told.done
+        state[:, 2 * config.hidden] = reward if config.reward == "value" else (predicted.reward > 0).float()
+    done = torch.sigmoid(predicted.done) if config.done else predicted.done
     return latent.numpy(), state.numpy(), reward.numpy(), done.numpy()
 
 
@@ -113,7 +115,7 @@ def test_every_controller_acts_by_its_formula_in_the_dream_and_in_reality(tmp_pa
 
 
 @pytest.mark.parametrize(("kind", "labels"), [("positive", [1, 0]), ("notebook", [0, 1]), ("value", [3.2, -0.1])])
-def test_reality_remembers_its_reward_as_the_head_tells_it(tmp_path, kind, labels):
+def test_reality_remembers_its_reward_in_the_heads_form(tmp_path, kind, labels):
     config = MDNRNNConfig(**SMALL, reward=kind, previous_reward=True, window=2)
     policy = PolicyStep(write_random_bundle(tmp_path / "b.zip", rnn=config, vae=SMALL_VAE))
     state = policy.zero_state(2)

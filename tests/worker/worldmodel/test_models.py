@@ -1,4 +1,4 @@
-"""The models of the sources: their sizes, and that what is exported is what was trained."""
+"""The sources' models: their sizes, and that the export equals the trained model."""
 
 from dataclasses import asdict, replace
 

@@ -1,6 +1,6 @@
 /* Polygons as pygame draws them, to the pixel: gfxdraw's anti-aliased outline and its filled polygon, and
    draw.polygon, which rounds in another way. The rules were read from pygame-ce 2.5 (SDL_gfx's primitives and draw.c)
-   and are restated here; worker.car_racing.check holds them against the installed pygame. */
+   and are restated here; worker.car_racing.native_check holds them against the installed pygame. */
 
 #include "canvas.h"
 

@@ -1,9 +1,10 @@
-"""Collecting rollouts: one compressed `.npz` an episode, each a pure function of (seed, number)."""
+"""Collect rollouts, one compressed `.npz` per episode: driven here as pure functions of (seed, number), or imported."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Sequence
+import shutil
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
@@ -14,6 +15,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DatasetError, DreamfleetError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.parent_death import exit_with_parent, signals_blocked
@@ -23,43 +25,39 @@ from dreamfleet.worker.scoring.rollout import Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
 from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
-from dreamfleet.worker.training.data.collect_config import CollectConfig
-from dreamfleet.worker.training.data.dataset import check_pictures
-from dreamfleet.worker.training.data.disk_errors import explain_write_errors
+from dreamfleet.worker.training.data.collect_config import CollectConfig, source_policies
+from dreamfleet.worker.training.data.data_folder import explain_folder_errors, explain_write_errors
+from dreamfleet.worker.training.data.dataset import (
+    check_pictures,
+    episode_path,
+    existing_episodes,
+    find_world,
+    load_arrays,
+    load_pictures,
+    load_steps,
+    preprocessing_of,
+    preprocessing_of_size,
+)
 from dreamfleet.worker.training.data.pilot import Pilot
-from dreamfleet.worker.training.data.world import find_world, preprocessing_of_size, source_policies
-
-
-def episode_path(folder: Path, number: int) -> Path:
-    """Where an episode lies."""
-    return folder / "episodes" / f"{number:06d}.npz"
-
-
-def existing_episodes(folder: Path) -> list[Path]:
-    """The episodes that are there, by number."""
-    return sorted((folder / "episodes").glob("[0-9]*.npz"))
 
 
 def missing_numbers(folder: Path, config: CollectConfig) -> list[int]:
-    """Numbers of the episodes that are not there yet."""
+    """The numbers of the episodes that are still missing."""
     return [number for number in range(config.episodes) if not episode_path(folder, number).exists()]
 
 
 def collect(folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pilot] = ()) -> Generator[int, None, None]:
-    """Drive the episodes that are not there yet in `jobs` processes; yields the frames of each as it is written.
+    """Drive the missing episodes in `jobs` processes; yield the frames of each once it is written.
 
-    Random drivers drive them, or these pilots in turn. `DatasetError` or `ControllerError` before anything is driven if
-    what is there has other pictures, or a pilot sees others. Closed early, it waits until those that are being driven
-    are written.
+    Random drivers drive, or `pilots` in turn. Before any drive it raises `DatasetError` if existing episodes have other
+    pictures, and `ControllerError` if a pilot does. When closed early, it waits until running drives are written.
     """
     check_pictures(existing_episodes(folder), config.picture)
     for pilot in pilots:
         pilot.check(preprocessing_of_size(config.picture).name)
     numbers = missing_numbers(folder, config)
-    try:
+    with explain_folder_errors(folder):
         (folder / "episodes").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
     if not numbers:
         return
     pin_thread_pools()
@@ -90,7 +88,7 @@ def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...]]) -> in
 
 
 def drive_episode(config: CollectConfig, number: int, pilots: Sequence[Pilot] = ()) -> dict[str, NDArray[Any]]:
-    """One episode of T steps: `picture` (T, side, side, 3) before each `action` (T, 3), then `reward` (T,)."""
+    """Drive an episode of T steps: `picture` (T, side, side, 3) before each `action` (T, 3), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
     world = find_world()
     name, policy = _driver(config, number, pilots, random)
@@ -112,7 +110,7 @@ def drive_episode(config: CollectConfig, number: int, pilots: Sequence[Pilot] = 
 def _driver(
     config: CollectConfig, number: int, pilots: Sequence[Pilot], random: np.random.Generator
 ) -> tuple[str, Policy]:
-    """Who drives this episode, by name and as a policy that has begun."""
+    """The driver of this episode: its name, and its policy with the episode begun."""
     if pilots:
         pilot = pilots[number % len(pilots)]
         return DRIVER_NAME, pilot.policy(config.noise, config.spells, int(random.integers(2**63)))
@@ -123,3 +121,40 @@ def _driver(
     drivers = find_world().drivers
     name = list(drivers)[number % len(drivers)] if config.driver == ALL_DRIVERS else config.driver
     return name, DriverPolicy(drivers[name](random))
+
+
+def import_rollouts(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
+    """Copy the rollouts that the data set lacks, compared by their bytes, under the next numbers; yield their frames.
+
+    `DatasetError` before any copy if the pictures, the data set's included, have different preprocessings.
+    """
+    there = existing_episodes(folder)
+    kinds = {preprocessing_of(path): path for path in (*there, *rollouts)}
+    if len(kinds) > 1:
+        found = " and ".join(f"{kind!r} ({path})" for kind, path in kinds.items())
+        raise DatasetError(f"a data set's pictures are of one kind, and these are {found}; choose another --data")
+    sizes = {path.stat().st_size for path in rollouts if path.exists()}
+    known = {hash_file(path) for path in there if path.stat().st_size in sizes}
+    number = int(there[-1].stem) + 1 if there else 0
+    for path in rollouts:
+        frames = _check_drive(path)
+        if (identity := hash_file(path)) in known:
+            continue
+        known.add(identity)
+        with (
+            explain_folder_errors(folder),
+            path.open("rb") as source,
+            atomic_write(episode_path(folder, number)) as target,
+        ):
+            shutil.copyfileobj(source, target)
+        number += 1
+        yield frames
+
+
+def _check_drive(path: Path) -> int:
+    """Check a drive, which an untrusted worker may have sent, and return its number of frames."""
+    frames = len(load_pictures(path))
+    load_arrays(path, "driver")
+    if len(load_steps(path)["reward"]) != frames:
+        raise DatasetError(f"{path} holds {frames} pictures and another number of actions or rewards; delete it")
+    return frames

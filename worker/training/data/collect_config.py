@@ -1,39 +1,42 @@
-"""How much is driven for a data set, and by whom; its fields are flags, so it is apart from what drives."""
+"""The configuration of collecting, whose fields are flags: amounts and drivers."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+
+import numpy as np
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.tasks.api import Policy, TaskWithPolicies
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS
+from dreamfleet.worker.training.data.dataset import WORLD, find_world, preprocessing_of_size
 
-MAX_NOISE = 10.0  # noise, in halves of an action's range
+MAX_NOISE = 10.0  # in halves of an action's range
 
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """How much and what is driven."""
+    """How much is driven, how, and by which drivers."""
 
-    episodes: int = option(400, "episodes in all")
-    steps: int = option(300, "steps of an episode at most")
-    seed: int = option(0, "makes the data set")
-    anywhere: float = option(0.6, "share of episodes that start somewhere on the track instead of at its beginning")
-    patience: int = option(120, "steps after the last new tile before an episode ends; 0: it goes on")
-    picture: int = option(64, "height and width of what is recorded: 64, or 96 for the whole observation")
-    noise: float = option(0.3, "on a controller's actions, of half their range; random drivers have none")
+    episodes: int = option(400, "total number of episodes")
+    steps: int = option(300, "longest episode, in steps")
+    seed: int = option(0, "random seed of the data set")
+    anywhere: float = option(0.6, "share of episodes that start at a random place on the track")
+    patience: int = option(120, "steps without a new tile after which an episode ends; 0: never")
+    picture: int = option(64, "height and width of recorded pictures: 64, or 96 for the whole observation")
+    noise: float = option(0.3, "noise on a controller's actions, in halves of their range; random drivers have none")
     spells: float = option(
-        0.0, "chance of each step that an action which a controller leaves at its bound, as a brake, is tried"
+        0.0, "chance per step to try an action that a controller keeps at its bound, such as the brake, for a while"
     )
     driver: str = option(
         ALL_DRIVERS,
-        f"who drives at random: {ALL_DRIVERS} (held, ornstein-uhlenbeck and random-walk in turn), one of these alone, "
+        f"random driver: {ALL_DRIVERS} (held, ornstein-uhlenbeck and random-walk in turn), one of these alone, "
         "uniform (the notebook's), pushed (the article's) or network (Ha & Schmidhuber's)",
     )
 
     def __post_init__(self) -> None:
-        from dreamfleet.worker.training.data.world import known_drivers, preprocessing_of_size
-
         for name in ("episodes", "steps"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} must be at least 1, not {getattr(self, name)}")
@@ -50,3 +53,14 @@ class CollectConfig:
         if not 0 <= self.spells <= 1:
             raise UsageError(f"--spells must be from 0 to 1, not {self.spells}")
         preprocessing_of_size(self.picture)
+
+
+def source_policies(world: str = WORLD) -> Mapping[str, Callable[[np.random.Generator], Policy]]:
+    """The random policies of published sources by name; a world may have none."""
+    task = find_world(world)
+    return task.policies if isinstance(task, TaskWithPolicies) else {}
+
+
+def known_drivers(world: str = WORLD) -> tuple[str, ...]:
+    """The names of all random drivers."""
+    return (*find_world(world).drivers, *source_policies(world))

@@ -1,4 +1,4 @@
-"""Recorded episodes on disk, streamed: memory holds a few dozen of them, never all."""
+"""The recorded episodes of a data set, and their world. They are streamed: memory holds a few dozen, never all."""
 
 from __future__ import annotations
 
@@ -8,19 +8,48 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.archives import ArchiveLimits, Arrays, DamagedArchiveError, open_archive, read_arrays
 from dreamfleet.common.files.regular_files import open_regular
-from dreamfleet.worker.training.data.world import find_world, preprocessing_of_size
+from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask
+from dreamfleet.worker.tasks.registry import find_task
 
-POOL_EPISODES = 48  # whose frames are shuffled together
-POOL_FRAMES = 16_000  # of them at most, or one episode: 200 MB of 64x64, 440 MB of 96x96
+WORLD = "car-racing"  # the task of data sets
+POOL_EPISODES = 48  # episodes whose frames are shuffled together
+POOL_FRAMES = 16_000  # most frames of a pool, unless one episode has more: 200 MB at 64x64, 440 MB at 96x96
 VALIDATION_EVERY = 20  # every 20th episode is held out, whole
-LIMITS = ArchiveLimits(512 << 20)  # bytes of an episode: 19,000 pictures of 96x96
+LIMITS = ArchiveLimits(512 << 20)  # bytes of an episode: 19,000 pictures at 96x96
+
+
+def find_world(name: str = WORLD) -> RecordableTask:
+    """Find the task `name`; `UsageError` if it cannot be recorded."""
+    task = find_task(name)
+    if not isinstance(task, RecordableTask):
+        raise UsageError(f"task {name!r} has no drivers and pictures to collect: docs/tasks.md says what it needs")
+    return task
+
+
+def preprocessing_of_size(size: int, world: str = WORLD) -> Preprocessing:
+    """The world's preprocessing with pictures of `size` pixels; `UsageError` if there is none."""
+    known = find_world(world).preprocessings.values()
+    for each in known:
+        if each.size == size:
+            return each
+    raise UsageError(f"pictures are {' or '.join(str(each.size) for each in known)} pixels wide, not {size}")
+
+
+def episode_path(folder: Path, number: int) -> Path:
+    """The path of an episode's file."""
+    return folder / "episodes" / f"{number:06d}.npz"
+
+
+def existing_episodes(folder: Path) -> list[Path]:
+    """The paths of the recorded episodes, by number."""
+    return sorted((folder / "episodes").glob("[0-9]*.npz"))
 
 
 def episode_paths(folder: Path, kind: str = "episodes") -> list[Path]:
-    """The episodes of a data set, `episodes` or `encoded`, by number; `DatasetError` if there are too few."""
+    """The paths of a data set's `episodes` or `encoded` episodes, by number; `DatasetError` for fewer than two."""
     paths = sorted((folder / kind).glob("[0-9]*.npz"))
     if len(paths) < 2:
         verb = "dreamfleet collect" if kind == "episodes" else "dreamfleet encode"
@@ -29,13 +58,13 @@ def episode_paths(folder: Path, kind: str = "episodes") -> list[Path]:
 
 
 def split_held_out(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Episodes to train on and episodes held out."""
+    """Split episodes into those to train on and those held out."""
     held_out = list(paths[::VALIDATION_EVERY])
     return [path for path in paths if path not in set(held_out)], held_out
 
 
 def load_arrays(path: Path, *names: str) -> Arrays:
-    """The named arrays of one episode; `DatasetError` if the file is damaged or lacks one."""
+    """Load the named arrays of an episode; `DatasetError` if the file is damaged or lacks one."""
     try:
         return read_arrays(path, LIMITS, names)
     except (OSError, DamagedArchiveError) as error:
@@ -47,7 +76,7 @@ def _damaged(path: Path, error: Exception) -> DatasetError:
 
 
 def check_whole(paths: Sequence[Path], *names: str) -> None:
-    """`DatasetError` names the first episode that is damaged or lacks an array; reads the archives' directories."""
+    """`DatasetError` names the first episode that is damaged or lacks an array. It reads only archive directories."""
     for path in paths:
         try:
             with open_regular(path, LIMITS.size) as file, open_archive(file, LIMITS) as archive:
@@ -61,23 +90,23 @@ def check_whole(paths: Sequence[Path], *names: str) -> None:
 
 
 def check_pictures(paths: Sequence[Path], size: int) -> None:
-    """`DatasetError` names the first episode whose pictures are of another preprocessing than that to `size`."""
+    """`DatasetError` names the first episode with pictures of another preprocessing than that for `size`."""
     wanted = preprocessing_of_size(size).name
     for path in paths:
         if (found := preprocessing_of(path)) != wanted:
             raise DatasetError(
-                f"{path} holds pictures {found!r}, and {wanted!r} are asked for: a data set and its VAE have one kind; "
+                f"{path} holds pictures {found!r}, and {wanted!r} are wanted: a data set and its VAE have one kind; "
                 "choose another --data, or --picture"
             )
 
 
 def preprocessing_of(path: Path) -> str:
-    """The name of the preprocessing that made an episode's pictures."""
+    """The name of the preprocessing of an episode's pictures."""
     return str(load_arrays(path, "preprocessing")["preprocessing"])
 
 
 def load_pictures(path: Path) -> NDArray[np.uint8]:
-    """An episode's pictures `(T, side, side, 3)`; `DatasetError` if they are not what its preprocessing makes."""
+    """Load an episode's pictures `(T, side, side, 3)`; `DatasetError` if they do not match its preprocessing."""
     arrays = load_arrays(path, "picture", "preprocessing")
     pictures: NDArray[np.uint8] = arrays["picture"]
     known = find_world().preprocessings.get(str(arrays["preprocessing"]))
@@ -88,9 +117,9 @@ def load_pictures(path: Path) -> NDArray[np.uint8]:
 
 
 def load_steps(path: Path, *latents: str) -> Arrays:
-    """`action` (T, actions), `reward` (T,), `ended` and these `latents` (T, n) of an episode; all floats are float32.
+    """Load `action` (T, actions), `reward` (T,), `ended` and the named `latents` (T, n) of an episode, as float32.
 
-    `DatasetError` if they are not of one drive: other types, other lengths, or none.
+    `DatasetError` if their types or lengths are wrong, or they are empty.
     """
     arrays = load_arrays(path, "action", "reward", "ended", *latents)
     ended, steps = arrays["ended"], len(arrays["reward"]) if arrays["reward"].ndim else 0
@@ -106,9 +135,9 @@ def load_steps(path: Path, *latents: str) -> Arrays:
 def picture_batches(
     paths: Sequence[Path], batch: int, seed: int, first_pool: int = 0, taken: int = 0
 ) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
-    """Endless shuffled batches `(batch, side, side, 3)`, each with its pool and how many of that are taken with it.
+    """Yield shuffled batches `(batch, side, side, 3)` without end, each with its pool and its number in the pool.
 
-    A pure function of its arguments: begin behind a batch with the numbers that came with it.
+    A pure function of its arguments: pass a batch's two numbers to resume after it.
     """
     pool = first_pool
     while True:
@@ -134,7 +163,7 @@ def _load_pool(paths: Sequence[Path]) -> NDArray[np.uint8]:
 
 
 def pad(sequences: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Sequences `(T_i, ...)` of unequal length as one `(N, max T, ...)`, zero where one has ended."""
+    """Stack sequences `(T_i, ...)` of unequal length to `(N, max T, ...)`, padded with zeros."""
     longest = max(len(sequence) for sequence in sequences)
     padded = np.zeros((len(sequences), longest, *sequences[0].shape[1:]), dtype=np.float32)
     for row, sequence in zip(padded, sequences, strict=True):

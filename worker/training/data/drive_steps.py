@@ -1,7 +1,4 @@
-"""Moments of recorded drives: losses of the road, and which a bundle keeps for dreams to begin at.
-
-Pure: rewards and chance in, steps out.
-"""
+"""Steps of recorded drives, found from their rewards: losses of the road, and beginnings of dreams for a bundle."""
 
 from __future__ import annotations
 
@@ -13,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
-FIRST_START = (
-    20  # steps of a drive at which no dream begins: the memory of next to nothing is what first pictures come with
-)
-LOSS_STEPS = 40  # steps without a positive reward that make a loss
-EARLIEST, LATEST = 60, 5  # steps before a loss between which its moment lies
+FIRST_START = 20  # first step of a drive at which a dream may begin; before it the recurrent state is almost empty
+LOSS_STEPS = 40  # steps without a positive reward that count as a loss of the road
+EARLIEST, LATEST = 60, 5  # bounds of the steps before a loss at which a dream may begin
 
 
 class DriveStep(NamedTuple):
-    """A step of a drive, before it acted; drives are numbered as they were given."""
+    """A step of a drive, before its action; drives are numbered in their given order."""
 
     drive: int
     step: int
@@ -29,21 +24,21 @@ class DriveStep(NamedTuple):
 
 @dataclass(frozen=True)
 class SampledSteps:
-    """Those that were drawn: shortly before a loss of the road, one a loss, and anywhere."""
+    """Sampled steps: shortly before losses of the road, one per loss, and anywhere."""
 
     before_losses: tuple[DriveStep, ...]
     anywhere: tuple[DriveStep, ...]
 
     @property
     def all(self) -> tuple[DriveStep, ...]:
-        """Each once, drive by drive."""
+        """All steps in order, drive by drive."""
         return tuple(sorted(self.before_losses + self.anywhere))
 
 
 def find_road_losses(rewards: Floats) -> list[int]:
-    """Steps at which a drive of rewards `(T,)` lost the road, as they alone tell it.
+    """The steps at which a drive lost the road, by its rewards `(T,)` alone.
 
-    From such a step on none is positive for `LOSS_STEPS` steps at least, and the one before it is.
+    A loss begins after a positive reward if none of the next `LOSS_STEPS` rewards, or more, is positive.
     """
     paid = np.flatnonzero(rewards > 0)
     unpaid = np.diff(paid, append=len(rewards)) - 1
@@ -51,7 +46,7 @@ def find_road_losses(rewards: Floats) -> list[int]:
 
 
 def on_road_mask(reward: Floats) -> NDArray[np.bool_]:
-    """The steps of a drive `(T,)` that another reward follows before the road counts as lost."""
+    """Which steps of a drive `(T,)` have a positive reward within the next `LOSS_STEPS` steps: it is on the road."""
     steps = np.arange(len(reward))
     paid = np.where(reward > 0, steps, 2 * len(reward) + LOSS_STEPS)
     following = np.minimum.accumulate(paid[::-1])[::-1]
@@ -59,9 +54,9 @@ def on_road_mask(reward: Floats) -> NDArray[np.bool_]:
 
 
 def sample_steps(drives: Sequence[Floats], count: int, random: np.random.Generator) -> SampledSteps:
-    """So many moments of drives by their rewards `(T,)`, half of them before losses, as far as there are any.
+    """Sample `count` steps of drives with rewards `(T,)`, up to half of them before losses.
 
-    The rest is drawn anywhere behind the first steps; fewer where all drives together have fewer.
+    The others are uniform over all steps from `FIRST_START` on. There are fewer than `count` if the drives are short.
     """
     lost = [DriveStep(drive, step) for drive, rewards in enumerate(drives) for step in find_road_losses(rewards)]
     lost = [each for each in lost if each.step - LATEST >= FIRST_START]
@@ -76,7 +71,7 @@ def _shortly_before(step: int, random: np.random.Generator) -> int:
 
 
 def _anywhere(drives: Sequence[Floats], count: int, random: np.random.Generator) -> list[DriveStep]:
-    """So many different moments, or all that there are; each step of each drive is as likely."""
+    """Sample `count` different steps uniformly over all drives, or take all if there are fewer."""
     lengths = np.array([max(len(rewards) - FIRST_START, 0) for rewards in drives])
     ends = np.cumsum(lengths)
     places = random.choice(ends[-1], size=min(count, int(ends[-1])), replace=False)

@@ -12,19 +12,19 @@ from dreamfleet.worker.scoring.action_bursts import ActionBursts
 from dreamfleet.worker.scoring.actors import ControllerActor
 from dreamfleet.worker.scoring.disturbance import Disturbance
 from dreamfleet.worker.scoring.disturbed_policy import DisturbedPolicy
-from dreamfleet.worker.training.data.world import WORLD, find_world
+from dreamfleet.worker.training.data.dataset import WORLD, find_world
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 
 @dataclass(frozen=True)
 class Pilot:
-    """A controller and the world model that it was evolved with."""
+    """A controller with the world model that it was evolved with."""
 
     controller: Controller
     bundle: Bundle
 
     def check(self, preprocessing: str) -> None:
-        """`ControllerError` unless it drives the world of data sets, and sees the pictures of this preprocessing."""
+        """`ControllerError` unless its task is the data sets' world and its pictures have this preprocessing."""
         manifest = self.bundle.manifest
         if self.controller.bundle != self.bundle.sha256:
             raise ControllerError(
@@ -37,7 +37,7 @@ class Pilot:
             )
 
     def policy(self, noise: float, bursts: float, seed: int) -> DisturbedPolicy:
-        """It at the wheel of one drive, under a noise and spells that follow from the seed."""
+        """The policy of one drive, with noise and bursts of tried actions by the seed."""
         actions = find_world().world.actions
         if not isinstance(actions, Continuous):
             raise ControllerError(f"{WORLD} has no continuous actions: its drives cannot be disturbed")

@@ -1,4 +1,4 @@
-"""Encoded rollouts as batches of an MDN-RNN."""
+"""Encoded rollouts as batches of an MDN-RNN, their labels, and the MDN-RNN's states along them."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from dreamfleet.worker.training.data.dataset import load_steps, pad
-from dreamfleet.worker.worldmodel.mdnrnn import reward_labels
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, reward_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
 FLIP = np.array([-1, 1, 1], dtype=np.float32)  # a mirrored drive steers the other way
-CHUNK_STEPS = 10_000  # that go through a model at once: about 300 MB
+CHUNK_STEPS = 10_000  # steps per chunk: about 300 MB in a model
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,18 @@ class Rollouts:
     mask: Tensor
 
     def chunks(self) -> Iterator[Rollouts]:
-        """The same rollouts, few at a time."""
+        """Yield the same rollouts in smaller batches."""
         rows = max(1, CHUNK_STEPS // self.mask.shape[1])
         for start in range(0, len(self.mask), rows):
             yield Rollouts(*(getattr(self, each.name)[start : start + rows] for each in fields(self)))
 
     def to(self, device: torch.device | None) -> Rollouts:
-        """On a device."""
+        """Copy to a device."""
         return Rollouts(*(getattr(self, each.name).to(device) for each in fields(self)))
 
 
 def load_rollouts(paths: Sequence[Path], mirrored: NDArray[np.bool_] | None = None) -> Rollouts:
-    """The rollouts of these episodes, some of them mirrored."""
+    """Load the rollouts of these episodes, mirrored where `mirrored` `(N,)` is true."""
     columns: dict[str, list[NDArray[np.float32]]] = {each.name: [] for each in fields(Rollouts)}
     for path, flip in zip(paths, np.zeros(len(paths), np.bool_) if mirrored is None else mirrored, strict=True):
         prefix = "mirrored_" if flip else ""
@@ -60,9 +60,9 @@ def load_rollouts(paths: Sequence[Path], mirrored: NDArray[np.bool_] | None = No
 
 
 def done_labels(config: MDNRNNConfig, rollouts: Rollouts) -> Tensor:
-    """What the done head shall tell `(N, T)`: 1 where an episode ended, and where `lost` steps without reward follow.
+    """The done head's targets `(N, T)`: 1 where an episode ended, or at least `lost` steps without reward follow.
 
-    A drive that was given up without a reward for so long is lost from its last reward to its end.
+    A drive that ends more than `lost` steps after its last reward counts as lost from that reward on.
     """
     if not config.lost:
         return rollouts.done
@@ -79,12 +79,35 @@ def done_labels(config: MDNRNNConfig, rollouts: Rollouts) -> Tensor:
 
 
 def model_inputs(config: MDNRNNConfig, latents: Tensor, rollouts: Rollouts) -> Tensor:
-    """`(N, T, inputs)`: latents, actions, and where the model takes it the reward head's label of the step before.
+    """The model's inputs `(N, T, inputs)`: latents, actions, and for some models the reward label of the step before.
 
-    The first step has `first_reward` instead.
+    At the first step that label is `first_reward`.
     """
     parts = [latents, rollouts.action]
     if config.previous_reward:
         labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
         parts.append(functional.pad(labels, (1, 0), value=config.first_reward)[:, :-1, None])
     return torch.cat(parts, dim=-1)
+
+
+def teacher_force(model: MDNRNN, rollouts: Rollouts) -> tuple[Tensor, list[Tensor]]:
+    """Run the model on recorded inputs: LSTM outputs `(N, T, hidden)`, and the state `(N, state)` before each step."""
+    config = model.config
+    labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
+    state = rollouts.mu.new_zeros(len(rollouts.mu), config.state)
+    states, hidden = [], []
+    for step in range(rollouts.mu.shape[1]):
+        if config.previous_reward:
+            first = torch.full_like(labels[:, 0], config.first_reward)
+            state = with_reward_label(model, state, labels[:, step - 1] if step else first)
+        states.append(state)
+        last, state = model.advance(torch.cat([rollouts.mu[:, step], rollouts.action[:, step]], dim=1), state)
+        hidden.append(last)
+    return torch.stack(hidden, dim=1), states
+
+
+def with_reward_label(model: MDNRNN, state: Tensor, label: Tensor) -> Tensor:
+    """Copy a state `(N, state)` with the reward label `(N,)` of the step before, for models that take it as input."""
+    state = state.clone()
+    state[:, 2 * model.config.hidden] = label
+    return state

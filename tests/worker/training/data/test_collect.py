@@ -1,3 +1,8 @@
+"""Collecting rollouts: driven here, or imported from a run; a full disk and damaged rollouts name their files."""
+
+import errno
+import os
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -8,10 +13,12 @@ from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
 from dreamfleet.worker.car_racing.random_network import RandomNetworkPolicy
-from dreamfleet.worker.training.data.collect import collect, drive_episode, episode_path
+from dreamfleet.worker.training.data import collect as module
+from dreamfleet.worker.training.data.collect import collect, drive_episode, import_rollouts
 from dreamfleet.worker.training.data.collect_config import CollectConfig
-from dreamfleet.worker.training.data.dataset import load_pictures
+from dreamfleet.worker.training.data.dataset import episode_path, episode_paths, load_pictures
 from dreamfleet.worker.training.data.pilot import Pilot
+from tests.support.drives import write_drive, write_drives
 
 # SWIG warns as Box2D is imported, and an error there kills the process.
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
@@ -178,3 +185,46 @@ def test_a_controller_of_another_model_or_other_pictures_drives_for_no_data_set(
     with pytest.raises(ControllerError, match=r"sees 'box-64' .* holds 'raw-96' .*: choose another --picture"):
         list(collect(tmp_path, replace(TINY, picture=96), 1, (pilot,)))
     assert not (tmp_path / "episodes").exists()
+
+
+def test_a_drive_that_a_full_disk_cannot_hold_is_named(monkeypatch, tmp_path):
+    @contextmanager
+    def full(path):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        yield path
+
+    monkeypatch.setattr(module, "atomic_write", full)
+    monkeypatch.setattr(module, "drive_episode", lambda *_: {"action": ()})
+    with pytest.raises(DatasetError, match=r"cannot write .*000003\.npz: No space left on device"):
+        module._collect_one((tmp_path, None, 3, ()))
+
+
+def test_drives_take_the_next_free_numbers_each_once(tmp_path):
+    data, run = tmp_path / "data", tmp_path / "run"
+    write_drive(data, 0)
+    write_drive(data, 7, steps=10)
+    rollouts = [write_drive(run, number, steps=5 + number) for number in (3, 4)]
+    assert list(import_rollouts(data, rollouts)) == [8, 9]
+    assert [path.name for path in episode_paths(data)] == ["000000.npz", "000007.npz", "000008.npz", "000009.npz"]
+    assert episode_path(data, 9).read_bytes() == rollouts[1].read_bytes()
+    assert list(import_rollouts(data, rollouts)) == []
+    later = write_drive(run, 5)
+    assert list(import_rollouts(data, [*rollouts, later, later])) == [12]
+
+
+def test_an_empty_folder_begins_at_zero(tmp_path):
+    assert list(import_rollouts(tmp_path / "data", write_drives(tmp_path / "run", 2))) == [12, 11]
+    assert [path.name for path in episode_paths(tmp_path / "data")] == ["000000.npz", "000001.npz"]
+
+
+def test_what_a_worker_sent_is_looked_at_first(tmp_path):
+    drive = write_drive(tmp_path / "run", 0)
+    short = {**np.load(drive), "reward": np.zeros(3, np.float32)}
+    for content in (b"no drive", None):
+        if content is None:
+            np.savez_compressed(drive, **short)
+        else:
+            drive.write_bytes(content)
+        with pytest.raises(DatasetError, match=str(drive)):
+            list(import_rollouts(tmp_path / "data", [drive]))
+        assert not (tmp_path / "data").exists()

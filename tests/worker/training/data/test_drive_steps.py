@@ -29,14 +29,14 @@ def drawn(drives, count, seed=0):
         (drive(100, *range(50), 90), [50]),
         (drive(100, *range(50), 89), []),
         (drive(100, *range(60)), [60]),
-        (drive(100, *range(61)), []),  # too short to tell
+        (drive(100, *range(61)), []),  # too short to know
         (drive(200, *range(0, 200, 40)), []),
         (drive(200, *range(0, 60, 20), 150), [41, 151]),
         (drive(100), []),  # it never found the road
         (drive(10, 1), []),
     ],
 )
-def test_a_loss_is_told_by_rewards_alone(rewards, lost):
+def test_a_loss_is_found_by_rewards_alone(rewards, lost):
     assert find_road_losses(rewards) == lost
     for step in lost:
         assert rewards[step - 1] > 0

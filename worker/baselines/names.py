@@ -1,3 +1,0 @@
-"""The baselines by name."""
-
-RANDOM, DISCRETE, DRQN = NAMES = ("random", "random-discrete", "drqn")
