@@ -49,7 +49,7 @@ class PictureAgent(ABC):
     def make_policies(self) -> Callable[[int], Policy]:
         """It at the wheel in the episode of a seed."""
 
-    def make_judge(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The unmodified environment of gymnasium, observing what it sees."""
         return make_reference_environment(find_preprocessing(self.preprocessing), render_mode)
 

@@ -53,10 +53,10 @@ class DreamBatch:
         latent, state, made = noise.first.latent, world.begin(len(rows), noise.first.memory), 0
         for step in range(self._horizon):
             moment = world.step_controllers(latent, parameters, state, noise.next(rows))
-            if self._observer is not None and self._observer.due():
+            if self._observer is not None and self._observer.is_due():
                 first = int(rows[0])
                 seen = StepSnapshot(step, float(fitness[first]), moment.action[0], None, latent[0], state[0])
-                self._observer.see(start + first, lambda seen=seen: seen)  # type: ignore[misc]
+                self._observer.observe(start + first, lambda seen=seen: seen)  # type: ignore[misc]
             fitness[rows] += moment.reward
             steps[rows] += 1
             made += len(rows)

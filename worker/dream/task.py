@@ -10,14 +10,14 @@ from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.tasks.api import Assignment, Policy, Task, World
 from dreamfleet.worker.tasks.registry import find_task
 
-WIDTH = 256  # rows of a batch: larger ones are no faster
+BATCH_SIZE = 256  # rows of a batch: larger ones are no faster
 
 
 class DreamTask(Task):
     """The task `dream`, of any bundle that dreams: whatever is real is the bundle's own world's."""
 
     name = "dream"
-    width: ClassVar[int] = WIDTH
+    batch_size: ClassVar[int] = BATCH_SIZE
 
     def world_of(self, assignment: Assignment) -> World:
         """The bundle's own world."""
@@ -27,9 +27,11 @@ class DreamTask(Task):
         """Reality, as it is scored in: evaluations are driven, not dreamt."""
         return self.reality(assignment).make_environment(assignment)
 
-    def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    def make_evaluation_environment(
+        self, assignment: Assignment, render_mode: str | None = None
+    ) -> gymnasium.Env[Any, Any]:
         """Reality, as reported scores come from it."""
-        return self.reality(assignment).make_judge(assignment, render_mode)
+        return self.reality(assignment).make_evaluation_environment(assignment, render_mode)
 
     def make_policy(self, assignment: Assignment) -> Policy:
         """What drives in reality."""

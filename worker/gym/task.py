@@ -54,18 +54,20 @@ class GymTask(Task):
         """The environment, made with what the run froze of its arguments."""
         return self._make(assignment.spec.option("environment", {}))
 
-    def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    def make_evaluation_environment(
+        self, assignment: Assignment, render_mode: str | None = None
+    ) -> gymnasium.Env[Any, Any]:
         """The same environment."""
         arguments = dict(assignment.spec.option("environment", {}))
         return self._make(arguments if render_mode is None else {**arguments, "render_mode": render_mode})
 
-    def make_shown(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:
+    def make_watched_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:
         """Of gymnasium's own environments, whose `render` changes nothing that is scored; others' might."""
         plain = self.make_environment(assignment)
         plain.close()
         own = type(plain.unwrapped).__module__.startswith(tuple(ENGINES))
         drawn = own and RGB in plain.metadata.get("render_modes", ())
-        return _RenderOnDemand(self.make_judge(assignment, RGB)) if drawn else None
+        return _RenderOnDemand(self.make_evaluation_environment(assignment, RGB)) if drawn else None
 
     def make_policy(self, assignment: Assignment) -> Policy:
         """A controller on the flat observation, normalised as it was when the run began."""

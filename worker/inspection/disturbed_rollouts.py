@@ -17,8 +17,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.worker.inspection.encoded_rollout import ZOOM
 from dreamfleet.worker.scoring.actors import Actor
-from dreamfleet.worker.scoring.disturbance import Disturbance
-from dreamfleet.worker.scoring.disturbed_policy import DisturbedPolicy
+from dreamfleet.worker.scoring.disturbance import Disturbance, DisturbedPolicy
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
 from dreamfleet.worker.tasks.api import Assignment, RecordableTask, Task, TaskWithTrueState
 from dreamfleet.worker.tasks.registry import find_task

@@ -38,7 +38,9 @@ class ChildProcess:
         pin_thread_pools()
         context = get_context("spawn")
         self._steps: Any = context.Value("Q", 0, lock=False)
-        self._abandoned: Any = context.Array("Q", 2, lock=False)  # numbers of the groups to abandon: an even and an odd one
+        self._abandoned: Any = context.Array(
+            "Q", 2, lock=False
+        )  # numbers of the groups to abandon: an even and an odd one
         self._is_watched: Any = context.Value("B", 0, lock=False)
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(

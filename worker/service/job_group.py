@@ -107,9 +107,9 @@ def _results(
     if len(scores) != len(work):
         raise ValueError(f"the task gave {len(scores)} scores of {len(work)} episodes")
     if not all(math.isfinite(score.fitness) for score in scores):
-        raise ValueError("the task gave a fitness that is no number")
+        raise ValueError("the task gave a fitness that is not a finite number")
     if not all(0 <= int(score.steps) < 2**63 for score in scores):
-        raise ValueError("the task gave a number of steps that is none")
+        raise ValueError("the task gave a number of steps that is not from 0 to 2**63 - 1")
     sha256 = None if upload is None else hashlib.sha256(upload).digest()
     return tuple(_result(job, score, spent, sha256, horizon) for (job, _), score in zip(work, scores, strict=True))
 

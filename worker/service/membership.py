@@ -47,7 +47,7 @@ class Membership:
         self._stop_requests += 1
 
     def join(self, nonce: str, beat: float, now: float) -> None:
-        """Record that a run welcomed this worker; `nonce` names its coordinator's life, `beat` the heartbeat interval."""
+        """Record that a run welcomed this worker: its coordinator's life `nonce`, and the heartbeat interval `beat`."""
         self._beat = beat
         self._coordinators: set[str] = set()  # nonces of the coordinators in sight
         self._run_has_ended = False

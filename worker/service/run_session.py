@@ -248,12 +248,12 @@ class RunSession:
             self._next_heartbeat_at = now + self._admission.intervals.beat
             self._send_heartbeat(now, capacity=0 if self._membership.draining else self._slots.capacity)
         for results in self._outbox.due(now):
-            self._sender.results(self._slots, results)
+            self._sender.send_results(self._slots, results)
         for part in self._uploads.due(now):
-            self._sender.upload(part)
+            self._sender.send_part(part)
 
     def _send_heartbeat(self, now: float, capacity: int) -> None:
-        self._sender.beat(
+        self._sender.send_heartbeat(
             self._slots,
             numbering=self._backlog.numbering,
             seen=self._backlog.seen,

@@ -51,7 +51,7 @@ class CoordinatorSender:
         self._identity = identity
         self._admission = admission
 
-    def results(self, slots: SlotPool, results: tuple[Result, ...]) -> None:
+    def send_results(self, slots: SlotPool, results: tuple[Result, ...]) -> None:
         """Send results in one message."""
         batch = ResultBatch(
             run_uid=self._admission.run_uid,
@@ -62,20 +62,20 @@ class CoordinatorSender:
         )
         self._publish(keys.result(self._admission.run, self._identity), batch)
 
-    def upload(self, piece: FilePart) -> None:
+    def send_part(self, part: FilePart) -> None:
         """Send one part of a job's rollout file."""
-        part = UploadPart(
+        message = UploadPart(
             run_uid=self._admission.run_uid,
             incarnation=self._admission.incarnation,
-            digest=piece.digest,
-            sha256=piece.sha256,
-            offset=piece.offset,
-            total=piece.total,
-            data=piece.data,
+            digest=part.digest,
+            sha256=part.sha256,
+            offset=part.offset,
+            total=part.total,
+            data=part.data,
         )
-        self._publish(keys.upload(self._admission.run, self._identity), part)
+        self._publish(keys.upload(self._admission.run, self._identity), message)
 
-    def beat(
+    def send_heartbeat(
         self, slots: SlotPool, *, numbering: int, seen: int, capacity: int, queued: Sequence[bytes],
         unacked: Sequence[bytes], rate: float,
     ) -> None:  # fmt: skip

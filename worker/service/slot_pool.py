@@ -37,7 +37,7 @@ class SlotPool:
         """`RefusedError` for a task that is not in `allowed_tasks`; `memory_limit` is in bytes a slot, 0 means none."""
         check_task_allowed(spec.task, allowed_tasks)
         self._task = spec.task
-        self._width = find_task(spec.task).width
+        self._batch_size = find_task(spec.task).batch_size
         self._failures = FailureLog()
         self.host_class = ""  # reported by the first child that is ready
         self._watched = False
@@ -69,7 +69,7 @@ class SlotPool:
 
         R14: heartbeats report it, and it bounds how many jobs the coordinator gives this worker.
         """
-        return min(sum(slot.ready for slot in self._slots) * self._width, MAX_LEASES // 2)
+        return min(sum(slot.ready for slot in self._slots) * self._batch_size, MAX_LEASES // 2)
 
     @property
     def steps(self) -> int:
@@ -100,11 +100,11 @@ class SlotPool:
 
         R26: nothing starts while too many results, `undelivered`, wait for a verdict, so the outbox stays bounded.
         """
-        room = 4 * len(self._slots) * self._width - undelivered
+        room = 4 * len(self._slots) * self._batch_size - undelivered
         idle = [slot for slot in self._slots if slot.idle and room >= 0]
         ahead = [slot for slot in self._slots if slot.can_queue_another and room > 0]
         for slot in idle + ahead:
-            if work := backlog.take(self._width):
+            if work := backlog.take(self._batch_size):
                 slot.submit(work)
         if self._watched and self._shown_slot is not None and not self._shown_slot.running:
             self._switch_shown_slot()

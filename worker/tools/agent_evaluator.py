@@ -18,7 +18,7 @@ class AgentEvaluator:
 
     def __init__(self, agent: Agent) -> None:
         self._world, self._parameters = agent.world, agent.parameters
-        self._environment, self._policies = agent.make_judge(), agent.make_policies()
+        self._environment, self._policies = agent.make_evaluation_environment(), agent.make_policies()
         self._truth = agent.truth
 
     def drive(self, seed: int) -> EpisodeResult:

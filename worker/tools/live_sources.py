@@ -43,7 +43,7 @@ def driven_frames(
     """
     for track in count(seed):
         agent, facts = driver()
-        environment = agent.make_judge("rgb_array")
+        environment = agent.make_evaluation_environment("rgb_array")
         try:
             yield from _episode(agent, facts, environment, replace(dreaming, seed=track), rate)
         finally:

@@ -40,7 +40,7 @@ def make_environment(
     controller: Controller | TrainedAgent, bundle: Bundle | None = None, render_mode: str | None = None
 ) -> gymnasium.Env[Any, Any]:
     """The environment that a controller is judged in, observing what its policy takes."""
-    return _agent(controller, bundle).make_judge(render_mode)
+    return _agent(controller, bundle).make_evaluation_environment(render_mode)
 
 
 def make_policy(controller: Controller | TrainedAgent, bundle: Bundle | None = None) -> Policy:

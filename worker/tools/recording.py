@@ -23,7 +23,7 @@ def record(
     Of an agent with a world model it shows what that sees and decodes beside the drive, and dreams if it can. If `stop`
     asks for it, the video ends early, with a step at least.
     """
-    environment = agent.make_judge("rgb_array")
+    environment = agent.make_evaluation_environment("rgb_array")
     policy: Any = agent.make_policies()(seed)
     policy.begin(agent.parameters)
     config, bundle = dreaming or ParallelDreamConfig(seed=seed), agent.bundle
