@@ -21,6 +21,7 @@ from dreamfleet.worker.scoring.disturbance import Disturbance, DisturbedPolicy
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
 from dreamfleet.worker.tasks.api import Assignment, RecordableTask, Task, TaskWithTrueState
 from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.worldmodel.observation import join_features
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 Floats = NDArray[np.float32]
@@ -71,7 +72,7 @@ class DisturbedDrive:
     @property
     def features(self) -> Floats:
         """[z, h] of each step `(T, latent + hidden)`: what a controller sees."""
-        return np.concatenate([self.latent, self.state[:, : self.hidden]], axis=1)
+        return join_features(self.latent, self.state, self.hidden)
 
 
 @dataclass

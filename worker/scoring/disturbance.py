@@ -64,7 +64,7 @@ class ActionBursts:
         self._left = np.zeros(actions.actions, np.int64)
 
     def apply(self, chosen: Floats, done: Floats) -> Floats:
-        """The next actions `(1, actions)`: those `done`, or a burst in their place; `chosen` are the undisturbed ones."""
+        """The next actions `(1, actions)`: those `done`, or bursts in their place; `chosen` are before any noise."""
         random, count = self._random, len(self._value)
         begins, lengths = random.random(count), random.integers(SHORTEST, LONGEST, count, endpoint=True)
         values = random.uniform(self._low, self._high).astype(np.float32)

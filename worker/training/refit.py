@@ -31,6 +31,7 @@ from dreamfleet.worker.training.data.dataset import (
 )
 from dreamfleet.worker.training.data.drive_steps import on_road_mask
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, RewardLabel
+from dreamfleet.worker.worldmodel.observation import join_features
 
 RIDGE = 0.01  # against the mean square of a feature, which is below 1 for h and about 1 for what z tells
 TANH_BOUND = 2.5  # tanh has 0.987 there: how much further a value lies makes no action
@@ -79,7 +80,7 @@ class FeatureExtractor:
         action, reward = pad([drive.action for drive in drives]), pad([drive.reward for drive in drives])
         state, seen = self._memory.zero_state(len(drives)), []
         for step in range(latent.shape[1]):
-            seen.append(np.concatenate([latent[:, step], state[:, : self._hidden]], axis=1))
+            seen.append(join_features(latent[:, step], state, self._hidden))
             state = self._memory.advance(latent[:, step], action[:, step], state)
             self._label.write(state, reward[:, step].astype(np.float64))
         return np.stack(seen, axis=1)
