@@ -8,7 +8,7 @@ from dreamfleet.common.cli.health import Finding
 
 
 def examine() -> Iterator[Finding]:
-    """Whether the native picture was built and equals the installed gymnasium's."""
+    """Check that the native renderer was built and draws the same pictures as the installed gymnasium."""
     remedy = "install a C compiler, then pip install --force-reinstall --no-deps dreamfleet; gymnasium draws until then"
     try:
         from dreamfleet.worker.car_racing.environment import is_native_available

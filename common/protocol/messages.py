@@ -204,7 +204,7 @@ class Heartbeat(Message):
     nonce: Word
     numbering: Count
     seen: Annotated[int, Between(0, MAX_BATCHES)]  # every batch of this numbering up to this number has arrived
-    capacity: Annotated[int, Between(0, MAX_LEASES)]  # slots x the task's width
+    capacity: Annotated[int, Between(0, MAX_LEASES)]  # slots x the task's batch size
     slots: Annotated[int, Between(0, MAX_SLOTS)]
     queued: Annotated[tuple[Tag, ...], Length(0, MAX_LEASES)]
     running: Annotated[tuple[RunningJob, ...], Length(0, MAX_LEASES)]

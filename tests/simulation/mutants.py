@@ -29,8 +29,7 @@ from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.worker.service.backlog import Backlog, PartialVector
 from dreamfleet.worker.service.membership import Membership
-from dreamfleet.worker.service.outbox import Outbox
-from dreamfleet.worker.service.upload_queue import UploadQueue
+from dreamfleet.worker.service.outbox import Outbox, UploadQueue
 from tests.simulation.schedule import Schedule, draw
 from tests.simulation.world import Outcome, play
 

@@ -29,8 +29,7 @@ from dreamfleet.common.protocol.messages import (
 )
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.membership import LeaveConditions, Membership, WorkerLoad
-from dreamfleet.worker.service.outbox import Outbox
-from dreamfleet.worker.service.upload_queue import BURST_INTERVAL, UploadQueue
+from dreamfleet.worker.service.outbox import BURST_INTERVAL, Outbox, UploadQueue
 from tests.simulation.coordinator import BEAT, REPEAT
 from tests.simulation.schedule import Shape
 from tests.simulation.truth import STEPS, TASK, fitness_of, rollout_of

@@ -185,7 +185,7 @@ class Judged(Toy):
 
     name = JUDGED
 
-    def make_judge(self, assignment):
+    def make_evaluation_environment(self, assignment):
         return gymnasium.wrappers.TransformReward(self.make_environment(assignment), lambda reward: reward + 100)
 
 
@@ -207,7 +207,7 @@ class Wide(Counted):
     """A slot scores 256 together."""
 
     name = f"{MODULE}:Wide"
-    width = 256
+    batch_size = 256
     seconds = 0.0
 
     def make_batch(self, assignment):
@@ -294,7 +294,7 @@ class Optimistic(Toy):
     """Its dream rewards actions without bound, the less the warmer; in reality they soon are too large."""
 
     name = OPTIMISTIC
-    width = 4
+    batch_size = 4
 
     def make_batch(self, assignment):
         return OptimisticBatch(assignment.spec.temperature)

@@ -73,7 +73,7 @@ def _cases(bundle: Bundle) -> tuple[dict[str, Callable[[RecordedDrive], float]],
     notes = []
     if find_spec("torch"):
         cases["torch_fitness_step"] = lambda recorded_drive: seconds_a_step(
-            task.make_judge(assignment), recorded_drive, make_torch_controller(bundle)
+            task.make_evaluation_environment(assignment), recorded_drive, make_torch_controller(bundle)
         )
     else:
         notes.append("ratio_fitness_step needs torch: pip install 'dreamfleet[train]'")

@@ -48,7 +48,7 @@ class PictureAgent(ABC):
     def make_policies(self) -> Callable[[int], Policy]:
         """Return a function from an episode's seed to a policy."""
 
-    def make_judge(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """Gymnasium's unmodified environment, observing this agent's pictures."""
         return make_reference_environment(find_preprocessing(self.preprocessing), render_mode)
 

@@ -33,7 +33,7 @@ WORLD = World(
     frames_per_second=50,
     action_names=("steer", "gas", "brake"),
     dream_reward=DreamReward(gain=3.5, cost=0.1),  # a tile gives 1000 / N, of a track's N tiles: 3.5 on average
-    stray="off_road",  # `OffRoadInfo` says so
+    off_course="off_road",  # `OffRoadInfo` says so
     threshold=gymnasium.spec(ENVIRONMENT).reward_threshold,
     finish="lap_finished",  # gymnasium says so as an episode ends; one that runs out of time says nothing
 )
@@ -59,7 +59,7 @@ class CarRacingTask(Task):
         variant = assignment.world_model.variant
         return replace(
             WORLD, actions=variant.controls, version=variant.version, time_cost=variant.time_cost,
-            stray_cost=variant.offroad_cost,
+            off_course_cost=variant.offroad_cost,
         )  # fmt: skip
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
@@ -70,7 +70,9 @@ class CarRacingTask(Task):
         """The same, in the preprocessing of this name."""
         return make_car_racing(preprocessing=preprocessing)
 
-    def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    def make_evaluation_environment(
+        self, assignment: Assignment, render_mode: str | None = None
+    ) -> gymnasium.Env[Any, Any]:
         """Gymnasium's unmodified environment in the bundle's preprocessing, computed by NumPy."""
         return _with_off_road_info(
             make_reference_environment(self.preprocessing(assignment.world_model), render_mode), assignment
@@ -135,7 +137,7 @@ class OffRoadInfo(gymnasium.Wrapper[Any, Any, Any, Any]):
         """The environment's step with `off_road` added to `info`."""
         *given, info = self.env.step(action)
         inner: Any = self.env.unwrapped
-        info[WORLD.stray] = not all(wheel.tiles for wheel in inner.car.wheels)
+        info[WORLD.off_course] = not all(wheel.tiles for wheel in inner.car.wheels)
         return (*given, info)
 
 

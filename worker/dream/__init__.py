@@ -1,4 +1,4 @@
-"""CarRacing as the MDN-RNN dreams it: a place to evolve in, and environments for whoever wants to look.
+"""CarRacing as the MDN-RNN predicts it: a task to evolve controllers in, and gymnasium environments.
 
 Importing this registers `dreamfleet/CarRacingDream-v0`, also for `gymnasium.make_vec`.
 

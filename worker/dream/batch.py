@@ -1,4 +1,4 @@
-"""Scoring many candidates in the dream at once; a fitness is the same bits alone, in any batch, in any order."""
+"""Scoring many candidates in the dream at once; a fitness has the same bits alone, in any batch and in any order."""
 
 from __future__ import annotations
 
@@ -15,27 +15,30 @@ from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.tasks.api import Episode, Score, StepObserver, StepSnapshot, World
 
 DEFAULT_TEMPERATURE = 1.0
-MAX_ROWS = 256  # rows that dream together: larger batches are slower again
+MAX_ROWS = 256  # episodes that are dreamt together: larger batches are slower
 
 
 class DreamBatch:
-    """Dreams batches of episodes to their ends."""
+    """Scores batches of dreamt episodes."""
 
     def __init__(self, bundle: Bundle, spec: TaskSpec, world: World | None = None) -> None:
-        """`world` is the bundle's own; found by its name if it is not given."""
+        """`world` is the bundle's world; by default it is looked up by the name of the bundle's task."""
         self._size = bundle.controller_shape.size
         self._horizon = spec.horizon
         self._observer: StepObserver | None = None
         self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, world, spec.recorded)
 
     def watched(self, observer: StepObserver) -> DreamBatch:
-        """The same, which shows the first of the dreams that still go on."""
+        """A copy that passes steps to `observer`: those of the first episode that has not ended."""
         shown = copy(self)
         shown._observer = observer
         return shown
 
     def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None] = lambda _: None) -> list[Score]:
-        """The summed reward of each dream, in step order, in double precision; `on_step` hears of all steps so far."""
+        """The score of each episode: the sum of its rewards in step order, in double precision.
+
+        `on_step` gets the number of steps so far, over all episodes.
+        """
         scores: list[Score] = []
         for start in range(0, len(episodes), MAX_ROWS):
             before = sum(score.steps for score in scores)
@@ -53,10 +56,10 @@ class DreamBatch:
         latent, state, made = noise.first.latent, world.begin(len(rows), noise.first.memory), 0
         for step in range(self._horizon):
             moment = world.step_controllers(latent, parameters, state, noise.next(rows))
-            if self._observer is not None and self._observer.due():
+            if self._observer is not None and self._observer.is_due():
                 first = int(rows[0])
                 seen = StepSnapshot(step, float(fitness[first]), moment.action[0], None, latent[0], state[0])
-                self._observer.see(start + first, lambda seen=seen: seen)  # type: ignore[misc]
+                self._observer.observe(start + first, lambda seen=seen: seen)  # type: ignore[misc]
             fitness[rows] += moment.reward
             steps[rows] += 1
             made += len(rows)

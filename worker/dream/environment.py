@@ -1,6 +1,6 @@
-"""The dream as gymnasium environments, one and many: they observe latents, and are rendered by the decoder.
+"""The dream as gymnasium environments, single and vectorised. They observe latents; the decoder renders them.
 
-`car_racing.latent` is the reality that observes the same.
+The environment of `car_racing.latent` has the same observations in reality.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dreamfleet.common.artifacts.actions import Actions, Discrete
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.worker.dream.noise import EpisodeNoise, stack_draws
 from dreamfleet.worker.dream.world import DreamWorld
-from dreamfleet.worker.worldmodel.inference import Decoder
+from dreamfleet.worker.worldmodel.inference import Controllers, Decoder, DreamStep
 from dreamfleet.worker.worldmodel.observation import Observation, open_bundle
 
 Floats = NDArray[np.float32]
@@ -26,19 +26,18 @@ FRAMES_PER_SECOND = 50  # CarRacing's
 
 
 def action_space(actions: Actions) -> Any:
-    """What the dreamt world's actions may be; CarRacing's: steering, gas, brake."""
+    """The gymnasium space of a world's actions."""
     if isinstance(actions, Discrete):
         return spaces.Discrete(actions.outputs, start=actions.first)
     return spaces.Box(np.array(actions.low, np.float32), np.array(actions.high, np.float32))
 
 
 class CarRacingDream(gymnasium.Env[Floats, Floats]):
-    """One dream: observes the latent `(latent,)`, takes CarRacing's actions `(3,)`.
+    """One dream. It observes the latent `(latent,)` and takes CarRacing's actions `(3,)`.
 
-    With `features` `zh` the MDN-RNN's hidden state stands behind the latent, `(latent + hidden,)`.
-
-    An episode is a pure function of its seed and actions. It ends where the model's done head says so, and is
-    truncated after `horizon` steps. `recorded` is the share of dreams that begin where recorded drives were.
+    With `features="zh"` the MDN-RNN's hidden state follows the latent, `(latent + hidden,)`. An episode is a pure
+    function of its seed and actions. It terminates when the model's done head predicts it, and is truncated after
+    `horizon` steps. `recorded` is the share of episodes that start at recorded states.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012 - gymnasium's name
@@ -57,7 +56,7 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         self.action_space = action_space(self._world.world.actions)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Begin a dream; without a seed, one after the last. Of `info`: the `memory` that the model has there."""
+        """Start an episode; without a seed the next random one. `info["memory"]` is the model's memory at the start."""
         super().reset(seed=seed, options=options)
         dream = int(self.np_random.integers(2**31)) if seed is None else seed
         self._noise = EpisodeNoise(dream, self._world.chance)
@@ -68,7 +67,7 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         return self._observe(), {"memory": begun.memory.copy()}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Dream one step under `action` `(3,)`."""
+        """Dream one step with `action` `(3,)`."""
         given = np.asarray(action, dtype=np.float32).reshape(1, 3)
         if not np.isfinite(given).all():
             raise ValueError("an action must be three finite numbers")
@@ -79,7 +78,7 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         return self._observe(), float(moment.reward[0]), bool(moment.done[0]), truncated, {}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The picture `(side, side, 3)` that the decoder makes of the latent."""
+        """The decoded latent, a picture `(side, side, 3)`."""
         return None if self._decoder is None else self._decoder.decode(self._latent)[0]
 
     def _observe(self) -> Floats:
@@ -88,9 +87,9 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
 
 
 class CarRacingDreamVector(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
-    """Many dreams in one batch; one that has ended begins anew at the next step, as gymnasium's vector environments do.
+    """Many dreams in one batch. A finished one restarts at the next step, as in gymnasium's vector environments.
 
-    Dream i of `reset(seed=s)` is the single environment's of seed `s + i`.
+    After `reset(seed=s)` dream `i` is the single environment's of seed `s + i`.
     """
 
     metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - gymnasium's name
@@ -114,7 +113,7 @@ class CarRacingDreamVector(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin every dream; `seed` is the first one's, or a list of all. Of `info`: each one's `memory`."""
+        """Start all dreams; `seed` is the first one's, or a list of all. `info["memory"]` `(num_envs, memory)`."""
         super().reset(seed=seed if isinstance(seed, int) else None, options=options)
         seeds: list[int | None] = list(seed) if isinstance(seed, (list, tuple)) else [None] * self.num_envs
         if isinstance(seed, int):
@@ -132,7 +131,7 @@ class CarRacingDreamVector(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
     def step(
         self, actions: Floats
     ) -> tuple[Floats, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Dream one step under `actions` `(num_envs, 3)`."""
+        """Dream one step with `actions` `(num_envs, 3)`."""
         draw = stack_draws([noise.next() for noise in self._noise], axis=0).map(np.concatenate)
         given = np.asarray(actions, dtype=np.float32)
         moment = self._world.imagine(self._latent, given, self._state, draw)
@@ -147,14 +146,14 @@ class CarRacingDreamVector(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         return self._observe(), reward, done, truncated, self._start_info(begun) if begun.any() else {}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Each dream's picture `(side, side, 3)`."""
+        """The decoded latents, one picture `(side, side, 3)` a dream."""
         return None if self._decoder is None else tuple(self._decoder.decode(self._latent))
 
     def _observe(self) -> Floats:
         return self._observation.observe(self._latent, self._state)
 
     def _start_info(self, begun: Flags) -> dict[str, Any]:
-        """What `info` says of dreams that have just begun, as gymnasium's vector environments say it."""
+        """The `info` of dreams that have just started, in the form of gymnasium's vector environments."""
         return {"memory": self._memory.copy(), "_memory": begun}
 
     def _reset_one(self, index: int, seed: int | None) -> None:
@@ -163,3 +162,30 @@ class CarRacingDreamVector(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self._latent[index], self._memory[index] = self._noise[index].begin(self._world.start_states)
         self._state[index] = self._world.begin(1, self._memory[index])
         self._steps[index] = 0
+
+
+class DreamPolicy:
+    """A controller in a dream environment: it observes latents, and its memory advances as the dream's does."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._controllers, self._step = Controllers(bundle), DreamStep(bundle)
+        self._state = self._step.zero_state(1)
+        self._parameters = np.zeros((1, self._step.shape.size), dtype=np.float32)
+
+    def begin(self, parameters: Floats) -> None:
+        """Start an episode with a controller's flat parameter vector `(size,)`."""
+        self._step.shape.check(parameters)
+        self._parameters = parameters.astype(np.float32).reshape(1, -1)
+        self._state = self._step.zero_state(1)
+
+    def set_memory(self, memory: Floats) -> None:
+        """Start with the model's memory `(memory,)`; an environment's `reset` returns it in `info`."""
+        self._state[:, : self._step.memory_size] = memory
+
+    def act(self, observation: Floats) -> Floats:
+        """The action `(actions,)` for a latent `(latent,)`."""
+        latent = observation[None]
+        action = self._controllers.act(self._parameters, latent, self._state)
+        self._state = self._step.advance(latent, action, self._state)
+        chosen: Floats = action[0]
+        return chosen

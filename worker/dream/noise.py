@@ -1,4 +1,4 @@
-"""What chance adds to a dream: a pure function of the episode's seed, the same for every candidate."""
+"""The random numbers of a dream: a pure function of the episode's seed, the same for every candidate."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from dreamfleet.worker.dream.start_states import StartStates
 from dreamfleet.worker.worldmodel.inference import NoiseSize
 
 Floats = NDArray[np.float32]
-BLOCK_STEPS = 64  # steps drawn at once: a horizon of any length costs no more memory
+BLOCK_STEPS = 64  # steps drawn at once, so that memory does not grow with the horizon
 
 
 @dataclass(frozen=True)
 class Draw:
-    """Noise `(rows, latent)` of a step, or of several: which mixture is chosen, and where in it.
+    """Random numbers of one step, or of several, each `(rows, latent)`.
 
-    `mask` `(rows, hidden)` is the dropout of models that were trained with it: 0 or 1 / (1 - rate).
+    `uniform` chooses the mixture component, `normal` the value within it. `mask` `(rows, hidden)` is the dropout of
+    models that were trained with it: 0 or 1 / (1 - rate).
     """
 
     uniform: Floats
@@ -28,12 +29,12 @@ class Draw:
     mask: Floats | None = None
 
     def map(self, change: Callable[[Floats], Floats]) -> Draw:
-        """Every part of it, changed."""
+        """A draw with `change` applied to each array."""
         return Draw(change(self.uniform), change(self.normal), None if self.mask is None else change(self.mask))
 
 
 def stack_draws(draws: Sequence[Draw], axis: int) -> Draw:
-    """Draws of as many dreamers, joined along a new axis."""
+    """Join draws along a new axis."""
 
     def join(*parts: Floats) -> Floats:
         return np.stack(parts, axis=axis)
@@ -44,14 +45,14 @@ def stack_draws(draws: Sequence[Draw], axis: int) -> Draw:
 
 
 class DreamStart(NamedTuple):
-    """A dream's first latent, and what the model remembers there: `(latent,)` and `(memory,)`, or a row a dream."""
+    """A dream's first latent `(latent,)` and the model's memory `(memory,)` there; or one row a dream."""
 
     latent: Floats
     memory: Floats
 
 
 class EpisodeNoise:
-    """The noise of one episode, step after step, and its beginning."""
+    """The random numbers of one episode: its start, and then each step."""
 
     def __init__(self, seed: int, chance: NoiseSize) -> None:
         self._random = np.random.Generator(np.random.PCG64(seed))
@@ -60,14 +61,14 @@ class EpisodeNoise:
         self._left = 0
 
     def begin(self, start_states: StartStates) -> DreamStart:
-        """Where the dream begins; to be called first. Wherever that is, the noise of its steps is the same."""
+        """Where the dream starts; call it first. The noise of the steps does not depend on the start."""
         first = int(self._random.integers(len(start_states.initial)))
         mu, logvar, memory = start_states.choose(self._seed, first)
         normal = self._random.standard_normal(self._chance.latent, dtype=np.float32)
         return DreamStart(mu + np.exp(0.5 * logvar) * normal, memory)
 
     def draw_block(self) -> Draw:
-        """The noise of the next `BLOCK_STEPS` steps, a row each."""
+        """The draw of the next `BLOCK_STEPS` steps, one row each."""
         latent, hidden, rate = self._chance
         uniform = self._random.random((BLOCK_STEPS, latent), dtype=np.float32)
         normal = self._random.standard_normal((BLOCK_STEPS, latent), dtype=np.float32)
@@ -77,7 +78,7 @@ class EpisodeNoise:
         return Draw(uniform, normal, kept.astype(np.float32) / np.float32(1 - rate))
 
     def next(self) -> Draw:
-        """The next step's noise, one row."""
+        """The draw of the next step, one row."""
         if self._left == 0:
             self._block, self._left = self.draw_block(), BLOCK_STEPS
         step = BLOCK_STEPS - self._left
@@ -86,10 +87,10 @@ class EpisodeNoise:
 
 
 class SharedNoise:
-    """The noise of rows that dream few episodes between them: drawn once an episode, given to each of its rows."""
+    """The random numbers of many rows with few different seeds: drawn once a seed, and shared by its rows."""
 
     def __init__(self, seeds: NDArray[np.int64], chance: NoiseSize, start_states: StartStates) -> None:
-        """`seeds` `(rows,)`: one a row."""
+        """`seeds` `(rows,)`, one for each row."""
         unique, self._episode = np.unique(seeds, return_inverse=True)
         self._sources = [EpisodeNoise(int(seed), chance) for seed in unique]
         begun = zip(*(source.begin(start_states) for source in self._sources), strict=True)
@@ -97,7 +98,7 @@ class SharedNoise:
         self._left = 0
 
     def next(self, rows: NDArray[np.int64]) -> Draw:
-        """The next step's noise of the rows that still dream."""
+        """The draw of the next step for the rows with these indices."""
         if self._left == 0:
             self._blocks = stack_draws([source.draw_block() for source in self._sources], axis=1)
             self._left = BLOCK_STEPS

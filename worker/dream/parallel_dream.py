@@ -1,4 +1,4 @@
-"""The dream beside a drive: the same controller inside the model, which begins at the drive's own latent."""
+"""Dreams that start from a real drive: the same controller, continued inside the world model."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class ParallelDreamConfig:
-    """How it dreams, and after how many steps it looks at the drive again."""
+    """Settings of a `ParallelDream`."""
 
     temperature: float = 1.0
-    every: int = 100  # two seconds: by then a dream has left the track that is driven
+    every: int = 100  # steps until it restarts from the drive: after two seconds a dream has left the real track
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -29,7 +29,7 @@ class ParallelDreamConfig:
 
 
 class ParallelDream:
-    """One controller's dream, step by step beside its drive; needs no reward head."""
+    """One controller's dream beside its drive, step by step. The model needs no reward head."""
 
     def __init__(self, bundle: Bundle, parameters: Floats, config: ParallelDreamConfig) -> None:
         self._step = DreamStep(bundle)
@@ -37,12 +37,12 @@ class ParallelDream:
         self._parameters = parameters.astype(np.float32).reshape(1, -1)
         self._config = config
         self._over = True
-        self.since = 0  # the step of the drive at which this dream began
+        self.since = 0  # the step of the drive at which this dream started
 
     def follow(self, step: int, latent: Floats, state: Floats) -> Floats:
-        """The latent `(1, latent)` dreamt for this step of the drive; the drive's own where a dream begins.
+        """The dreamt latent `(1, latent)` for a step of the drive; where a dream starts, the drive's own.
 
-        `latent` and `state` are the drive's at this step, before it acts.
+        `latent` `(1, latent)` and `state` `(1, state)` are the drive's at this step, before it acts.
         """
         if self._over or step - self.since >= self._config.every:
             self._latent, self._state, self.since = latent, state, step
@@ -56,7 +56,7 @@ class ParallelDream:
 
 
 class DreamContinuation:
-    """The dream that goes on from any moment of any controller's drive."""
+    """Dreams that continue any controller's drive from any moment."""
 
     def __init__(self, bundle: Bundle, temperature: float) -> None:
         check_temperature(temperature)
@@ -64,14 +64,14 @@ class DreamContinuation:
         self._temperature = temperature
 
     def fits(self, latent: Floats, state: Floats, parameters: Floats) -> bool:
-        """Whether these `(size,)` are of this world model and its controllers."""
+        """Whether these flat arrays have the sizes of this world model and its controllers."""
         sizes = self._step.latent_size, self._step.state_size, self._step.shape.size
         return (len(latent), len(state), len(parameters)) == sizes
 
     def dream(self, latent: Floats, state: Floats, parameters: Floats, seed: int) -> Iterator[Floats]:
-        """The latent `(1, latent)` after each step from there, until the model says that it is over.
+        """Yield the latent `(1, latent)` after each further step, until the model predicts the end.
 
-        All three `(size,)`; `state` is what was remembered before the action at `latent`.
+        All three arrays are flat; `state` is the model's before the action at `latent`.
         """
         noise = EpisodeNoise(seed, self._step.chance)
         latent, state, parameters = latent[None], state[None], parameters[None]
@@ -87,5 +87,5 @@ class DreamContinuation:
 
 
 def can_dream(bundle: Bundle) -> bool:
-    """Whether the bundle has a step of the dream; those from before it do not."""
+    """Whether the bundle has the graph of a dream step; bundles of early versions do not."""
     return DREAM_GRAPH in bundle.manifest.parts

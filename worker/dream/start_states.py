@@ -1,4 +1,4 @@
-"""Where dreams begin: at first pictures with an empty memory, or at recorded states, with what a drive remembered."""
+"""Where dreams start: at first pictures with an empty memory, or at recorded states with the memory of a drive."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from dreamfleet.common.artifacts.onnx_checks import read_float_array
 from dreamfleet.common.errors import BundleError, UsageError
 
 Floats = NDArray[np.float32]
-START_SPAWN_KEY = (1,)  # the spawn key of what chooses a beginning: it takes nothing from a dream's other chance
+START_SPAWN_KEY = (1,)  # gives the choice of a start its own random numbers, apart from those of the dream's steps
 
 
 class StartState(NamedTuple):
-    """One of them: `mu`, `logvar` `(latent,)`, and the model's recurrent state `memory` `(memory,)`."""
+    """A start: `mu` and `logvar` `(latent,)` of the latent, and the model's recurrent state `memory` `(memory,)`."""
 
     mu: Floats
     logvar: Floats
@@ -26,11 +26,10 @@ class StartState(NamedTuple):
 
 @dataclass(frozen=True)
 class StartStates:
-    """All that a bundle has, and the share of dreams that begins at recorded states.
+    """All start states of a bundle, and the share of dreams that start at recorded states.
 
-    `initial` `(N, 2, latent)` are the mu and logvar of first pictures, `recorded` `(M, 2 * latent + memory)` those of
-    recorded moments, with what the model remembered there. `empty` `(memory,)` is what it remembers before it has seen
-    anything; zeros unless it is given.
+    `initial` `(N, 2, latent)` holds mu and logvar of first pictures. `recorded` `(M, 2 * latent + memory)` holds mu,
+    logvar and memory at recorded moments. `empty` `(memory,)` is the memory before anything is seen; by default zeros.
     """
 
     initial: Floats
@@ -40,9 +39,9 @@ class StartStates:
 
     @classmethod
     def of(cls, bundle: Bundle, share: float, empty: Floats) -> StartStates:
-        """A bundle's own, by its model's `empty` memory; `UsageError` for a share that is none.
+        """The start states of a bundle whose model has this `empty` memory; `UsageError` for a share not in [0, 1].
 
-        `BundleError` where recorded states are asked for and there are none, or they are of another model.
+        `BundleError` if the share needs recorded states and there are none, or they belong to another model.
         """
         check_recorded_share(share)
         initial, width = read_float_array(bundle.read(INITIAL_LATENTS_PART)), 2 * bundle.manifest.latent + len(empty)
@@ -57,9 +56,9 @@ class StartStates:
         return cls(initial, recorded, share, empty)
 
     def choose(self, seed: int, first: int) -> StartState:
-        """Where the dream of this seed begins: at a recorded state, or else at the `first` of the first pictures.
+        """The start of the dream with this seed: a recorded state, or else the first picture number `first`.
 
-        A seed that begins at a recorded state does so at every larger share, at the same one.
+        A seed that starts at a recorded state starts at the same one for every larger share.
         """
         if self.share:
             random = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=START_SPAWN_KEY)))
@@ -78,4 +77,4 @@ class StartStates:
 def check_recorded_share(share: float) -> None:
     """`UsageError` unless it is from 0 to 1."""
     if not 0 <= share <= 1:
-        raise UsageError(f"the share of dreams that begins at recorded states must be from 0 to 1, not {share}")
+        raise UsageError(f"the share of dreams that start at recorded states must be from 0 to 1, not {share}")

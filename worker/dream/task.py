@@ -1,4 +1,4 @@
-"""The dream as a task: candidates are scored in it, many at once; what is reported is driven in reality."""
+"""The dream as a task: candidates are scored in it, many at once; reported scores come from reality."""
 
 from __future__ import annotations
 
@@ -10,36 +10,38 @@ from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.tasks.api import Assignment, Policy, Task, World
 from dreamfleet.worker.tasks.registry import find_task
 
-WIDTH = 256  # rows of a batch: larger ones are no faster
+BATCH_SIZE = 256  # larger batches are no faster
 
 
 class DreamTask(Task):
-    """The task `dream`, of any bundle that dreams: whatever is real is the bundle's own world's."""
+    """The task `dream` for any bundle that can dream. Everything real comes from the task of the bundle's world."""
 
     name = "dream"
-    width: ClassVar[int] = WIDTH
+    batch_size: ClassVar[int] = BATCH_SIZE
 
     def world_of(self, assignment: Assignment) -> World:
-        """The bundle's own world."""
+        """The world of the bundle's task."""
         return self.reality(assignment).world_of(assignment)
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
-        """Reality, as it is scored in: evaluations are driven, not dreamt."""
+        """The real environment: evaluations are driven, not dreamt."""
         return self.reality(assignment).make_environment(assignment)
 
-    def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
-        """Reality, as reported scores come from it."""
-        return self.reality(assignment).make_judge(assignment, render_mode)
+    def make_evaluation_environment(
+        self, assignment: Assignment, render_mode: str | None = None
+    ) -> gymnasium.Env[Any, Any]:
+        """The real environment that reported scores come from."""
+        return self.reality(assignment).make_evaluation_environment(assignment, render_mode)
 
     def make_policy(self, assignment: Assignment) -> Policy:
-        """What drives in reality."""
+        """The policy that drives in reality."""
         return self.reality(assignment).make_policy(assignment)
 
     def make_batch(self, assignment: Assignment) -> DreamBatch:
-        """What scores candidates."""
-        self.make_policy(assignment)  # refuses a bundle that does not fit its world
+        """The batch that dreams."""
+        self.make_policy(assignment)  # raises `BundleError` if the bundle does not fit its world
         return DreamBatch(assignment.world_model, assignment.spec, self.world_of(assignment))
 
     def reality(self, assignment: Assignment) -> Task:
-        """The task of the world that the bundle was trained on; `UsageError` where no package registers it."""
+        """The task that the bundle was trained on; `UsageError` if no package registers it."""
         return find_task(assignment.world_model.manifest.task)

@@ -1,4 +1,4 @@
-"""A bundle's dream: where it begins, how it goes on, what a step is worth."""
+"""A bundle's dream: its start, its steps, and their rewards."""
 
 from __future__ import annotations
 
@@ -20,22 +20,25 @@ Floats = NDArray[np.float32]
 
 
 class DreamtStep(NamedTuple):
-    """What one dreamed step gives, a row a dreamer."""
+    """The result of a dreamt step, one row a dream; `action` is the one that led here."""
 
     latent: Floats
     state: Floats
     reward: NDArray[np.float64]
     done: NDArray[np.bool_]
-    action: Floats  # that led here
+    action: Floats
 
 
 class DreamWorld:
-    """The frozen MDN-RNN as a world, at one temperature (Ha & Schmidhuber 2018, section 4)."""
+    """The frozen MDN-RNN as a world, at one temperature (Ha and Schmidhuber 2018, section 4)."""
 
     def __init__(
         self, bundle: Bundle, temperature: float, world: World | None = None, recorded: float = 0.0
     ) -> None:  # fmt: skip
-        """`world` is the bundle's own; found by its name if it is not given. `recorded` is a share of `StartStates`."""
+        """`world` is the bundle's; by default it is looked up. `recorded` is the share of `StartStates`.
+
+        `BundleError` if the bundle cannot dream, or if the rewards of its dream are unknown.
+        """
         check_temperature(temperature)
         if DREAM_GRAPH not in bundle.manifest.parts:
             raise BundleError(f"{bundle.path.name} is from before dreams: build it again with `dreamfleet bundle`")
@@ -56,9 +59,9 @@ class DreamWorld:
         self.start_states = StartStates.of(bundle, recorded, self._step.zero_state(1)[0, : self.memory_size])
 
     def begin(self, rows: int, memory: Floats | None = None) -> Floats:
-        """The state `(rows, state)` before a first step: empty, or the model's part is `memory` `(rows, memory)`.
+        """The state `(rows, state)` before the first step, with the model's memory empty or `memory` `(rows, memory)`.
 
-        What a controller keeps of its own choices begins anew either way.
+        The controllers' memory of their own choices is empty either way.
         """
         state = self._step.zero_state(rows)
         if memory is not None:
@@ -66,40 +69,37 @@ class DreamWorld:
         return state
 
     def step_controllers(self, latent: Floats, parameters: Floats, state: Floats, draw: Draw) -> DreamtStep:
-        """Controllers `parameters` `(rows, size)` act on `latent` `(rows, latent)` and `state`; the dream goes on."""
+        """One step in which controllers `parameters` `(rows, size)` act on `latent` `(rows, latent)` and `state`."""
         step = self._step.step
         return self._make_step(step(latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask))
 
     def imagine(
         self, latent: Floats, action: Floats, state: Floats, draw: Draw, chosen: Floats | None = None
     ) -> DreamtStep:
-        """The dream goes on under given actions `(rows, actions)`; `chosen` is a controller's where another is done."""
+        """One step under given actions `(rows, actions)`; `chosen` are the controllers' own, if those differ."""
         step = self._step.imagine
         return self._make_step(
             step(latent, action, state, draw.uniform, draw.normal, self._temperature, draw.mask, chosen)
         )
 
     def _make_step(self, dream: DreamOutput) -> DreamtStep:
-        told = dream.reward.astype(np.float64)
-        reward = (
-            told
-            if self._dream_reward is None or self._reward_kind == "value"
-            else self._value(told, self._dream_reward, dream)
-        )
+        reward = dream.reward.astype(np.float64)
+        if self._dream_reward is not None and self._reward_kind != "value":
+            reward = self._label_reward(reward, self._dream_reward, dream)
         return DreamtStep(dream.latent, dream.state, reward, dream.done > 0.5, dream.action)
 
-    def _value(self, told: NDArray[np.float64], worth: DreamReward, dream: DreamOutput) -> NDArray[np.float64]:
-        if worth.source == "survival":
+    def _label_reward(
+        self, predicted: NDArray[np.float64], terms: DreamReward, dream: DreamOutput
+    ) -> NDArray[np.float64]:
+        if terms.source == "survival":
             label = (dream.done <= 0.5).astype(np.float64)
-        else:
-            label = (
-                told if self._reward_kind == "positive" else 1 - told
-            )  # the notebook's head tells of steps without one
-        return np.asarray(worth.gain * label - worth.cost)
+        else:  # the notebook's head predicts steps without a reward
+            label = predicted if self._reward_kind == "positive" else 1 - predicted
+        return np.asarray(terms.gain * label - terms.cost)
 
 
 def world_of(bundle: Bundle) -> World:
-    """The world that a bundle was trained on."""
+    """The world of the task that a bundle was trained on."""
     return find_task(bundle.manifest.task).world_of(Assignment.of(bundle.manifest.task, bundle))
 
 

@@ -1,4 +1,4 @@
-"""The window: a picture, how it goes, and what a person wants."""
+"""The window of a person who drives: it shows the picture and the score, and reads the keys."""
 
 from __future__ import annotations
 
@@ -10,22 +10,26 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal
 
+import numpy as np
 import pygame
+from numpy.typing import NDArray
 
 from dreamfleet.common.errors import NoDisplayError
-from dreamfleet.worker.driving.pedals import Pedals
 
 FRAMES_PER_SECOND = 50  # CarRacing's
-BAR_HEIGHT, MIN_WIDTH = 64, 640  # pixels: what the text needs
+BAR_HEIGHT, MIN_WIDTH = 64, 640  # pixels that the text needs
 BACKGROUND, INK, FAINT = (18, 20, 24), (235, 235, 235), (150, 155, 165)
-INVISIBLE = ("offscreen", "dummy")  # what SDL falls back to without a screen
+INVISIBLE = ("offscreen", "dummy")  # SDL's drivers without a screen
 QUIT_KEYS = (pygame.K_ESCAPE, pygame.K_q)
+LEFT, RIGHT = (pygame.K_LEFT, pygame.K_a), (pygame.K_RIGHT, pygame.K_d)
+GAS, BRAKE = (pygame.K_UP, pygame.K_w), (pygame.K_DOWN, pygame.K_s)
+BRAKE_STRENGTH = 0.8  # as gymnasium's own keyboard control: at 1 the wheels lock
 WindowCommand = Literal["again", "quit"]
 
 
 @dataclass(frozen=True)
 class DriveStatus:
-    """What stands under the picture."""
+    """The numbers below the picture."""
 
     score: float
     step: int
@@ -33,11 +37,32 @@ class DriveStatus:
     over: bool
 
 
+class Pedals:
+    """Steering, gas and brake by the arrow keys or WASD."""
+
+    def __init__(self) -> None:
+        self._held: set[int] = set()
+
+    def handle_event(self, event: pygame.event.Event) -> None:
+        """Note keys that go down or up. When the window loses focus all keys count as up: later events are not seen."""
+        if event.type == pygame.KEYDOWN:
+            self._held.add(event.key)
+        elif event.type == pygame.KEYUP:
+            self._held.discard(event.key)
+        elif event.type == pygame.WINDOWFOCUSLOST:
+            self._held.clear()
+
+    def action(self) -> NDArray[np.float32]:
+        """The action `(3,)`: steering in [-1, 1], gas and brake in [0, 1]. Left and right together steer straight."""
+        left, right, gas, brake = (not self._held.isdisjoint(keys) for keys in (LEFT, RIGHT, GAS, BRAKE))
+        return np.array([int(right) - int(left), gas, BRAKE_STRENGTH * brake], dtype=np.float32)
+
+
 class DriveWindow:
-    """Shows pictures of one size, 50 a second at most; use it in a `with`."""
+    """Shows pictures of one size, at most 50 a second; use it in a `with`."""
 
     def __init__(self, name: str, picture: tuple[int, int], scale: float) -> None:
-        """`picture` is its width and height before `scale`; `NoDisplayError` where no window can be opened."""
+        """`picture` is the width and height before `scale`; `NoDisplayError` if no window can be opened."""
         self._size = max(1, round(picture[0] * scale)), max(1, round(picture[1] * scale))
         width = max(self._size[0], MIN_WIDTH)
         self._left = (width - self._size[0]) // 2
@@ -58,7 +83,7 @@ class DriveWindow:
         pygame.display.quit()
 
     def read_commands(self) -> Iterator[WindowCommand]:
-        """What was asked for since the last call; pedals hear of every key."""
+        """The commands since the last call; all key events also go to `pedals`."""
         for event in pygame.event.get():
             self.pedals.handle_event(event)
             if event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key in QUIT_KEYS):
@@ -67,7 +92,7 @@ class DriveWindow:
                 yield "again"
 
     def show(self, picture: pygame.Surface, status: DriveStatus) -> None:
-        """Draw, and wait until the frame's time is over."""
+        """Draw, and wait until the next frame is due."""
         self._screen.fill(BACKGROUND)
         fitting = picture if picture.get_size() == self._size else pygame.transform.scale(picture, self._size)
         self._screen.blit(fitting, (self._left, 0))
@@ -89,9 +114,9 @@ class DriveWindow:
 
 
 def open_display(size: tuple[int, int], remedy: str) -> pygame.Surface:
-    """The window's surface; one that nobody sees is none, unless `$SDL_VIDEODRIVER` asks for it.
+    """Open a window and return its surface; an invisible one only if `$SDL_VIDEODRIVER` requests it.
 
-    `NoDisplayError` with the `remedy` where no window can be opened.
+    `NoDisplayError` with the `remedy` if no window can be opened.
     """
     try:
         with _plain_display():
@@ -107,10 +132,10 @@ def open_display(size: tuple[int, int], remedy: str) -> pygame.Surface:
 
 @contextmanager
 def _plain_display() -> Iterator[None]:
-    """Open a display that a person sees and that is drawn without OpenGL, where the environment does not say otherwise.
+    """Make SDL use a visible display without OpenGL, unless environment variables say otherwise.
 
-    Left alone, SDL falls back to a driver that nobody sees, and draws through OpenGL: both load Mesa and its LLVM into
-    the process, where torch's triton, loaded later, crashes on it.
+    By default SDL may fall back to an invisible driver and draws through OpenGL. Both load Mesa's LLVM into the
+    process, on which torch's triton crashes when it is loaded later.
     """
     wanted = {"SDL_FRAMEBUFFER_ACCELERATION": "0"}
     if sys.platform == "linux":

@@ -1,4 +1,4 @@
-"""Driving by hand: the loop between a scene and its window."""
+"""Driving by hand: the loop that steps an environment with the keys of a window."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dreamfleet.worker.driving.scene import Scene
 
 @dataclass(frozen=True)
 class DrivingConfig:
-    """Where it begins, when it is over, how large it is drawn (`None`: what suits the scene)."""
+    """Seed, most steps of an episode, and scale of the picture (`None`: the scene's own)."""
 
     seed: int
     steps: int = 1000
@@ -29,7 +29,7 @@ class DrivingConfig:
 
 @dataclass(frozen=True)
 class DriveResult:
-    """How an episode went."""
+    """Score and number of steps of an episode."""
 
     score: float
     steps: int
@@ -38,9 +38,9 @@ class DriveResult:
 def drive(
     scene: Scene, config: DrivingConfig, on_frame: Callable[[int], None] = lambda _step: None
 ) -> Iterator[DriveResult]:
-    """Drive until the person quits; yields each episode as it is over or left, and waits to be driven again.
+    """Drive until the person quits; yield each episode when it is over or left.
 
-    `on_frame` hears each frame's step.
+    `on_frame` gets the step of each frame.
     """
     environment = scene.environment
     environment.reset(seed=config.seed)
@@ -67,5 +67,5 @@ def drive(
 
 
 def random_seed() -> int:
-    """A seed of nobody's."""
+    """A random seed."""
     return int(np.random.default_rng().integers(10_000))

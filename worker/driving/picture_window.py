@@ -1,4 +1,4 @@
-"""A window that shows pictures, until the person who looks closes it."""
+"""A window that shows pictures until somebody closes it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from dreamfleet.worker.driving.drive_window import BACKGROUND, FAINT, QUIT_KEYS, open_display
 
-INITIAL_SIZE = 720, 680  # its size until there is a picture
+INITIAL_SIZE = 720, 680  # pixels, until there is a picture
 REMEDY = "write a file by --out live.mp4, look where there is a screen, or through `ssh -X`"
 
 
 class PictureWindow:
-    """Use it in a `with`; `NoDisplayError` where no window can be opened."""
+    """Use it in a `with`; `NoDisplayError` if no window can be opened."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -28,7 +28,7 @@ class PictureWindow:
         pygame.display.quit()
 
     def draw(self, picture: NDArray[np.uint8] | None) -> bool:
-        """Show a picture `(height, width, 3)`, or go on with the last; whether the window is still wanted."""
+        """Show a picture `(height, width, 3)`, or keep the last; return whether the window is still open."""
         for event in pygame.event.get():
             if event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key in QUIT_KEYS):
                 return False

@@ -1,4 +1,4 @@
-"""What is driven in, and its picture for a person."""
+"""The environments that a person drives in, and how they are drawn."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ WIDTH = 640  # pixels of a dream's picture on a screen
 
 
 class Scene(Protocol):
-    """An environment that takes CarRacing's actions, and how it looks."""
+    """An environment that takes CarRacing's actions, with its picture."""
 
     name: str
-    scale: float  # that suits a screen
+    scale: float  # from the picture to a suitable size on a screen
     environment: gymnasium.Env[Any, Any]
 
     def surface(self) -> pygame.Surface:
-        """The picture of now."""
+        """The current picture."""
 
 
 class CarRacingScene:
-    """CarRacing, drawn by gymnasium at the size it shows people: 1000x800."""
+    """CarRacing, drawn by gymnasium at its full size of 1000x800."""
 
     name, scale = "CarRacing", 1.0
 
@@ -36,7 +36,7 @@ class CarRacingScene:
         self.environment = make_car_racing(preprocessing=BOX.name, render_mode="rgb_array", max_episode_steps=steps)
 
     def surface(self) -> pygame.Surface:
-        """Gymnasium's own surface; what it returns is a smaller copy."""
+        """Gymnasium's own surface; `render` returns a smaller copy."""
         self.environment.render()
         inner: Any = self.environment.unwrapped
         drawn: pygame.Surface = inner.surf

@@ -1,7 +1,7 @@
-"""One of gymnasium's environments as a task: a controller on its flat observation, no bundle.
+"""Any gymnasium environment as a task without a world model: the controller acts on the flat observation.
 
-The name is `gym:` and the environment's id, in gymnasium's own form where its package must be imported first:
-`gym:LunarLander-v3`, `gym:my_package:MyWorld-v0`.
+The task's name is `gym:` and the environment's id, for example `gym:LunarLander-v3`, or, with a package that must be
+imported first, `gym:my_package:MyWorld-v0`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Description, Policy, Task, World
 from dreamfleet.worker.tasks.policy import FlatPolicy
 
-RGB = "rgb_array"  # gymnasium's name of the mode in which `render` gives pictures
+RGB = "rgb_array"  # gymnasium's render mode that returns pictures
 OPTIONS = ("environment", "normalise", "seed")
 NORMALISING_EPISODES = 20
-DEFAULT_MAX_STEPS = 10_000  # of an episode where the environment was registered without a limit of its own
-# What gymnasium's own environments compute with; of any other the distribution that its module is from.
+DEFAULT_MAX_STEPS = 10_000  # steps of an episode, if the environment was registered without a limit
+# Packages that gymnasium's own environments compute with. Other environments: the distribution of their module.
 ENGINES = {
     "gymnasium.envs.box2d": ("box2d", "box2d-py"),
     "gymnasium.envs.mujoco": ("mujoco",),
@@ -43,7 +43,7 @@ class GymTask(Task):
         self._id = environment
 
     def world_of(self, assignment: Assignment) -> World:
-        """What the environment's own spaces and registration say; `UsageError` where they cannot be used."""
+        """The world of the environment's spaces and registration; `UsageError` if they cannot be used."""
         environment = self.make_environment(assignment)
         try:
             return _build_world(environment, self._id)
@@ -51,32 +51,34 @@ class GymTask(Task):
             environment.close()
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
-        """The environment, made with what the run froze of its arguments."""
+        """The environment, with the arguments that the run froze."""
         return self._make(assignment.spec.option("environment", {}))
 
-    def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    def make_evaluation_environment(
+        self, assignment: Assignment, render_mode: str | None = None
+    ) -> gymnasium.Env[Any, Any]:
         """The same environment."""
         arguments = dict(assignment.spec.option("environment", {}))
         return self._make(arguments if render_mode is None else {**arguments, "render_mode": render_mode})
 
-    def make_shown(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:
-        """Of gymnasium's own environments, whose `render` changes nothing that is scored; others' might."""
+    def make_watched_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:
+        """The environment with pictures; `None` outside of gymnasium, where `render` might change scores."""
         plain = self.make_environment(assignment)
         plain.close()
         own = type(plain.unwrapped).__module__.startswith(tuple(ENGINES))
         drawn = own and RGB in plain.metadata.get("render_modes", ())
-        return _RenderOnDemand(self.make_judge(assignment, RGB)) if drawn else None
+        return _RenderOnDemand(self.make_evaluation_environment(assignment, RGB)) if drawn else None
 
     def make_policy(self, assignment: Assignment) -> Policy:
-        """A controller on the flat observation, normalised as it was when the run began."""
+        """A controller on the flat observation, normalised with the statistics that the run froze."""
         normal = assignment.spec.option("normal", {"mean": 0.0, "deviation": 1.0})
         return FlatPolicy(assignment.controller, self.world_of(assignment).actions, normal["mean"], normal["deviation"])
 
     def describe(self, options: Mapping[str, Any]) -> Description:
         """Sizes, packages, and the options that a run freezes.
 
-        `environment`: arguments of `gymnasium.make`; `normalise`: observations are shifted and scaled by their mean and
-        deviation in 20 episodes of random actions from `seed` on, which are part of the run from then on.
+        Option `environment`: arguments of `gymnasium.make`. Option `normalise`: shift and scale observations by their
+        mean and standard deviation in 20 episodes of random actions, with seeds from `seed` on.
         """
         if unknown := set(options) - set(OPTIONS):
             raise UsageError(f"task {self.name} knows no option {', '.join(sorted(unknown))}: {', '.join(OPTIONS)}")
@@ -106,15 +108,15 @@ class GymTask(Task):
             ) from error
         except TypeError as error:
             raise UsageError(f"{self._id} takes no such arguments: {error}") from error
-        except (Exception, SystemExit) as error:  # whatever an environment does as it is made
+        except (Exception, SystemExit) as error:  # environments may raise anything
             raise UsageError(f"{self._id} cannot be made: {type(error).__name__}: {error}") from error
 
 
 class _RenderOnDemand(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Steps as an environment that is never drawn, and knows of pictures only while `render` draws one.
+    """Sets the render mode only while `render` draws, so that steps do no work for pictures.
 
-    Where it knows, it may do more in every step: LunarLander makes bodies of its engines' sparks, which only `render`
-    removes, so that with ten pictures a second its steps take many times as long.
+    LunarLander, for example, creates a body for each engine spark if a render mode is set, and only `render` removes
+    them. With ten pictures a second its steps would take many times as long.
     """
 
     def __init__(self, environment: gymnasium.Env[Any, Any]) -> None:
@@ -122,7 +124,7 @@ class _RenderOnDemand(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.unwrapped.render_mode = None
 
     def render(self) -> Any:
-        """The picture, without what only steps that are drawn leave behind."""
+        """Draw the current picture."""
         self.unwrapped.render_mode = RGB
         try:
             return super().render()
@@ -169,7 +171,7 @@ def _convert_action_space(space: Any, name: str) -> Actions:
 def _measure_normalisation(
     environment: gymnasium.Env[Any, Any], seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and deviation `(observations,)` over episodes of random actions; a constant one is left as it is."""
+    """Mean and standard deviation `(observations,)` over episodes of random actions; 1 for a constant observation."""
     environment.action_space.seed(seed)
     seen = []
     for episode in range(NORMALISING_EPISODES):

@@ -17,11 +17,11 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.worker.inspection.encoded_rollout import ZOOM
 from dreamfleet.worker.scoring.actors import Actor
-from dreamfleet.worker.scoring.disturbance import Disturbance
-from dreamfleet.worker.scoring.disturbed_policy import DisturbedPolicy
+from dreamfleet.worker.scoring.disturbance import Disturbance, DisturbedPolicy
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
 from dreamfleet.worker.tasks.api import Assignment, RecordableTask, Task, TaskWithTrueState
 from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.worldmodel.observation import join_features
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 Floats = NDArray[np.float32]
@@ -72,8 +72,8 @@ class DisturbedDrive:
 
     @property
     def features(self) -> Floats:
-        """[z, h] of each step `(T, latent + hidden)`, a controller's inputs."""
-        return np.concatenate([self.latent, self.state[:, : self.hidden]], axis=1)
+        """[z, h] of each step `(T, latent + hidden)`: a controller's inputs."""
+        return join_features(self.latent, self.state, self.hidden)
 
 
 @dataclass

@@ -15,6 +15,7 @@ from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDrive
 from dreamfleet.worker.scoring.disturbance import add_disturbance
 from dreamfleet.worker.worldmodel.inference import Controllers
+from dreamfleet.worker.worldmodel.observation import join_features
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -56,7 +57,7 @@ class DriveDreamer:
         latent, state = (np.repeat(each[segment.step][None], rows, axis=0) for each in (drive.latent, drive.state))
         going = np.ones((rows, 1), dtype=bool)
         for action, push in zip(drive.action[segment.steps], drive.push[segment.steps], strict=True):
-            features.append(np.concatenate([latent, state[:, : self._hidden]], axis=1))
+            features.append(join_features(latent, state, self._hidden))
             chosen = self._controllers.act(self._parameters, latent, state) if own else None
             done = np.repeat(action[None], rows, axis=0) if chosen is None else self._pushed(chosen, push)
             draw = stack_draws([noise.next() for noise in noises], axis=0).map(np.concatenate)
@@ -76,7 +77,7 @@ class DriveDreamer:
         draw = stack_draws(pieces, axis=0).map(lambda part: part.reshape(-1, part.shape[-1])[: len(drive)])
         moment = self._world.imagine(drive.latent, drive.action, drive.state, draw)
         latent = np.concatenate([drive.latent[:1], moment.latent[:-1]])
-        return np.concatenate([latent, drive.state[:, : self._hidden]], axis=1), moment.reward
+        return join_features(latent, drive.state, self._hidden), moment.reward
 
     def _pushed(self, chosen: Floats, push: Floats) -> Floats:
         actions = self._world.world.actions

@@ -1,4 +1,4 @@
-"""Who chooses the actions of a drive: a controller by a world model, or a random driver."""
+"""Actors, which choose the actions of a drive: a controller with its world model, or a random driver."""
 
 from __future__ import annotations
 
@@ -21,54 +21,58 @@ Floats = NDArray[np.float32]
 
 
 class Actor(Protocol):
-    """Chooses; whoever drives by it tells its mind, if it has one, what is seen, done and rewarded."""
+    """Chooses actions. The caller passes observations, actions and rewards to its recurrent state, if it has one."""
 
     @property
-    def mind(self) -> RecurrentState | None:
-        """By which it chooses."""
+    def recurrent_state(self) -> RecurrentState | None:
+        """The state that its choices depend on; `None` if there is none."""
 
     def choose(self, seen: Any, /) -> Floats:
-        """The next action `(1, actions)`; `seen` is what the world shows, which its mind has been told."""
+        """The next action `(1, actions)`; `seen` is the observation, which its recurrent state already has."""
 
 
 class ControllerActor:
-    """A controller, by the mind of the world model that it was evolved in, under its shape and variant."""
+    """A controller, with the recurrent state of the world model that it was evolved in, of its shape and variant."""
 
-    def __init__(self, controller: Controller, bundle: Bundle, mind: RecurrentState) -> None:
+    def __init__(self, controller: Controller, bundle: Bundle, recurrent_state: RecurrentState) -> None:
         self._controllers = Controllers(bundle.for_controller(controller))
         self._parameters = controller.parameters.reshape(1, -1)
-        self.mind = mind
+        self.recurrent_state = recurrent_state
 
     def choose(self, _seen: Any) -> Floats:
-        """What the controller does now."""
-        return self._controllers.act(self._parameters, self.mind.latent, self.mind.state)
+        """The controller's action `(1, actions)` for its recurrent state."""
+        state = self.recurrent_state
+        return self._controllers.act(self._parameters, state.latent, state.state)
 
 
 class DriverActor:
-    """A driver without a mind, of one drive."""
+    """A policy without a recurrent state, for one drive."""
 
-    mind = None
+    recurrent_state = None
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
         policy.begin(np.zeros(0, dtype=np.float32))
 
     def choose(self, seen: Any) -> Floats:
-        """The driver's next action."""
+        """The policy's next action `(1, actions)`."""
         action: Floats = self._policy.act(seen)[None]
         return action
 
 
-def make_controller_actor(controller: Controller, own: Bundle, bundle: Bundle, mind: RecurrentState) -> Actor:
-    """A controller of the world model `own` where `bundle` watches by `mind`; both must see the same pictures."""
+def make_controller_actor(controller: Controller, own: Bundle, bundle: Bundle, watching: RecurrentState) -> Actor:
+    """A controller of the world model `own`, while the world model `bundle` observes the drive by its state `watching`.
+
+    The actor shares `watching` if both are the same world model. `ControllerError` unless both see the same pictures.
+    """
     if own.sha256 == bundle.sha256:
-        return ControllerActor(controller, bundle, mind)
+        return ControllerActor(controller, bundle, watching)
     check_same_pictures(own, bundle)
     return ControllerActor(controller, own, RecurrentState(own.for_controller(controller)))
 
 
 def check_same_pictures(own: Bundle, bundle: Bundle) -> None:
-    """`ControllerError` unless a controller of the world model `own` sees what `bundle` does."""
+    """`ControllerError` unless the world models `own` and `bundle` see the same pictures of the same task."""
     if (own.manifest.task, own.manifest.preprocessing) != (bundle.manifest.task, bundle.manifest.preprocessing):
         raise ControllerError(
             f"the controller sees {own.manifest.preprocessing} of {own.manifest.task}, {bundle.manifest.name} "
@@ -77,9 +81,9 @@ def check_same_pictures(own: Bundle, bundle: Bundle) -> None:
 
 
 def make_driver_actors(bundle: Bundle, name: str) -> Callable[[int], Actor]:
-    """The hand of a seed: the random driver of that name of the bundle's world; `UsageError` lists those there are.
+    """A function from a seed to an actor: the random driver or policy `name` of the bundle's task.
 
-    The names are those that a data set is collected by.
+    The names are those of `dreamfleet collect --driver`; `UsageError` lists them for an unknown one.
     """
     task = find_task(bundle.manifest.task)
     drivers = list(task.drivers.items()) if isinstance(task, RecordableTask) else []

@@ -1,4 +1,4 @@
-"""Who is judged, recorded and watched: a controller with its world model, or what drives without one."""
+"""Agents, which are evaluated, recorded and watched: a controller with its world model, or a trained agent without."""
 
 from __future__ import annotations
 
@@ -21,56 +21,56 @@ from dreamfleet.worker.tasks.registry import find_task
 
 Floats = NDArray[np.float32]
 Policies = Callable[[int], Policy]
-"""The policy of the episode of a seed, which `begin` is still to begin."""
+"""A function from an episode's seed to its policy; the caller calls `begin`."""
 Truth = Callable[[gymnasium.Env[Any, Any]], dict[str, float]]
 
 
 class Agent(Protocol):
-    """Drives whole episodes of one world, whatever it is; it goes to other processes."""
+    """Drives whole episodes in the world that it is evaluated in. It can be pickled for other processes."""
 
     @property
     def sha256(self) -> str:
-        """Of all that its choices follow from, but world model, observation and the episode's seed."""
+        """Hash of everything that its actions depend on, except world model, observation and seed."""
 
     @property
     def task(self) -> str:
-        """That it was evolved or trained in."""
+        """Name of the task that it was evolved or trained in."""
 
     @property
     def bundle(self) -> Bundle | None:
-        """Its world model; `None`: it has none."""
+        """Its world model, if it has one."""
 
     @property
     def parameters(self) -> Floats:
-        """What its policy begins each episode with."""
+        """The parameters `(size,)` for its policy's `begin`."""
 
     @property
     def world(self) -> World:
-        """In which it drives."""
+        """The world of its task."""
 
     @property
     def reality(self) -> str:
-        """Name of the task of the world that it is judged in."""
+        """Name of the task of the world that it is evaluated in; after a dream, another than `task`."""
 
     @property
     def threshold(self) -> float | None:
-        """Mean score at which gymnasium has that world for solved; `None`: it says none."""
+        """Mean score at which gymnasium considers that world solved; `None`: unknown."""
 
-    def make_judge(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The environment that reported scores and videos come from."""
 
     def make_policies(self) -> Policies:
-        """It at the wheel: loaded once, for episodes one after the other."""
+        """Load its policy once, for one episode after another."""
 
     @property
     def truth(self) -> Truth | None:
-        """Tells the true state behind the last observation; `None` in a world that keeps it to itself."""
+        """A function that reads the true state behind the last observation; `None` if the task has none."""
 
 
 def make_agent(controller: Controller | TrainedAgent, bundle: Bundle | None = None) -> Agent:
-    """A controller, with its world model if it has one, or a trained agent, ready to drive.
+    """The agent of a controller, with its world model if it has one, or of a trained agent's file.
 
-    Errors of either kind, where it does not fit what is here, say what to do.
+    `ControllerError`, `BundleError` or `UsageError` if it does not fit the tasks and packages of this host.
     """
     if isinstance(controller, TrainedAgent):
         return NetworkAgent(controller)
@@ -81,7 +81,7 @@ def make_agent(controller: Controller | TrainedAgent, bundle: Bundle | None = No
 
 
 def make_evaluation_spec(controller: Controller, bundle: Bundle | None) -> TaskSpec:
-    """What a controller is judged in: whole episodes of its own task."""
+    """The specification of a controller's evaluation: whole episodes of its task."""
     return TaskSpec(
         controller.task, bundle.sha256 if bundle else "", horizon=ENVIRONMENT_LIMIT, patience=0,
         controller=controller.shape, options=controller.options, version=controller.version,
@@ -90,51 +90,51 @@ def make_evaluation_spec(controller: Controller, bundle: Bundle | None) -> TaskS
 
 @dataclass(frozen=True)
 class EvolvedAgent:
-    """A controller's parameters in what it is judged in."""
+    """The agent of a controller that a run evolved."""
 
     sha256: str
     spec: TaskSpec
     parameters: Floats = field(repr=False)
-    bundle: Bundle | None = None  # under its shape and variant
+    bundle: Bundle | None = None  # of the controller's shape and variant
 
     @property
     def assignment(self) -> Assignment:
-        """What it is judged in, as tasks ask for it."""
+        """What it is evaluated in, in the form that tasks take."""
         return Assignment(self.spec, self.bundle)
 
     @property
     def task(self) -> str:
-        """That it was evolved in."""
+        """Name of the task that it was evolved in."""
         return self.spec.task
 
     @property
     def world(self) -> World:
-        """As its task has it."""
+        """The world of its task."""
         return self._task.world_of(self.assignment)
 
     @property
     def reality(self) -> str:
-        """Of one from a dream another task."""
+        """Name of the task that it is evaluated in."""
         return self._reality.name
 
     @property
     def threshold(self) -> float | None:
-        """Of that world."""
+        """That of the world that it is evaluated in."""
         return self._reality.world_of(self.assignment).threshold
 
-    def make_judge(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
-        """Its task's judge; one that draws nothing need not know of a mode."""
+    def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+        """Its task's evaluation environment; a task without pictures may have no parameter `render_mode`."""
         task, given = self._task, () if render_mode is None else (render_mode,)
-        return task.make_judge(self.assignment, *given)
+        return task.make_evaluation_environment(self.assignment, *given)
 
     def make_policies(self) -> Policies:
-        """Its task's policy, the same in each episode."""
+        """Its task's policy, the same one in each episode."""
         policy = self._task.make_policy(self.assignment)
         return lambda _seed: policy
 
     @property
     def truth(self) -> Truth | None:
-        """As that world tells it."""
+        """That of the task that it is evaluated in."""
         reality = self._reality
         return reality.truth if isinstance(reality, TaskWithTrueState) else None
 

@@ -1,4 +1,4 @@
-"""The one episode loop: whoever scores, judges, records, collects or inspects goes through it."""
+"""The episode loop, which scoring, evaluating, recording, collecting and inspecting share."""
 
 from __future__ import annotations
 
@@ -14,52 +14,52 @@ from numpy.typing import NDArray
 from dreamfleet.worker.scoring.rollout import Rollout
 from dreamfleet.worker.tasks.api import Policy, Score
 
-MAX_STRAYS = 100  # steps off the course that an episode pays for at most: one that is lost is one loss, however long
+MAX_OFF_COURSE_STEPS = 100  # most steps off the course that are charged: a lost course is one loss, however long
 
 
 @dataclass(frozen=True)
 class EpisodeConfig:
-    """One episode: its seed, its steps at most, and when a hopeless one is cut (`patience` 0: never)."""
+    """Seed, limits and costs of an episode. The costs and keys are those of the same names in `World`."""
 
     seed: int
-    horizon: int
-    patience: int = 0
-    idle_cost: float = 0.0  # the world's: charged for each step that is cut off
-    time_cost: float = 0.0  # charged for each step until the course is finished, or the horizon
-    finish: str = ""  # the world's
-    stray_cost: float = 0.0  # charged for each step off the course, of the first `MAX_STRAYS`
-    stray: str = ""  # the world's
+    horizon: int  # most steps
+    patience: int = 0  # steps without a positive reward after which it is cut; 0: never
+    idle_cost: float = 0.0
+    time_cost: float = 0.0
+    finish: str = ""
+    off_course_cost: float = 0.0
+    off_course: str = ""
 
 
 class Transition(NamedTuple):
-    """One step that was made."""
+    """One step of an episode."""
 
     seen: Any  # the observation before the action
     action: Any
     reward: float
     step: int  # from 1
-    ended: bool  # the environment says so
-    cut: bool  # patience is at its end
-    info: dict[str, Any]  # what else the environment says
-    terminal: bool = False  # it ended for good, and was not only cut short by the environment's own limit
+    ended: bool  # the environment terminated or truncated the episode
+    cut: bool  # patience has run out
+    info: dict[str, Any]  # the environment's
+    terminal: bool = False  # the environment terminated the episode, and did not truncate it
 
 
 ResetHook = Callable[[gymnasium.Env[Any, Any], Any], Any]
-"""Changes an environment that was just reset, and its first observation; returns the new one."""
+"""Changes an environment that was just reset; takes its first observation and returns the new one."""
 
 
 def run_episode(
     environment: gymnasium.Env[Any, Any], policy: Policy, episode_config: EpisodeConfig, begin: ResetHook | None = None
 ) -> Iterator[Transition]:
-    """Make the episode's steps one by one, under a policy that has begun.
+    """Yield the steps of an episode; the caller has called `policy.begin`.
 
-    It is over where the environment says so, after `horizon` steps, or after `patience` steps without a positive
-    reward.
+    The episode ends when the environment ends it, after `horizon` steps, or after `patience` steps without a positive
+    reward. `begin` may change the environment right after its reset.
     """
     observation, _ = environment.reset(seed=episode_config.seed)
     if begin is not None:
         observation = begin(environment, observation)
-    # Of a `RewardAwarePolicy`: `isinstance` of a protocol takes 70 microseconds, as long as some tasks' steps.
+    # Only a `RewardAwarePolicy` has it; `isinstance` with a protocol takes 70 microseconds, as long as some steps.
     report_reward: Callable[[float], None] | None = getattr(policy, "reward", None)
     idle, over = 0, False
     for step in range(1, episode_config.horizon + 1):
@@ -85,18 +85,17 @@ def score(
     rollout: Rollout | None = None,
     on_transition: Callable[[Transition], None] | None = None,
 ) -> Score:
-    """The episode's fitness: the sum of its rewards, in step order, in double precision.
+    """Run an episode; the fitness is the sum of its rewards in step order, in double precision, minus the costs.
 
-    `rollout` records the episode, and `on_transition` gets each step.
-
-    An episode that patience cuts is charged what standing still would have cost up to the horizon, so that cut and
-    uncut candidates compare. Time costs up to the horizon too, unless the course is finished: to crash saves nothing.
-    Steps off the course cost too: they foretell a loss long before one is seen in rewards.
+    `rollout` records the episode, and `on_transition` gets each step. An episode that patience cuts is charged what
+    standing still up to the horizon costs, so that cut and uncut candidates are comparable. `time_cost` is charged up
+    to the horizon unless the course is finished, so that a crash saves nothing. Steps off the course are charged
+    because they announce a loss long before rewards do.
     """
     if not np.isfinite(parameters).all():
         raise ValueError("the controller's parameters hold NaN or infinity")
     policy.begin(parameters)
-    fitness, steps, strays, finished = 0.0, 0, 0, False
+    fitness, steps, off_course_steps, finished = 0.0, 0, 0, False
     for moment in run_episode(environment, policy, episode_config):
         fitness += moment.reward
         steps = moment.step
@@ -108,11 +107,11 @@ def score(
         on_step(steps)
         if moment.cut:
             fitness -= episode_config.idle_cost * (episode_config.horizon - steps)
-        strays += bool(episode_config.stray_cost and moment.info.get(episode_config.stray))
+        off_course_steps += bool(episode_config.off_course_cost and moment.info.get(episode_config.off_course))
         finished = moment.ended and bool(moment.info.get(episode_config.finish))
     if episode_config.time_cost:
         fitness -= episode_config.time_cost * (steps if finished else episode_config.horizon)
-    fitness -= episode_config.stray_cost * min(strays, MAX_STRAYS)
+    fitness -= episode_config.off_course_cost * min(off_course_steps, MAX_OFF_COURSE_STEPS)
     if not math.isfinite(fitness):
         raise ValueError("the episode's rewards do not add up to a number")
     return Score(fitness, steps)

@@ -1,9 +1,8 @@
-"""What a host computes on fixed inputs: two hosts are of one class if they compute the same bits here.
+"""The class of a host: two hosts are of one class if they compute the same bits on fixed inputs.
 
-A short episode goes through everything that a fitness is made of: the simulator and its picture, the policy with its
-world model, and for tasks that score in batches, such as the dream, these too. Every number that is met on the way is
-looked at, not only the scores: kernels that round otherwise show in the last bits of nearly any sum of products. It is
-a sample all the same: what differs in rarer inputs alone is not seen.
+A short episode uses everything that a fitness depends on: the simulator and its picture, the policy with its world
+model, and the batch of tasks such as the dream. All numbers on the way are hashed, not only the scores, because another
+rounding shows in the last bits of nearly any sum of products. It remains a sample: rarer differences are not found.
 """
 
 from __future__ import annotations
@@ -20,56 +19,58 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
 from dreamfleet.worker.tasks.api import Batch, Policy, StepSnapshot, WatchableBatch
 
-SEED = 0  # nobody's
-PROBE_CONTROLLERS = 4  # that are shown what the first one saw
-MAX_PARAMETER = 0.25  # parameter of the controllers: their actions are neither all alike nor all at a bound
+SEED = 0  # used by no run
+PROBE_CONTROLLERS = 4  # controllers that get the observations of the first one's episode
+MAX_PARAMETER = 0.25  # small enough that the actions differ and are not all at a bound
 
 
 class HostClassProbe:
-    """The digest of what was computed so far; as a `StepObserver` it adds each step."""
+    """A digest of everything computed so far. As a `StepObserver` it adds every step."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
 
     @property
     def host_class(self) -> str:
-        """The class that these bits make."""
+        """The host class: the first 16 hex digits of the digest."""
         return self._hash.hexdigest()[:16]
 
     def add_episode(self, environment: gymnasium.Env[Any, Any], policy: Policy, size: int, steps: int) -> None:
-        """Take in an episode of a controller of `size` parameters, of so many steps at most.
+        """Add an episode of at most `steps` steps of a controller with `size` parameters.
 
-        What was observed there is shown to other controllers too.
+        Other controllers' outputs for the same observations are added too.
         """
         parameters, seen = fixed_parameters(size), []
-        watched = WatchedPolicy(policy, self, 0)  # with what a world model has in mind
+        watched = WatchedPolicy(policy, self, 0)  # it also passes the world model's latent and state to `observe`
         watched.begin(parameters)
         for moment in run_episode(environment, watched, EpisodeConfig(SEED, steps)):
             seen.append(moment.seen)
             self.add_value((moment.seen, moment.reward, moment.ended))
-        outputs: Callable[[Any], Any] = getattr(policy, "outputs", policy.act)  # of a `PolicyWithOutputs` one
+        outputs: Callable[[Any], Any] = getattr(policy, "outputs", policy.act)  # see `PolicyWithOutputs`
         for shift in range(PROBE_CONTROLLERS):
             policy.begin(np.roll(parameters, shift))
             for each in seen:
                 self.add_value(outputs(each))
 
     def add_batch(self, batch: Batch, size: int) -> None:
-        """Take in what a batch makes of two controllers of `size` parameters, and what it shows of its steps."""
+        """Add the scores of two controllers with `size` parameters in a batch, and the steps that the batch shows."""
         shown = batch.watched(self) if isinstance(batch, WatchableBatch) else batch
         episodes = [(fixed_parameters(size), SEED), (-fixed_parameters(size), SEED)]
         for each in shown.score(episodes, lambda _: None):
             self.add_value((float(each.fitness), int(each.steps)))
 
-    def due(self) -> bool:
-        """Every step is looked at."""
+    def is_due(self) -> bool:
+        """Observe every step."""
         return True
 
-    def see(self, episode: int, look: Callable[[], StepSnapshot]) -> None:  # noqa: ARG002 - as an onlooker is shown it
-        """Take in a step of a batch."""
+    def observe(self, episode: int, look: Callable[[], StepSnapshot]) -> None:  # noqa: ARG002 - of the protocol
+        """Add a step."""
         self.add_value(tuple(look()))
 
+    due, see = is_due, observe  # former names, which batches of other packages may call
+
     def add_value(self, value: Any) -> None:
-        """Take in the bits of what an environment or a policy gives, whatever it is made of."""
+        """Add the bits of a value of an environment or a policy: numbers, arrays, texts, and containers of them."""
         if isinstance(value, Mapping):
             for name in sorted(value, key=str):
                 self.add_value((str(name), value[name]))
@@ -83,7 +84,7 @@ class HostClassProbe:
 
 
 def fixed_parameters(size: int) -> NDArray[np.float32]:
-    """Parameters `(size,)` of the probing controllers: spread evenly by whole numbers, the same bits on every host."""
+    """Parameters `(size,)` of the controllers, spread evenly by integer arithmetic: the same bits on every host."""
     spread = np.arange(1, size + 1, dtype=np.uint64) * np.uint64(2654435769) % np.uint64(2**32)  # Knuth's 2^32 / phi
     centred: NDArray[np.float32] = ((spread.astype(np.float64) / 2**31 - 1) * MAX_PARAMETER).astype(np.float32)
     return centred

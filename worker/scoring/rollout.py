@@ -1,4 +1,4 @@
-"""One episode as data sets hold it: what was seen before each action, the action, its reward."""
+"""One recorded episode of a data set: the observation before each action, the action, and its reward."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 class Rollout:
-    """Grows step by step; equal rollouts give equal files."""
+    """A recording that grows step by step; equal recordings give equal files."""
 
     def __init__(self, driver: str, preprocessing: str) -> None:
         self.ended = False  # whether the environment ended it
@@ -24,13 +24,13 @@ class Rollout:
         return len(self._actions)
 
     def add(self, picture: Any, action: Any, reward: float) -> None:
-        """One step: the picture that was seen, then what was done."""
+        """Add a step: the picture before the action, the action, and its reward."""
         self._pictures.append(picture)
         self._actions.append(action)
         self._rewards.append(reward)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Of T steps: `picture` (T, side, side, 3) before each `action` (T, 3), then `reward` (T,)."""
+        """The T steps as arrays: `picture` (T, side, side, 3), `action` (T, actions), `reward` (T,), and metadata."""
         return {
             "picture": np.stack(self._pictures),
             "action": np.stack(self._actions),
@@ -41,7 +41,7 @@ class Rollout:
         }
 
     def to_bytes(self) -> bytes:
-        """The compressed `.npz`."""
+        """The recording as a compressed `.npz` file."""
         file = io.BytesIO()
         write_episode(file, self.arrays())
         return file.getvalue()

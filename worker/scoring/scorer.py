@@ -1,4 +1,4 @@
-"""What a slot does with a job: the task's environment and policy, made once, used for every job."""
+"""Scoring jobs in a slot, with an environment and a policy that are made once."""
 
 from __future__ import annotations
 
@@ -24,11 +24,13 @@ from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
 from dreamfleet.worker.tasks.api import Assignment, Batch, BatchedTask, Score, StepObserver, Task, WatchableBatch, World
 from dreamfleet.worker.tasks.registry import find_task
 
-DRIVER_NAME = "controller"  # as a kept rollout names who drove
+DRIVER_NAME = "controller"  # the driver's name in collected rollouts
 
 
 class Scorer:
-    """Scores a slot's jobs.
+    """Scores jobs of one specification, and of variants of it.
+
+    `UsageError` or `BundleError` if the task, its version or the world model does not fit this host.
 
     >>> from dreamfleet.common.artifacts.bundle_store import find_bundle
     >>> bundle = find_bundle("tiny")
@@ -37,7 +39,7 @@ class Scorer:
     """
 
     def __init__(self, spec: TaskSpec, bundle: Bundle | None = None) -> None:
-        self.observer: StepObserver | None = None  # to be set between turns; `None` costs an episode nothing
+        self.observer: StepObserver | None = None  # may be set between jobs; `None` costs an episode nothing
         task = find_task(spec.task)
         fitting = None if bundle is None else bundle.with_controllers(spec.controller, Variant.from_json(spec.options))
         assignment = Assignment(spec, fitting)
@@ -46,9 +48,9 @@ class Scorer:
         self._batch_for: Callable[[TaskSpec], Batch] | None = None
         if isinstance(task, BatchedTask):
             make = task.make_batch
-            # One is kept: a run's terms change now and then, and making a batch takes milliseconds.
+            # The last batch is kept: specifications change rarely, and making a batch takes milliseconds.
             self._batch_for = lru_cache(maxsize=1)(lambda each: make(Assignment(each, assignment.bundle)))
-            self._batch_for(spec)  # so that what is wrong with it shows at once
+            self._batch_for(spec)  # raises its errors now, not with the first job
         self._task, self._assignment = task, assignment
         self._environment = task.make_environment(assignment)
         self._policy = task.make_policy(assignment)
@@ -58,9 +60,10 @@ class Scorer:
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,
         spec: TaskSpec | None = None,
     ) -> Score:  # fmt: skip
-        """A candidate's fitness under the run's horizon and patience; an evaluation drives the whole episode.
+        """A candidate's score under the run's horizon and patience, or, for `evaluate`, in a whole episode.
 
-        `spec` is one other than the run's: the same at another temperature, horizon or patience, or driven.
+        `parameters` `(size,)`. `spec` replaces the run's specification; it may differ in temperature, horizon, patience
+        and whether episodes are driven. `on_step` gets the number of steps so far.
         """
         return self.score_all([(kind, parameters, seed)], on_step, spec)[0]
 
@@ -68,7 +71,7 @@ class Scorer:
         self, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]], on_step: Callable[[int], None],
         spec: TaskSpec | None = None,
     ) -> list[Score]:  # fmt: skip
-        """A turn's jobs, as `score` does; `on_step` hears of all steps made so far."""
+        """The scores of several jobs, as `score`; `on_step` gets the number of steps so far, over all jobs."""
         if (batch := self._batch([kind for kind, _, _ in jobs], spec)) is not None:
             if self.observer is not None and isinstance(batch, WatchableBatch):
                 batch = batch.watched(self.observer)
@@ -92,25 +95,25 @@ class Scorer:
         self, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,
         spec: TaskSpec | None = None,
     ) -> tuple[Score, Rollout]:  # fmt: skip
-        """An episode as candidates drive it, and what happened in it, failures included; `spec` as in `score`."""
+        """Score and recording of an episode under the run's horizon and patience; `spec` as in `score`."""
         rollout = Rollout(DRIVER_NAME, self._preprocessing)
         episode_config = self.episode_config("collect", seed, spec)
         return self._run_episode(0, parameters, episode_config, on_step, rollout), rollout
 
     @property
     def drawn_by(self) -> str:
-        """Who draws the environment's picture; `-` where a task does not say."""
+        """What draws the environment's pictures; `-` if the task does not say."""
         return str(getattr(self._environment.unwrapped, "drawn_by", "-"))
 
     @cached_property
     def host_class(self) -> str:
-        """The class of this host, as far as this task shows it: hosts of one compute the same bits.
+        """The class of this host: hosts of one class compute the same bits in this task.
 
-        Where nobody may look, or the task fails at it, the host's fingerprint tells it.
+        Without a probe episode (`probe_steps` 0), or if it fails, the class comes from the host's fingerprint.
         """
         steps = getattr(self._task, "probe_steps", Task.probe_steps)
         found, size = HostClassProbe(), self._assignment.controller.size
-        with suppress(Exception):  # a job that is to be scored will tell what is wrong, and to whom it matters
+        with suppress(Exception):  # the first job will report the same error
             if steps > 0:
                 found.add_episode(self._environment, self._policy, size, steps)
                 if self._batch_for is not None:
@@ -119,17 +122,24 @@ class Scorer:
         return class_from_fingerprint(fingerprint(self.world.packages))
 
     def episode_config(self, kind: Kind, seed: int, spec: TaskSpec | None = None) -> EpisodeConfig:
-        """The episode that a job of this kind and seed is, in the run's specification or in `spec`."""
+        """The episode of a job with this kind and seed, in the run's specification or in `spec`."""
         if kind == "evaluate":
             return EpisodeConfig(seed, self.world.horizon)
         spec, world = spec or self.spec, self.world
-        time_cost, stray_cost = (world.time_cost, world.stray_cost) if kind == "score" else (0.0, 0.0)
+        time_cost, off_course_cost = (world.time_cost, world.off_course_cost) if kind == "score" else (0.0, 0.0)
         return EpisodeConfig(
-            seed, spec.horizon, spec.patience, world.idle_cost, time_cost, world.finish, stray_cost, world.stray
+            seed,
+            spec.horizon,
+            spec.patience,
+            world.idle_cost,
+            time_cost,
+            world.finish,
+            off_course_cost,
+            world.off_course,
         )
 
     def _batch(self, kinds: Iterable[Kind], spec: TaskSpec | None) -> Batch | None:
-        """What scores jobs of these kinds at once; `None` where they are driven one by one."""
+        """The batch that scores jobs of these kinds; `None` if they are driven one by one."""
         spec = spec or self.spec
         if self._batch_for is None or spec.driven or any(kind != "score" for kind in kinds):
             return None
@@ -138,7 +148,7 @@ class Scorer:
     def close(self) -> None:
         """Release the environments."""
         self._environment.close()
-        if (watched := self.__dict__.get("_watched_environment")) is not None:  # made when somebody first watches
+        if (watched := self.__dict__.get("_watched_environment")) is not None:  # made on first use
             watched.close()
 
     def _run_episode(
@@ -149,7 +159,7 @@ class Scorer:
         on_step: Callable[[int], None],
         rollout: Rollout | None = None,
     ) -> Score:
-        """Drive an episode, the one of this place in the turn, before the onlooker's eyes if there is one."""
+        """Drive the episode with this index in its group, and let the observer watch if there is one."""
         if self.observer is None:
             return score(self._environment, self._policy, parameters, episode_config, on_step, rollout)
         shown = self._watched_environment
@@ -159,14 +169,14 @@ class Scorer:
 
     @cached_property
     def _watched_environment(self) -> gymnasium.Env[Any, Any] | None:
-        """What is scored in while somebody looks on, if that is another environment; one that cannot be had is none."""
+        """The task's environment for watched episodes; `None` if there is none or it cannot be made."""
         with suppress(Exception):
-            return self._task.make_shown(self._assignment)
+            return self._task.make_watched_environment(self._assignment)
         return None
 
 
 def find_checked_world(assignment: Assignment) -> World:
-    """The world that is scored in; `UsageError` where the task is of another version here."""
+    """The world that is scored in; `UsageError` if the task has another version on this host."""
     spec, world = assignment.spec, find_task(assignment.spec.task).world_of(assignment)
     if world.version != spec.version:
         raise UsageError(

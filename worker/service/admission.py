@@ -1,8 +1,4 @@
-"""Asking to join a run: hello, and what the answer means.
-
-Whoever reaches the port can answer too. So of several answers a welcome goes before a refusal, and the run that this
-worker has joined already before any other; of equals one is taken at random, so that nobody is sure to be believed.
-"""
+"""Joining a run: the hello request and its answer."""
 
 from __future__ import annotations
 
@@ -24,10 +20,10 @@ from dreamfleet.common.protocol.messages import HelloReply, HelloRequest, Interv
 from dreamfleet.common.serialization.constraints import MAX_TEXT
 from dreamfleet.common.serialization.validation import MalformedError, from_plain
 from dreamfleet.common.transport.query import query_all, query_every_responder
-from dreamfleet.worker.service.task_allowlist import check_task_allowed
+from dreamfleet.worker.tasks.registry import check_task_allowed
 
 HELLO_TIMEOUT = 2.0
-MAX_RUNS_LISTED = 8  # runs by name
+MAX_RUNS_LISTED = 8  # run names in an error message
 
 
 @dataclass(frozen=True)
@@ -40,9 +36,9 @@ class Admission:
     nonce: str
     spec: TaskSpec
     intervals: Intervals
-    packages: tuple[str, ...] = NUMERIC_PACKAGES  # whose versions the run's fingerprint names
-    numbering: int = 0  # of the batches that follow
-    classes: bool = False  # whether the coordinator knows classes of hosts
+    packages: tuple[str, ...] = NUMERIC_PACKAGES  # the run's fingerprint consists of their versions
+    numbering: int = 0  # R12: each welcome starts a new numbering of batches
+    classes: bool = False  # whether the coordinator supports host classes
 
 
 def request_admission(
@@ -54,17 +50,16 @@ def request_admission(
     *,
     secured: bool = False,
 ) -> Admission | None:
-    """Say hello to `run`, or to the only live one; `None` if nobody answers, `RefusedError` if the answer is no.
+    """Say hello to `run`, or to the only live run; `None` if nobody answers, `RefusedError` if the answer is a refusal.
 
-    `joined_run_uid` is the uid of the run that this worker is in.
-
-    A run that asks for a task which the request does not announce is refused in turn: its word imports nothing here.
-    In a `secured` fleet it is said under this worker's own name.
-    Where the run's fingerprint names other packages than the request's, hello is said again about those.
+    `joined_run_uid` is the uid of the run that this worker has joined, if any. In a `secured` fleet the request goes to
+    this worker's own key. If the run's fingerprint covers other packages than the request's, hello is sent again
+    with a fingerprint of those. A run whose task the request does not announce is refused, so that an answer never
+    makes this worker import code.
     """
     reply = _send_hello(session, run, request, inbox, joined_run_uid, secured=secured)
     if reply is not None and not reply.accepted and reply.packages != request.packages:
-        named = fingerprint(reply.packages)[:MAX_TEXT]  # the packages that they name are theirs to choose
+        named = fingerprint(reply.packages)[:MAX_TEXT]  # the coordinator chooses how many
         about = replace(request, packages=reply.packages, fingerprint=named)
         reply = _send_hello(session, reply.run, about, inbox, joined_run_uid, secured=secured)
     if reply is None:
@@ -83,13 +78,18 @@ def _send_hello(
     *,
     secured: bool,
 ) -> HelloReply | None:
+    """The answer to one hello request.
+
+    R23: a single refusal decides nothing, because anybody on the network can answer. The joined run comes first, then a
+    welcome, then a refusal. Of equal answers one is drawn at random, so that no stranger always wins.
+    """
     key = keys.secured_hello(run or "*", request.worker) if secured else keys.hello(run or "*")
     replies = []
     for _, payload in query_every_responder(session, [key], HELLO_TIMEOUT, encode_json(request)):
         reply = inbox.decode_json(HelloReply, payload)
         if reply is not None and _is_reply_of(reply, run):
             replies.append(reply)
-            if reply.accepted and reply.run_uid == joined_run_uid:  # nobody is to keep it waiting by not answering
+            if reply.accepted and reply.run_uid == joined_run_uid:  # no need to wait for others
                 break
     if not replies:
         return None
@@ -99,17 +99,17 @@ def _send_hello(
 
 
 def _is_reply_of(reply: HelloReply, run: str | None) -> bool:
-    """Whether an answer is of `run`, or of any at all: what else answers is nobody's coordinator."""
+    """Whether an answer comes from `run`, or, if that is `None`, from a run with a valid name."""
     with suppress(UsageError):
         return keys.check_run_name(reply.run) == (run or reply.run)
     return False
 
 
 def find_run_with_fewest_slots(session: zenoh.Session, excluded: Collection[str] = ()) -> str | None:
-    """The live run that works with the fewest slots; of equals the first by name. Those in `excluded` are left out."""
+    """The live run with the fewest slots, without those in `excluded`; of equals the first by name."""
     found = []
     for payload in query_all(session, [keys.status("*")], HELLO_TIMEOUT):
-        with suppress(ValueError, KeyError, TypeError):  # what answers need not be of this version
+        with suppress(ValueError, KeyError, TypeError):  # another version may answer in another form
             document = json.loads(payload)
             if document["state"] not in ("ended", "paused") and document["run"] not in excluded:
                 found.append((int(document["slots"]), str(document["run"])))
@@ -117,7 +117,7 @@ def find_run_with_fewest_slots(session: zenoh.Session, excluded: Collection[str]
 
 
 def make_request(worker: str, tasks: tuple[str, ...], slots: int) -> HelloRequest:
-    """What a worker says of itself."""
+    """The hello request of a worker."""
     return HelloRequest(
         protocol_min=keys.PROTOCOL_VERSION,
         protocol_max=keys.PROTOCOL_VERSION,
@@ -136,8 +136,8 @@ def _read_admission(reply: HelloReply) -> Admission:
         spec, intervals = from_plain(TaskSpec, reply.spec), from_plain(Intervals, reply.intervals)
     except MalformedError as error:
         raise RefusedError(
-            f"run {reply.run} (dreamfleet {reply.package}) describes its task in words that this version does not know "
-            f"({error}); install dreamfleet {reply.package} here"
+            f"run {reply.run} (dreamfleet {reply.package}) describes its task in a form that this version does not "
+            f"know ({error}); install dreamfleet {reply.package} here"
         ) from error
     return Admission(
         keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages,

@@ -1,8 +1,6 @@
-"""What the coordinator has given this worker and no slot has taken yet, in one numbering of its batches. Pure.
+"""The jobs that the coordinator has given this worker and that no slot has taken yet. Pure.
 
-Batches may come twice, late or out of order; each counts once, and a vector may be spread over several. Whoever reaches
-the port can send some too, so what waits is bounded: what has no room is let go, and as the next beats do not show it,
-the coordinator gives it again.
+Batches may arrive twice, late or out of order, and anybody on the network can send some.
 """
 
 from __future__ import annotations
@@ -15,41 +13,46 @@ from math import prod
 
 from dreamfleet.common.protocol.messages import MAX_LEASES, Job, JobBatch, TaskSpec, VectorPart
 
-MAX_UNUSED_VECTORS = 64  # beside those that queued jobs need
-MAX_BATCHES_AHEAD = 1024  # batches after one that is missing
-MAX_VECTOR_BYTES = 256 << 20  # of all vectors; of 1024 candidates: 65,000 parameters each
+# R26: strangers can send batches too, so what they can fill is limited. The coordinator gives a dropped job again,
+# because the next heartbeats do not list it.
+MAX_UNUSED_VECTORS = 64  # vectors that no queued job needs
+MAX_BATCHES_AHEAD = 1024  # batches after a missing one
+MAX_VECTOR_BYTES = 256 << 20  # of all vectors; with 1024 candidates: 65,000 parameters each
 
 
 @dataclass
 class PartialVector:
-    """What has come of a vector of `size` bytes, by offset."""
+    """The parts of a vector of `size` bytes that have arrived, by offset."""
 
     size: int
     data: dict[int, bytes] = field(default_factory=dict)
 
     def content(self) -> bytes:
-        """All of it, in order."""
+        """The parts in order, joined."""
         return b"".join(data for _, data in sorted(self.data.items()))
 
 
 class Backlog:
-    """Queued jobs in the order in which they came, and the vectors that they score."""
+    """Queued jobs in order of arrival, and the vectors that they score."""
 
     def __init__(self, spec: TaskSpec) -> None:
         self._spec = spec
         self.start_numbering(0)
         self._jobs: OrderedDict[bytes, Job] = OrderedDict()
-        self._vectors: OrderedDict[bytes, bytes | PartialVector] = OrderedDict()  # by identity
+        self._vectors: OrderedDict[bytes, bytes | PartialVector] = OrderedDict()  # by hash
         self._bytes = 0  # of all vectors
 
     def start_numbering(self, numbering: int) -> None:
-        """The coordinator counts batches from 1 again, under another number."""
+        """Count batches from 1 again, under another numbering.
+
+        R12: each answer to hello starts a numbering, so batches from before a cut are not taken for current ones.
+        """
         self.numbering = numbering
-        self.seen = 0
+        self.seen = 0  # R10: the highest number up to which all batches have arrived; heartbeats report it
         self._received_ahead: set[int] = set()
 
     def clear(self) -> None:
-        """Forget what is queued: it is given again."""
+        """Drop the queued jobs; the coordinator gives them again."""
         self._jobs.clear()
 
     @property
@@ -58,10 +61,12 @@ class Backlog:
         return list(self._jobs)
 
     def add_batch(self, batch: JobBatch, in_slots: Collection[bytes] = ()) -> list[tuple[Job, str]]:
-        """Queue a batch's jobs once; those whose digest is not theirs come back with what is wrong.
+        """Queue the jobs of a batch; return those that are refused, each with the reason.
 
-        Jobs that a slot has already (`in_slots`, by digest) are not queued: a coordinator that was killed while it
-        opened a generation gives its jobs again in its next life.
+        R10: a batch counts once, so a repeated one changes nothing and a reordered one fills its gap.
+        R2: a job whose digest is not that of its content is refused, so a forged job is never scored.
+        R1: a digest names one job for good. A job that a slot has (`in_slots`, by digest) is therefore not queued again
+        when a restarted coordinator gives it a second time.
         """
         if not self.seen < batch.number <= self.seen + MAX_BATCHES_AHEAD or batch.number in self._received_ahead:
             return []
@@ -84,16 +89,17 @@ class Backlog:
         return refused
 
     def take(self, count: int) -> list[tuple[Job, bytes]]:
-        """The first jobs whose vectors are whole, with them: at most `count` to be scored, or one that is done alone.
+        """Remove and return the first jobs whose vectors are complete, with their vectors.
 
-        They are of one specification.
+        They share one specification: up to `count` jobs, or a single job that runs alone.
+        R2: a job whose vector turned out to have another hash is dropped, never scored.
         """
         taken: list[tuple[Job, bytes]] = []
         for digest, job in list(self._jobs.items()):
             if len(taken) == count or (taken and (job.runs_alone or job.overrides != taken[0][0].overrides)):
                 break
             vector = self._assemble(job.vector)
-            if job.vector not in self._vectors:  # what has come of it was of something else
+            if job.vector not in self._vectors:  # its parts were of something else
                 del self._jobs[digest]
             elif vector is not None:
                 taken.append((job, vector))
@@ -102,16 +108,21 @@ class Backlog:
                     break
         return taken
 
-    def _assemble(self, identity: bytes) -> bytes | None:
-        vector = self._vectors.get(identity)
+    def _assemble(self, vector_hash: bytes) -> bytes | None:
+        """The complete vector with this hash; `None` while parts are missing.
+
+        R13: a long vector travels in parts. R2: it is complete once its bytes have the named hash; if it is long enough
+        and has another hash, it is dropped.
+        """
+        vector = self._vectors.get(vector_hash)
         if not isinstance(vector, PartialVector):
             return vector
         content = vector.content()
-        if hashlib.sha256(content).digest() == identity:
-            self._vectors[identity] = content
+        if hashlib.sha256(content).digest() == vector_hash:
+            self._vectors[vector_hash] = content
             return content
         if len(content) >= vector.size:
-            self._drop(identity)
+            self._drop(vector_hash)
         return None
 
     def _add_part(self, part: VectorPart) -> None:
@@ -123,12 +134,13 @@ class Backlog:
             self._bytes += len(part.data)
         self._vectors.move_to_end(part.id)
 
-    def _drop(self, identity: bytes) -> None:
-        vector = self._vectors.pop(identity)
+    def _drop(self, vector_hash: bytes) -> None:
+        vector = self._vectors.pop(vector_hash)
         self._bytes -= len(vector.content() if isinstance(vector, PartialVector) else vector)
 
     def _trim(self) -> None:
+        """Drop the oldest vectors that no queued job needs."""
         needed = {job.vector for job in self._jobs.values()}
-        surplus = [identity for identity in self._vectors if identity not in needed]
-        for identity in surplus[: max(0, len(surplus) - MAX_UNUSED_VECTORS)]:
-            self._drop(identity)
+        surplus = [vector_hash for vector_hash in self._vectors if vector_hash not in needed]
+        for vector_hash in surplus[: max(0, len(surplus) - MAX_UNUSED_VECTORS)]:
+            self._drop(vector_hash)

@@ -1,7 +1,7 @@
-"""Fetching the frozen world model by its hash: in parts, resumable, verified.
+"""Fetch the frozen world model by its hash: in parts, resumable, verified.
 
-Whoever reaches the port can answer too. So all of one download is of one answerer, and one whose bytes were not those
-of the hash is asked again only where nobody else answers.
+Anybody on the network can answer. So all parts of a download come from one source, and a source whose bytes had another
+hash is used again only if nobody else answers.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dreamfleet.common.protocol.messages import MAX_PART, BundlePart
 from dreamfleet.common.transport.query import query_every_responder
 
 log = logging.getLogger(__name__)
-WINDOW = 8  # queries in flight: enough to fill a link with a long way
+WINDOW = 8  # queries in flight: enough to fill a link with a long delay
 MAX_ATTEMPTS = 3  # damaged downloads before giving up
 MAX_ROUNDS_WITHOUT_PROGRESS = 20  # rounds without progress before giving up
 QUERY_TIMEOUT = 3.0
@@ -36,22 +36,22 @@ def fetch_bundle(
     session: zenoh.Session, run: str, sha256: str, store: BundleStore, inbox: CountingDecoder,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Bundle | None:  # fmt: skip
-    """The bundle from the cache, or fetched from the coordinator; `None` if `stopped`, what has come stays.
+    """The bundle, from the cache or from the coordinator; `None` if `stopped`, and the parts so far stay in the cache.
 
-    `DownloadError` if it does not come, or comes as something else again and again.
+    `DownloadError` if nobody answers, or if it arrived damaged `MAX_ATTEMPTS` times.
     """
     bundle = store.find(sha256)
     if bundle is not None:
         return bundle
-    corrupt_sources: set[str] = set()  # who gave bytes that were not of the hash
+    corrupt_sources: set[str] = set()  # their bytes had another hash
     with store.lock_download(sha256) as path:
         for attempt in range(1, MAX_ATTEMPTS + 1):
             if (bundle := store.find(sha256)) is not None:  # another worker of this host was faster
                 return bundle
             try:
-                anew = not path.exists() or path.stat().st_size == 0
+                from_start = not path.exists() or path.stat().st_size == 0
                 sources = _download(session, keys.bundle(run, sha256), sha256, path, inbox, stopped, corrupt_sources)
-            except OSError as error:  # what has come stays, and the next worker goes on from there
+            except OSError as error:  # the parts so far stay, and the next worker continues from there
                 raise store.write_error(error) from error
             if stopped():
                 return None
@@ -59,7 +59,7 @@ def fetch_bundle(
                 bundle = store.finish_download(sha256)
             except BundleError as error:
                 log.warning("attempt %d of %d: %s", attempt, MAX_ATTEMPTS, error)
-                if anew and len(sources) == 1:  # else nobody knows whose bytes they were
+                if from_start and len(sources) == 1:  # otherwise any of several sources may have sent the wrong bytes
                     corrupt_sources |= sources
                 continue
             log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6)
@@ -70,11 +70,11 @@ def fetch_bundle(
 
 
 def fetch_bundle_of(controller: Controller, session: zenoh.Session, run: str) -> Bundle | None:
-    """The world model of a controller that `run` reports: cached, shipped, or fetched; `None` if it needs none."""
+    """The world model of a controller of `run`: cached, shipped, or fetched; `None` if it needs none."""
     if not controller.bundle:
         return None
     bundle = fetch_bundle(session, run, controller.bundle, BundleStore(default_cache()), CountingDecoder())
-    assert bundle is not None  # nobody stops it
+    assert bundle is not None  # it cannot be stopped
     return bundle.for_controller(controller)
 
 
@@ -82,10 +82,10 @@ def _download(
     session: zenoh.Session, key: str, sha256: str, path: Path, inbox: CountingDecoder, stopped: Callable[[], bool],
     corrupt_sources: Collection[str],
 ) -> set[str]:  # fmt: skip
-    """Append to `path` until it is as long as the bundle, or `stopped`; whose parts they were.
+    """Append to `path` until it is as long as the bundle, or until `stopped`; return the sources of the parts.
 
-    How long that is, the first part says; one that says otherwise is of something else. Another answerer is looked for
-    only once the chosen one is silent.
+    The first part names the length; a part that names another length is ignored. Another source is chosen only when the
+    current one is silent.
     """
     total, silences, source = None, 0, ""
     sources: set[str] = set()
@@ -103,29 +103,29 @@ def _download(
                     sources.add(source)
             if total is not None and file.tell() > total:
                 file.seek(0)
-                file.truncate()  # the beginning of something else
+                file.truncate()  # it was the beginning of another file
             elif file.tell() > before or file.tell() == total:
                 silences = 0
             else:
-                silences, total, source = silences + 1, None, ""  # which was perhaps of something else
+                silences, total, source = silences + 1, None, ""  # its length may have been wrong
                 sleep(PAUSE)
             if silences >= MAX_ROUNDS_WITHOUT_PROGRESS:
-                raise DownloadError("the coordinator no longer answers for its bundle: ask for it later")
+                raise DownloadError("the coordinator no longer sends its bundle: try again later")
     return sources
 
 
 def _choose_source(parts: Collection[str], corrupt_sources: Collection[str]) -> str:
-    """One of those who answer, at random: nobody is sure to be first."""
+    """One of the sources, at random, so that no stranger is always chosen; a corrupt one only if there is no other."""
     known = sorted(set(parts) - set(corrupt_sources)) or sorted(parts)
     return random.choice(known) if known else ""  # noqa: S311 - no secret
 
 
 def _checked_length(part: BundlePart) -> int:
-    """How long the bundle is; `DownloadError` before more is written than a bundle may be."""
+    """The bundle's length in bytes; `DownloadError` if it is longer than a bundle may be."""
     if part.total > MAX_BUNDLE:
         raise DownloadError(
-            f"the coordinator says that its bundle is {part.total / 1e6:,.0f} MB long, {MAX_BUNDLE / 1e6:.0f} at most "
-            "are fetched: check its copy"
+            f"the coordinator's bundle is said to be {part.total / 1e6:,.0f} MB long, and at most "
+            f"{MAX_BUNDLE / 1e6:.0f} MB are fetched: check its copy"
         )
     return part.total
 
@@ -139,13 +139,13 @@ def _query_parts(
     stopped: Callable[[], bool],
     source: str,
 ) -> dict[str, list[BundlePart]]:
-    """Parts of this bundle by who gave them; without waiting for others once `source` has given all."""
+    """Parts of this bundle by source. Returns as soon as `source` has sent all of `offsets`."""
     selectors = [f"{key}?offset={offset};length={MAX_PART}" for offset in offsets]
     parts: dict[str, list[BundlePart]] = {}
-    for who, payload in query_every_responder(session, selectors, QUERY_TIMEOUT, stopped=stopped):
+    for sender, payload in query_every_responder(session, selectors, QUERY_TIMEOUT, stopped=stopped):
         part = inbox.decode(BundlePart, payload)
         if part is not None and part.sha256.hex() == sha256:
-            parts.setdefault(who, []).append(part)
+            parts.setdefault(sender, []).append(part)
         if len(parts.get(source, [])) == len(offsets):
             break
     return parts

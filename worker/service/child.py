@@ -1,6 +1,6 @@
-"""A child process that scores: it knows nothing of Zenoh, takes turns from a pipe, and dies with its parent.
+"""A scoring child process: it reads groups of jobs from a pipe and writes their results back. It never uses Zenoh.
 
-This module imports nothing heavy, so that a child has asked to die with its parent before it loads a simulator.
+This module imports nothing heavy, so that a child arranges to die with its parent before it loads a simulator.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChildReady:
-    """A child's first word: it can score, who draws its picture, and of which class its host is."""
+    """First message of a child: it can score. `drawn_by` names what draws its pictures."""
 
     drawn_by: str
     host_class: str
@@ -35,16 +35,17 @@ def serve_jobs(
     pipe: Connection[Any, Any], steps: Any, abandoned: Any, is_watched: Any, spec: TaskSpec, bundle: Path | None,
     allowed_tasks: tuple[str, ...], parent: int,
 ) -> None:  # fmt: skip
-    """Score jobs from the pipe until it closes. `steps`, `abandoned` and `is_watched` are shared with the parent.
+    """Score groups of jobs from the pipe until it closes.
 
-    Nothing is imported for a task that is not among `allowed_tasks`.
+    `steps`, `abandoned` and `is_watched` are memory shared with the parent. A task that is not in `allowed_tasks` is
+    never imported.
     """
     exit_with_parent(parent)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker decides; Ctrl-C reaches the whole group
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the worker handles it
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    with suppress(OSError, AttributeError, ValueError, RuntimeError):  # no stderr: no traceback of a crash
+    with suppress(OSError, AttributeError, ValueError, RuntimeError):  # without a stderr a crash leaves no traceback
         faulthandler.enable()
-    make_stderr_nonblocking()  # whose reader is the worker's, and may be gone to sleep
+    make_stderr_nonblocking()  # inherited from the worker, whose reader may be suspended
     make_stdout_nonblocking()
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     scorer = _make_scorer(pipe, spec, bundle, allowed_tasks)
@@ -55,11 +56,11 @@ def serve_jobs(
 def _make_scorer(
     pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None, allowed_tasks: tuple[str, ...]
 ) -> Scorer:
-    """Load task and world model; what keeps them from loading is this child's last word."""
+    """Load the task and the world model; on an error send it as a `ScoringFailure` and exit."""
     from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.worker.scoring.scorer import Scorer
-    from dreamfleet.worker.service.job_group import ScoringFailure
-    from dreamfleet.worker.service.task_allowlist import check_task_allowed, check_world_allowed
+    from dreamfleet.worker.service.failure_log import ScoringFailure
+    from dreamfleet.worker.tasks.registry import check_task_allowed, check_world_allowed
 
     try:
         check_task_allowed(spec.task, allowed_tasks)
@@ -74,6 +75,10 @@ def _make_scorer(
 
 
 def _score_groups(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandoned: Any, is_watched: Any) -> None:
+    """Score group after group until the parent closes the pipe.
+
+    R9: a group whose jobs are no longer wanted (`abandoned`) ends at its next step.
+    """
     from dreamfleet.worker.service.frame_sampler import FrameSampler
     from dreamfleet.worker.service.job_group import AbandonedError, score_group
 

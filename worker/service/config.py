@@ -1,4 +1,4 @@
-"""How one worker works."""
+"""Settings of a worker process."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from dreamfleet.common.protocol.messages import MAX_LEASES
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """How one worker works."""
+    """Settings of a worker process; `UsageError` for values that do not fit together."""
 
     run: str | None = option(None, "name of the run (default: the only live one)")
     name: str | None = option(None, "name of this worker (default: the host's)")
-    slots: int = option(0, "scoring processes; 0: one a core")
-    drain_timeout: float = option(30.0, "seconds that running episodes may take after the first Ctrl-C")
-    any: bool = option(False, "serve whichever live run has the fewest slots, and the next one when it is over")
-    lifetime: float = option(0.0, "leave by itself after so many seconds, as at the first Ctrl-C; 0: never")
+    slots: int = option(0, "scoring processes; 0: one for each core")
+    drain_timeout: float = option(30.0, "seconds that running episodes may take to finish after the first Ctrl-C")
+    any: bool = option(False, "serve the live run with the fewest slots, and the next one when it is over")
+    lifetime: float = option(0.0, "leave after this many seconds, as on the first Ctrl-C; 0: never")
     slot_memory: int = option(
-        2048, "MiB of a scoring process; one that holds more is replaced between jobs; 0: no limit"
+        2048, "MiB that a scoring process may hold; a larger one is replaced between jobs; 0: no limit"
     )
     exit_when_done: bool = option(False, "leave when the run has ended or refuses this worker")
 
@@ -38,4 +38,4 @@ class WorkerConfig:
             raise UsageError(f"--slots must be from 0 to {MAX_LEASES}, not {self.slots}")
         for name in ("drain_timeout", "lifetime", "slot_memory"):
             if not 0 <= getattr(self, name) < float("inf"):
-                raise UsageError(f"--{name.replace('_', '-')} must not be negative, nor without end")
+                raise UsageError(f"--{name.replace('_', '-')} must be a finite number, and not negative")

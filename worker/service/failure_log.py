@@ -1,33 +1,66 @@
-"""Which failures have been told. Pure: failures in, what to log out.
-
-A broken task fails in every job of every candidate. Its traceback is told once; each result still carries its error.
-"""
+"""Failures while scoring: one of them as data, and which of them have been logged. Pure."""
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from dreamfleet.common.protocol.messages import Job
-from dreamfleet.worker.service.job_group import ScoringFailure
 
-MOST_KINDS = 100  # after which nothing is told any more: no log should grow with a run
+MAX_TRACE = 8000  # characters of a traceback that are kept, from its end, where the cause stands
+MAX_KINDS = 100  # kinds of failures that are logged at most
+
+
+@dataclass(frozen=True)
+class ScoringFailure:
+    """An exception that was raised while scoring.
+
+    `text` is one line, `trace` the traceback. `kind` is the exception's type and the line of code that raised it, so
+    two failures with different numbers in their texts have the same kind.
+    """
+
+    text: str
+    kind: str
+    trace: str
+
+    @classmethod
+    def of(cls, error: Exception) -> ScoringFailure:
+        """From a caught exception."""
+        lines = str(error).strip().splitlines()
+        places = traceback.extract_tb(error.__traceback__)
+        place = f"{places[-1].filename}:{places[-1].lineno}" if places else "nowhere"
+        name, first = type(error).__name__, lines[0] if lines else ""
+        trace = "".join(traceback.format_exception(error)).rstrip()
+        return cls(_encodable(f"{name}: {first}"[:500]), f"{name} at {place}", _encodable(trace[-MAX_TRACE:]))
 
 
 class FailureLog:
-    """Tells each kind of failure once."""
+    """Decides which failures are logged.
+
+    A broken task fails in every job of every candidate. One traceback suffices; each result still carries its error.
+    """
 
     def __init__(self) -> None:
         self._logged_kinds: set[str] = set()
 
     def format_if_new(self, failure: ScoringFailure, task: str, jobs: Sequence[Job]) -> str | None:
-        """What to log of a failure in these jobs, or of a slot's start where there are none; `None`: told before."""
-        if failure.kind in self._logged_kinds or len(self._logged_kinds) >= MOST_KINDS:
+        """The log text of a failure in `jobs` (none: as a slot started); `None` if its kind was logged before.
+
+        R26: the log must not grow with the run, so the number of logged kinds is limited too.
+        """
+        if failure.kind in self._logged_kinds or len(self._logged_kinds) >= MAX_KINDS:
             return None
         self._logged_kinds.add(failure.kind)
         return (
             f"task {task}: {failure.text} ({_describe_jobs(jobs)}); later failures from this line are not logged\n"
-            + (failure.trace)
+            f"{failure.trace}"
         )
+
+
+def _encodable(text: str) -> str:
+    """Replace half surrogate pairs, as in names of files, which UTF-8 cannot encode."""
+    return text.encode(errors="replace").decode()
 
 
 def _describe_jobs(jobs: Sequence[Job]) -> str:

@@ -1,7 +1,7 @@
-"""Live frames of one joined run: published while somebody subscribes, and never at the cost of anything else.
+"""Publishing live frames of a run while somebody watches.
 
-A frame is the least urgent of all messages and is dropped where a link is busy: a slow viewer misses frames, and no
-job, result or beat waits for him. What is dear, decoding and dreaming on, is the viewer's own work.
+Frames have the lowest priority and are dropped where a link is busy, so no job, result or heartbeat waits for a slow
+viewer. The expensive work, decoding and dreaming, is done by the viewer.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from dreamfleet.worker.service.admission import Admission
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import JobWithVector
 
-FRAME_OVERHEAD = 1024  # bytes of a frame beside its picture and what a world model has in mind
+FRAME_OVERHEAD = 1024  # bytes of a frame without its picture, latent and state
 
 
 class FramePublisher:
-    """The publisher of a worker's frames; `on_viewers_changed` is called in Zenoh's thread as viewers come or go."""
+    """Publishes a worker's frames; Zenoh's thread calls `on_viewers_changed` when viewers come or go."""
 
     def __init__(
         self, session: zenoh.Session, run: str, identity: str, on_viewers_changed: Callable[[Any], None]
@@ -36,12 +36,12 @@ class FramePublisher:
         self._listener = self._publisher.declare_matching_listener(on_viewers_changed)
 
     def show(self, admission: Admission, slot: int, work: JobWithVector, frame: SampledFrame) -> None:
-        """Publish what a slot showed of a job; a frame that is no message, such as of an endless score, is not sent."""
+        """Publish a slot's frame of a job. A frame that cannot be encoded, as with an infinite score, is dropped."""
         with suppress(MalformedError):
             self._publisher.put(encode(_make_view_frame(admission, slot, work, frame)))
 
     def undeclare(self) -> None:
-        """Show nothing more."""
+        """Stop publishing."""
         self._listener.undeclare()  # type: ignore[no-untyped-call]
         self._publisher.undeclare()
 

@@ -1,7 +1,7 @@
-"""What a scoring child shows of its episode while somebody watches: steps now and then, thinned out by the clock.
+"""Sampling frames of a running episode in a scoring child while somebody watches.
 
-The loop is many times faster than the drive that it computes, so frames are samples of the present: ten a second, and
-fewer where to show one takes long. Showing never takes more than a hundredth of the child's time, whatever is shown.
+An episode runs many times faster than real time, so a viewer gets samples: ten frames a second, and fewer where a frame
+is expensive. Sampling never takes more than a hundredth of the child's time.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ import numpy as np
 
 from dreamfleet.common.protocol.frame_pictures import pack_picture
 
-if TYPE_CHECKING:  # a task's contract imports gymnasium, which the parent of a child need not have loaded
+if TYPE_CHECKING:  # `tasks.api` imports gymnasium, which the parent process does not need
     from dreamfleet.worker.tasks.api import StepSnapshot
 
-FRAME_INTERVAL = 0.1  # seconds between two frames at least
-MAX_TIME_SHARE = 0.01  # of the child's time at most
-MAX_ACTIONS = 64
+FRAME_INTERVAL = 0.1  # seconds between two frames, at least
+MAX_TIME_SHARE = 0.01  # of the child's processor time, at most
+MAX_ACTIONS = 64  # numbers of an action that a frame holds
 
 
 @dataclass(frozen=True)
 class SampledFrame:
-    """A child's word of one step of the turn in its hands; numbers are float32 bytes, empty where there are none."""
+    """Message of a child about one step of its running group; `latent` and `state` are float32 bytes, or empty."""
 
     group: int
-    episode: int  # its place in the turn
+    episode: int  # its index in the group
     step: int
     score: float
     action: tuple[float, ...]
     height: int
     width: int
-    picture: bytes  # deflated
+    picture: bytes  # compressed
     latent: bytes
     state: bytes
 
 
 class FrameSampler:
-    """An observer that samples steps while `is_watched`, and sends them."""
+    """A `StepObserver` that sends samples of steps while `is_watched`."""
 
     def __init__(
         self,
@@ -50,30 +50,32 @@ class FrameSampler:
         clock: Callable[[], float] = perf_counter,
         cpu_time: Callable[[], float] = thread_time,
     ) -> None:
-        """`cpu_time` counts this thread's processor seconds: what others take of a busy host is no cost of sampling."""
+        """`cpu_time` gives the processor seconds of this thread, because a busy host slows down the wall clock."""
         self._send, self._is_watched, self._clock, self._cpu_time = send, is_watched, clock, cpu_time
         self._group, self._next_at = 0, 0.0
 
     def for_group(self, group: int) -> FrameSampler:
-        """The same, who looks on at this turn from now on."""
+        """Switch to another group, and return this sampler."""
         self._group = group
         return self
 
-    def due(self) -> bool:
-        """Whether the last frame is long enough ago, and somebody still watches."""
+    def is_due(self) -> bool:
+        """Whether the next frame is due and somebody watches."""
         return self._clock() >= self._next_at and self._is_watched()
 
-    def see(self, episode: int, look: Callable[[], StepSnapshot]) -> None:
-        """Show a step; what goes wrong with it is nobody's failure."""
+    def observe(self, episode: int, look: Callable[[], StepSnapshot]) -> None:
+        """Send a frame of a step; an error here must not fail the episode, so it is ignored."""
         began, before = self._clock(), self._cpu_time()
         with suppress(Exception):
             self._send(_make_frame(self._group, episode, look()))
         self._next_at = began + max(FRAME_INTERVAL, (self._cpu_time() - before) / MAX_TIME_SHARE)
 
+    due, see = is_due, observe  # former names, which batches of other packages may call
 
-def _make_frame(group: int, episode: int, glimpse: StepSnapshot) -> SampledFrame:
-    none = 1, 1, b""
-    picture = none if glimpse.picture is None else pack_picture(glimpse.picture)
-    mind = (b"" if each is None else each.astype("<f4").tobytes() for each in (glimpse.latent, glimpse.state))
-    action = tuple(float(each) for each in np.ravel(glimpse.action)[:MAX_ACTIONS])
-    return SampledFrame(group, episode, glimpse.step, float(glimpse.score), action, *picture, *mind)
+
+def _make_frame(group: int, episode: int, step: StepSnapshot) -> SampledFrame:
+    no_picture = 1, 1, b""
+    picture = no_picture if step.picture is None else pack_picture(step.picture)
+    model = (b"" if each is None else each.astype("<f4").tobytes() for each in (step.latent, step.state))
+    action = tuple(float(each) for each in np.ravel(step.action)[:MAX_ACTIONS])
+    return SampledFrame(group, episode, step.step, float(step.score), action, *picture, *model)

@@ -1,10 +1,9 @@
-"""A turn: the jobs that a child scores together, and what comes of them."""
+"""Scoring a group of jobs in a child process: the group, and its results."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -14,21 +13,20 @@ import numpy as np
 
 from dreamfleet.common.protocol.messages import MAX_UPLOAD, Job, Result, TaskSpec
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, clamp_count, rejection_reason
+from dreamfleet.worker.service.failure_log import ScoringFailure
 
 if TYPE_CHECKING:  # the child imports this module before it imports what scores
     from dreamfleet.worker.scoring.rollout import Rollout
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Score
 
-MAX_TRACE = 8000  # characters, from the end, where the cause stands
-
 JobWithVector = tuple[Job, bytes]
-"""A job and its vector's bytes."""
+"""A job, and the bytes of its vector."""
 
 
 @dataclass
 class JobGroup:
-    """Jobs that a child scores together, in one specification: one, or as many as its task's width."""
+    """Jobs of one specification that a child scores together: one, or up to the task's batch size."""
 
     number: int
     work: Sequence[JobWithVector]
@@ -36,42 +34,21 @@ class JobGroup:
 
     @property
     def jobs(self) -> list[Job]:
-        """Its jobs."""
+        """The jobs without their vectors."""
         return [job for job, _ in self.work]
 
     @property
     def size(self) -> int:
-        """Bytes of its vectors."""
+        """Bytes of all vectors."""
         return sum(len(vector) for _, vector in self.work)
 
 
 @dataclass(frozen=True)
-class ScoringFailure:
-    """What was raised: in one line, where it came from, and the whole traceback.
-
-    Failures of one `kind` come from one line of code, whatever numbers their texts name.
-    """
-
-    text: str
-    kind: str
-    trace: str
-
-    @classmethod
-    def of(cls, error: Exception) -> ScoringFailure:
-        """From an exception that was caught."""
-        lines = str(error).strip().splitlines()
-        places = traceback.extract_tb(error.__traceback__)
-        place = f"{places[-1].filename}:{places[-1].lineno}" if places else "nowhere"
-        name, first = type(error).__name__, lines[0] if lines else ""
-        trace = "".join(traceback.format_exception(error)).rstrip()
-        return cls(_plain(f"{name}: {first}"[:500]), f"{name} at {place}", _plain(trace[-MAX_TRACE:]))
-
-
-@dataclass(frozen=True)
 class GroupDone:
-    """A child's word that a turn is over: a result of each of its jobs, or none where it was told to give up.
+    """Message of a child that finished a group: one result a job, or none if the group was abandoned.
 
-    A file that a job left comes through the pipe, never through a disk. A `failure` is why the results are errors.
+    `upload` is the rollout file of a job; it passes through the pipe, never through a disk. `failure` explains results
+    that are errors.
     """
 
     group: int
@@ -80,19 +57,15 @@ class GroupDone:
     failure: ScoringFailure | None = None
 
 
-def _plain(text: str) -> str:
-    """Text that can travel: half a surrogate pair, as in the name of a file, cannot."""
-    return text.encode(errors="replace").decode()
-
-
 class AbandonedError(Exception):
-    """The running turn is not wanted any more."""
+    """The running group is no longer wanted."""
 
 
 def score_group(scorer: Scorer, group: int, work: Sequence[JobWithVector], count: Callable[[int], None]) -> GroupDone:
-    """A result of each job; whatever a task raises is the jobs' error, not the slot's end.
+    """Score a group and return one result a job.
 
-    `count` hears of all steps made so far, and ends the turn by raising `AbandonedError`.
+    R8: an exception of the task becomes an error of these jobs, never a fitness. It does not end the slot.
+    `count` gets the number of steps so far, over all jobs; it may raise `AbandonedError` to end the group.
     """
     started, made = perf_counter(), 0
 
@@ -118,7 +91,7 @@ def score_group(scorer: Scorer, group: int, work: Sequence[JobWithVector], count
 def _score(
     scorer: Scorer, work: Sequence[JobWithVector], on_step: Callable[[int], None], spec: TaskSpec
 ) -> tuple[list[Score], bytes | None]:
-    """The score of each job, and the file of a kept rollout."""
+    """The score of each job, and the file of a collected rollout."""
     episodes = [(job.kind, np.frombuffer(vector, dtype="<f4"), job.seeds[0]) for job, vector in work]
     if episodes[0][0] == "collect":
         _, vector, seed = episodes[0]
@@ -130,19 +103,22 @@ def _score(
 def _results(
     work: Sequence[JobWithVector], scores: list[Score], spent: float, upload: bytes | None, horizon: int
 ) -> tuple[Result, ...]:
-    """A result of each job; `ValueError` where a task's scores are not one number a job that a run can count."""
+    """One result a job; `ValueError` if the task's scores are not one finite number a job."""
     if len(scores) != len(work):
         raise ValueError(f"the task gave {len(scores)} scores of {len(work)} episodes")
     if not all(math.isfinite(score.fitness) for score in scores):
-        raise ValueError("the task gave a fitness that is no number")
+        raise ValueError("the task gave a fitness that is not a finite number")
     if not all(0 <= int(score.steps) < 2**63 for score in scores):
-        raise ValueError("the task gave a number of steps that is none")
+        raise ValueError("the task gave a number of steps that is not from 0 to 2**63 - 1")
     sha256 = None if upload is None else hashlib.sha256(upload).digest()
     return tuple(_result(job, score, spent, sha256, horizon) for (job, _), score in zip(work, scores, strict=True))
 
 
 def _result(job: Job, score: Score, spent: float, sha256: bytes | None, horizon: int) -> Result:
-    """A number that would spoil the run's is this job's error, and not that of the jobs that were scored with it."""
+    """The result of one job.
+
+    R8: a fitness or step count out of bounds becomes this job's error; the jobs scored with it keep their results.
+    """
     fitness, steps = float(score.fitness), int(score.steps)
     why = rejection_reason(fitness, steps, spent, LONGEST_EPISODE if job.kind == "evaluate" else horizon)
     if why is None:

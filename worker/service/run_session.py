@@ -1,7 +1,7 @@
-"""A worker's time in one run: it takes jobs, has them scored, and delivers until each result has its verdict.
+"""A worker in one run: it receives jobs, has them scored, and delivers each result until it has a verdict.
 
-One owner thread and one queue; Zenoh's callbacks and the slots' readers only enqueue. What is decided lies in pure
-parts (`Membership`, `Backlog`, `Outbox`, `UploadQueue`); here they meet the clock, the session and the slots.
+One thread owns everything and reads one queue; Zenoh's callbacks and the slots' readers only enqueue. The decisions are
+in pure classes (`Membership`, `Backlog`, `Outbox`, `UploadQueue`). This module gives them times and events.
 """
 
 from __future__ import annotations
@@ -27,33 +27,32 @@ from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.frame_publisher import FramePublisher
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.membership import COORDINATOR_GONE_AFTER, Membership, WorkerLoad
-from dreamfleet.worker.service.outbox import Outbox
+from dreamfleet.worker.service.outbox import BURST_INTERVAL, Outbox, UploadQueue
 from dreamfleet.worker.service.sender import CoordinatorSender, StepRate
 from dreamfleet.worker.service.slot import SlotEvent
 from dreamfleet.worker.service.slot_pool import SlotPool
-from dreamfleet.worker.service.upload_queue import BURST_INTERVAL, UploadQueue
 
 log = logging.getLogger(__name__)
-MAX_WAITING_BATCHES = 1024  # batches; a coordinator sends again what was not seen
-CLOCK_GAP = 2.0  # seconds between turns of the loop that mean a suspended host
+MAX_WAITING_BATCHES = 1024  # R26: more batches are dropped unread; the coordinator sends unconfirmed ones again
+CLOCK_GAP = 2.0  # seconds between two passes of the loop that mean that the host was suspended
 
 Events = queue.SimpleQueue[tuple[str, Any]]
 
 
 @dataclass(frozen=True)
 class CoordinatorLink:
-    """How this worker reaches coordinators: its session and name, and what it decodes with."""
+    """How this worker reaches coordinators: its session, its identity and its decoder."""
 
     session: zenoh.Session
     identity: str
     inbox: CountingDecoder
-    # To a run by name, of a class that may not be known yet, by who is in the run of this uid; `None`: nobody answers.
+    # Says hello: run name, host class (empty if unknown), uid of the joined run; `None` if nobody answers.
     request_admission: Callable[[str, str, str], Admission | None]
-    retry_delay: Callable[[], float]  # seconds until hello may be said again
+    retry_delay: Callable[[], float]  # seconds until the next hello
 
 
 class RunSession:
-    """The run that this worker has joined; `serve` returns when the worker leaves it."""
+    """This worker in the run that it has joined; `serve` returns when it leaves."""
 
     def __init__(
         self, link: CoordinatorLink, admission: Admission, membership: Membership, slots: SlotPool, events: Events
@@ -74,7 +73,7 @@ class RunSession:
         self._finished = self._steps_finished = 0
 
     def serve(self) -> None:
-        """Work until told to leave, or until the run is over; ends neither the slots nor the session."""
+        """Work until this worker stops or the run is over. Closes neither the slots nor the session."""
         declared = self._startup()
         try:
             self._main_loop()
@@ -105,6 +104,7 @@ class RunSession:
             before = now
             self._wait()
             now = monotonic()
+            # R21: after a suspension the gap is added to the slots' deadlines, so that no child counts as hanging.
             self._slots.check(now, gap=now - before if now - before > CLOCK_GAP else 0.0)
             if self._membership.start_draining_if_due(now):
                 self._return_unstarted_jobs()
@@ -115,7 +115,8 @@ class RunSession:
                 self._rejoin(now)
 
     def _shutdown(self, declared: list[Any]) -> None:
-        self._send_heartbeat(monotonic(), capacity=0)  # tells its end from that of a worker that was killed
+        # R24: a last heartbeat without capacity says that this worker left in order and was not killed.
+        self._send_heartbeat(monotonic(), capacity=0)
         for each in declared:
             each.undeclare()
         log.info(
@@ -123,7 +124,7 @@ class RunSession:
         )
 
     def _wait(self) -> None:
-        """Handle what has arrived, waiting until the next beat or repetition at most."""
+        """Handle all waiting events; without any, wait for one until something must be sent."""
         timeout = min(max(self._next_heartbeat_at - monotonic(), 0.0), self._admission.intervals.repeat / 4)
         timeout = min(timeout, BURST_INTERVAL) if len(self._uploads) else timeout
         with suppress(queue.Empty):
@@ -132,9 +133,10 @@ class RunSession:
                 self._handle(*self._events.get_nowait())
 
     def _handle(self, kind: str, event: Any) -> None:
-        """One event. No message of a coordinator ends a worker: what raises costs that message, which is sent again.
+        """Handle one event.
 
-        What a slot says is our own affair: a slot that cannot start ends the worker.
+        R7: an error in a coordinator's message costs only that message, which is repeated, and never ends the worker.
+        An error in a slot's event does end it, for example when no slot can start.
         """
         if kind == "slot" and isinstance(event.message, SampledFrame):
             self._publish_frame(event, event.message)
@@ -164,11 +166,17 @@ class RunSession:
             log.info("the coordinator of run %s is out of sight: it left, or the connection was cut; %s",
                      self._admission.run, then,
                      extra={"facts": {"event": "coordinator gone", "run": self._admission.run}})  # fmt: skip
-        elif self._membership.add_coordinator(nonce):  # of another life the new welcome is told
+        elif self._membership.add_coordinator(nonce):  # joining another life is logged by `_rejoin`
             log.info("the coordinator of run %s is in sight again; this worker goes on", self._admission.run,
                      extra={"facts": {"event": "coordinator back", "run": self._admission.run}})  # fmt: skip
 
     def _handle_batch(self, payload: bytes) -> None:
+        """Handle jobs, cancellations and verdicts.
+
+        R12: a batch of another life or of an older numbering is ignored, because the coordinator has said its content
+        again since. A batch of a newer numbering only makes this worker say hello.
+        R9: a cancelled job stops at its next step.
+        """
         batch = self._link.inbox.decode(JobBatch, payload)
         if batch is None:
             return
@@ -176,10 +184,10 @@ class RunSession:
         if (batch.run_uid, batch.incarnation, batch.nonce) != (ours.run_uid, ours.incarnation, ours.nonce):
             self._link.inbox.dropped["foreign coordinator"] += 1
             return
-        if batch.numbering < self._backlog.numbering:  # what it says was said again since
+        if batch.numbering < self._backlog.numbering:
             self._link.inbox.dropped["earlier numbering"] += 1
             return
-        if batch.numbering > self._backlog.numbering:  # it was welcomed again or given up, unheard; or so anybody says
+        if batch.numbering > self._backlog.numbering:
             self._link.inbox.dropped["unheard numbering"] += 1
             self._membership.suspect_forgotten()
             return
@@ -189,12 +197,12 @@ class RunSession:
         for digest in batch.cancels:
             self._slots.abandon(digest)
         for job, why in self._backlog.add_batch(batch, self._slots.wanted_digests):
-            if len(self._outbox) < MAX_LEASES:  # more than a beat can name nobody waits for
+            if len(self._outbox) < MAX_LEASES:  # R26: a heartbeat can list no more, and the job is given again
                 self._outbox.add(Result(job.digest, None, 0, 0.0, why, None))
         judged = [verdict.digest for verdict in batch.verdicts]
         self._outbox.acknowledge(judged)
         self._uploads.acknowledge(judged)
-        if self._membership.draining:  # jobs that were on their way: the next beat shows that they are not here
+        if self._membership.draining:  # R24: jobs that were on their way go back; the next heartbeat does not list them
             self._backlog.clear()
 
     def _handle_slot_event(self, event: SlotEvent) -> None:
@@ -203,7 +211,7 @@ class RunSession:
         capacity = self._slots.capacity
         results = self._slots.handle(event)
         if self._slots.capacity > capacity:
-            self._next_heartbeat_at = 0.0  # new capacity is told at once
+            self._next_heartbeat_at = 0.0  # report new capacity at once
         for result in results:
             self._finished += 1
             self._steps_finished += result.steps
@@ -211,10 +219,10 @@ class RunSession:
         if results:
             if event.upload is not None:
                 self._uploads.add(results[0].digest, event.upload)
-            self._fill_slots(now)  # before the other slots' events are looked at
+            self._fill_slots(now)  # before other events, so that the slot does not idle
 
     def _publish_frame(self, event: SlotEvent, frame: SampledFrame) -> None:
-        """Publish a frame. It is no news that the coordinator owes an answer to, so its silence goes on."""
+        """Publish a frame. The coordinator owes no answer to it, so its silence is not restarted."""
         work = self._slots.find_job(event.slot, event.child_number, frame)
         if work is not None:
             self._frame_publisher.show(self._admission, event.slot, work, frame)
@@ -224,23 +232,28 @@ class RunSession:
             self._slots.fill(self._backlog, undelivered=len(self._outbox))
 
     def _return_unstarted_jobs(self) -> None:
-        """Begin nothing more; the next beat shows what is no longer here."""
+        """Give up the jobs that no slot has started.
+
+        R24: the next heartbeat does not list them, so the coordinator gives them to another worker at once.
+        """
         self._backlog.clear()
         self._slots.abandon_waiting()
 
     def _send(self, now: float) -> None:
-        if (
-            now >= self._next_heartbeat_at
-        ):  # first, so that a coordinator that has just welcomed it listens to what follows
+        """Send what is due.
+
+        R19: the heartbeat comes first, because only a heartbeat makes this worker a member whose results count.
+        """
+        if now >= self._next_heartbeat_at:
             self._next_heartbeat_at = now + self._admission.intervals.beat
             self._send_heartbeat(now, capacity=0 if self._membership.draining else self._slots.capacity)
         for results in self._outbox.due(now):
-            self._sender.results(self._slots, results)
-        for piece in self._uploads.due(now):  # after the beat, which says that the job is in these hands
-            self._sender.upload(piece)
+            self._sender.send_results(self._slots, results)
+        for part in self._uploads.due(now):
+            self._sender.send_part(part)
 
     def _send_heartbeat(self, now: float, capacity: int) -> None:
-        self._sender.beat(
+        self._sender.send_heartbeat(
             self._slots,
             numbering=self._backlog.numbering,
             seen=self._backlog.seen,
@@ -254,24 +267,32 @@ class RunSession:
         return WorkerLoad(idle=self._slots.idle, awaits_verdict=len(self._outbox) > 0, uploading=len(self._uploads) > 0)
 
     def _rejoin(self, now: float) -> None:
-        """Say hello again; what runs goes on, what is unacknowledged is kept, what is queued is given again."""
+        """Say hello again.
+
+        R22: an extra hello is harmless. Running jobs go on and results without a verdict are kept; if the answer starts
+        a new numbering, queued jobs are dropped and given again.
+        """
         self._membership.note_hello_sent(now, self._link.retry_delay())
         admission = self._link.request_admission(self._admission.run, self._slots.host_class, self._admission.run_uid)
         if admission is None:
             return
         if (admission.run_uid, admission.spec) != (self._admission.run_uid, self._admission.spec):
             raise RefusedError(f"run {admission.run} is another run now")
-        anew = admission.nonce != self._admission.nonce
+        restarted = admission.nonce != self._admission.nonce
         self._admission = admission
         self._sender = CoordinatorSender(self._link.session, self._link.identity, admission)
-        if anew or admission.numbering != self._backlog.numbering:
+        if restarted or admission.numbering != self._backlog.numbering:
             self._restart_numbering(admission.numbering)
         self._membership.rejoin(admission.nonce, monotonic())
-        level = logging.INFO if anew else logging.DEBUG  # an idle worker of a paused run asks again and again
+        level = logging.INFO if restarted else logging.DEBUG  # an idle worker of a paused run says hello repeatedly
         log.log(level, "joined run %s again, incarnation %d", admission.run, admission.incarnation)
 
     def _restart_numbering(self, numbering: int) -> None:
-        """What was given under the last one is given again; what is unacknowledged is said again."""
+        """Start a new numbering of batches.
+
+        R12: the coordinator gives the queued jobs again under it, so they are dropped here.
+        R7: every result without a verdict is sent again at once, because the coordinator may not have the last sending.
+        """
         self._backlog.start_numbering(numbering)
         self._backlog.clear()
         self._outbox.resend_all()

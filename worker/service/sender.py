@@ -1,4 +1,4 @@
-"""What a worker says to its run's coordinator, as messages on its keys."""
+"""Messages from a worker to the coordinator of its run."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from dreamfleet.common.protocol.messages import (
     UploadPart,
 )
 from dreamfleet.worker.service.admission import Admission
+from dreamfleet.worker.service.outbox import FilePart
 from dreamfleet.worker.service.slot_pool import SlotPool
-from dreamfleet.worker.service.upload_queue import FilePart
 
-MAX_STEPS_PER_SECOND = 1e9  # steps that a beat can say
-SMOOTHING = 0.3  # weight of the newest interval in the throughput
+MAX_STEPS_PER_SECOND = 1e9  # the largest rate that a heartbeat can report
+SMOOTHING = 0.3  # weight of the newest interval in the rate
 
 
 class StepRate:
-    """Environment steps a second, smoothed over the intervals between two readings."""
+    """Environment steps a second, smoothed over the intervals between heartbeats."""
 
     def __init__(self, now: float) -> None:
         self._value = 0.0
         self._last = (now, 0)
 
     def update(self, now: float, steps: int) -> float:
-        """The rate, with `steps` made in all until now."""
+        """The rate at time `now`, when `steps` steps were made in all."""
         (then, before), self._last = self._last, (now, steps)
         if now > then:
             self._value += SMOOTHING * (max(steps - before, 0) / (now - then) - self._value)
@@ -44,15 +44,15 @@ class StepRate:
 
 
 class CoordinatorSender:
-    """Sends to the coordinator's life that `admission` names; a new life makes a new one."""
+    """Sends to the one life of a coordinator that `admission` names."""
 
     def __init__(self, session: zenoh.Session, identity: str, admission: Admission) -> None:
         self._session = session
         self._identity = identity
         self._admission = admission
 
-    def results(self, slots: SlotPool, results: tuple[Result, ...]) -> None:
-        """One message of finished jobs."""
+    def send_results(self, slots: SlotPool, results: tuple[Result, ...]) -> None:
+        """Send results in one message."""
         batch = ResultBatch(
             run_uid=self._admission.run_uid,
             incarnation=self._admission.incarnation,
@@ -62,24 +62,28 @@ class CoordinatorSender:
         )
         self._publish(keys.result(self._admission.run, self._identity), batch)
 
-    def upload(self, piece: FilePart) -> None:
-        """One part of a job's file."""
-        part = UploadPart(
+    def send_part(self, part: FilePart) -> None:
+        """Send one part of a job's rollout file."""
+        message = UploadPart(
             run_uid=self._admission.run_uid,
             incarnation=self._admission.incarnation,
-            digest=piece.digest,
-            sha256=piece.sha256,
-            offset=piece.offset,
-            total=piece.total,
-            data=piece.data,
+            digest=part.digest,
+            sha256=part.sha256,
+            offset=part.offset,
+            total=part.total,
+            data=part.data,
         )
-        self._publish(keys.upload(self._admission.run, self._identity), part)
+        self._publish(keys.upload(self._admission.run, self._identity), message)
 
-    def beat(
+    def send_heartbeat(
         self, slots: SlotPool, *, numbering: int, seen: int, capacity: int, queued: Sequence[bytes],
         unacked: Sequence[bytes], rate: float,
     ) -> None:  # fmt: skip
-        """What this worker holds: batches up to `seen`, jobs queued and running, results without a verdict."""
+        """Send a heartbeat: batches received up to `seen`, queued and running jobs, results without a verdict.
+
+        R10: `seen` confirms batches. R12: `numbering` names their numbering, so it confirms no batch of another one.
+        R20: every job that this worker has is listed, because a job that is not listed is given to another worker.
+        """
         running: list[RunningJob] = slots.running
         beat = Heartbeat(
             run_uid=self._admission.run_uid,
@@ -100,7 +104,7 @@ class CoordinatorSender:
         self._publish(keys.beat(self._admission.run, self._identity), beat)
 
     def _host_class(self, slots: SlotPool) -> str | None:
-        """The host's class, if it is known and the coordinator knows what that is."""
+        """The host class, if it is known and the coordinator supports host classes."""
         return slots.host_class or None if self._admission.classes else None
 
     def _publish(self, key: str, message: Message) -> None:

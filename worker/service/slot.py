@@ -1,4 +1,4 @@
-"""A slot: one scoring child after another, so that a crashed simulator costs one job and not the worker."""
+"""A scoring slot: it keeps one child process running, so that a crashed simulator costs one job and not the worker."""
 
 from __future__ import annotations
 
@@ -16,23 +16,24 @@ from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
 from dreamfleet.worker.service.child import ChildReady
 from dreamfleet.worker.service.child_process import ChildMessage, ChildProcess
+from dreamfleet.worker.service.failure_log import ScoringFailure
 from dreamfleet.worker.service.frame_sampler import SampledFrame
-from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector, ScoringFailure
+from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector
 
 log = logging.getLogger(__name__)
-FAILED_STARTS = 3
-MAX_NAME_LENGTH = 100  # characters of who draws, which a task says
-START_RETRY_DELAY = 2.0  # seconds until a host that had no room for a child is asked again
+FAILED_STARTS = 3  # failed starts in a row that end the worker
+MAX_NAME_LENGTH = 100  # characters of `drawn_by`
+START_RETRY_DELAY = 2.0  # seconds until the next try, where the host had no resources for a child
 REMEDY = "give it fewer --slots, or this host more room (ulimit -n, ulimit -u, memory, the disk of temporary files)"
-MAX_START_DELAY = 30.0  # seconds before another child, where one after another ends without having done anything
-START_LIMIT = 120.0  # seconds that a child may take to load task and world model; doubled with each that took longer
-SHORT_GROUP = 0.25  # seconds: after turns below it the next one already waits in the child
-MAX_PIPELINED_BYTES = 64 * 1024  # bytes of vectors that a pipe takes while its child is busy
+MAX_START_DELAY = 30.0  # the longest pause before a new child, where children end one after another without a result
+START_LIMIT = 120.0  # seconds that a child may take to load task and world model; doubled with each failed start
+SHORT_GROUP = 0.25  # seconds; after a group that was shorter, a second group is queued in the child
+MAX_PIPELINED_BYTES = 64 * 1024  # bytes of vectors that a pipe accepts while its child is busy
 
 
 @dataclass(frozen=True)
 class SlotEvent:
-    """What a slot tells its worker: a word of the child of that life, or that it is gone."""
+    """A message from the child number `child_number` of a slot; `None` as the message: the child is gone."""
 
     slot: int
     child_number: int
@@ -40,19 +41,19 @@ class SlotEvent:
 
     @property
     def failure(self) -> ScoringFailure | None:
-        """What the child raised: as it started, or in the turn that is over."""
+        """What the child raised as it started or while it scored the finished group."""
         if isinstance(self.message, GroupDone):
             return self.message.failure
         return self.message if isinstance(self.message, ScoringFailure) else None
 
     @property
     def upload(self) -> bytes | None:
-        """The file that the turn left."""
+        """The rollout file of the finished group."""
         return self.message.upload if isinstance(self.message, GroupDone) else None
 
 
 class Slot:
-    """The parent's side of one child, which has one turn in its hands and at most one more waiting."""
+    """The parent's side of one child, which scores one group and queues at most one more."""
 
     def __init__(
         self,
@@ -64,9 +65,9 @@ class Slot:
         memory_limit: int = 0,
         restore_bundle: Callable[[], object] = lambda: None,
     ) -> None:
-        """`allowed_tasks` are the tasks that a run may ask of this worker; `memory_limit` in bytes; 0: none.
+        """`allowed_tasks` are those that the child may import; `memory_limit` is in bytes, 0 means none.
 
-        `restore_bundle` makes `bundle` whole again after a child that could not start: others write into the cache.
+        `restore_bundle` fetches the file `bundle` again after a failed start, because others also write to the cache.
         """
         self.number = number
         self.ready = False
@@ -78,46 +79,46 @@ class Slot:
         self._memory_limit = memory_limit
         self._restore_bundle = restore_bundle
         self._groups: deque[JobGroup] = deque()
-        self._groups_are_short = False  # the last turn was
-        self._progress = (0, 0.0)  # steps, and when they were last seen to grow; while it starts, when that began
+        self._groups_are_short = False  # whether the last one was
+        self._progress = (0, 0.0)  # steps, and when they last grew; before the child is ready, when it was started
         self._child_number = 0
         self._failed_starts = 0
-        self._useless_children = 0  # children in a row that ended without a finished turn
+        self._useless_children = 0  # children in a row that ended without a finished group
         self._start_at = 0.0
-        self._child: ChildProcess | None = None  # `None` while it must wait for the next one
+        self._child: ChildProcess | None = None  # `None` until `_start_at`
         self._kill_reason, self._last_error = "", ""
-        self._sent = 0  # turns given to this child
+        self._sent = 0  # groups sent to this child
         self._is_watched = False
         self._start()
 
     @property
     def running(self) -> list[Job]:
-        """Jobs of the turn in the child's hands."""
+        """Jobs of the group that the child scores now."""
         return self._groups[0].jobs if self._groups else []
 
     @property
     def waiting(self) -> list[Job]:
-        """Jobs that the child has not begun."""
+        """Jobs that the child has not started."""
         return [job for group in list(self._groups)[1:] for job in group.jobs]
 
     @property
     def wanted_digests(self) -> set[bytes]:
-        """Digests of all its jobs that are wanted."""
+        """Digests of its jobs that are still wanted."""
         return {job.digest for group in self._groups for job in group.jobs if job.digest not in group.unwanted}
 
     @property
     def idle(self) -> bool:
-        """Ready, with nothing to do."""
+        """Whether the child is ready and has nothing to do."""
         return self.ready and not self._groups
 
     @property
     def can_queue_another(self) -> bool:
-        """Whether a turn may wait in the child, so that it need not wait for us between short ones."""
+        """Whether a second group may be queued in the child, so that it need not wait between short ones."""
         return self.ready and self._groups_are_short and len(self._groups) == 1
 
     @property
     def steps(self) -> int:
-        """Environment steps of the running turn so far, over all of its jobs."""
+        """Environment steps of the running group so far, over all its jobs."""
         return self._child.steps if self._groups and self._child else 0
 
     @property
@@ -126,8 +127,8 @@ class Slot:
         return self._child.pid if self._child else 0
 
     def submit(self, work: Sequence[JobWithVector]) -> None:
-        """Give the child a turn."""
-        assert self._child is not None  # it is idle, or takes more
+        """Send the child a group of jobs."""
+        assert self._child is not None  # the caller checked `idle` or `can_queue_another`
         self._sent += 1
         group = JobGroup(self._sent, work)
         self._groups.append(group)
@@ -136,22 +137,22 @@ class Slot:
         self._child.send(group.number, group.work)
 
     def show(self, wanted: bool) -> None:
-        """Have steps of its turns shown from the next one on, by this child and those after it; or no more."""
+        """Start sending frames with the next group, also after the child is replaced; or stop."""
         self._is_watched = wanted
         if self._child is not None:
             self._child.show(wanted)
 
     def find_job(self, child_number: int, frame: SampledFrame) -> JobWithVector | None:
-        """The job whose step was shown; `None` of a turn that is none of this child's any more."""
+        """The job that a frame shows; `None` if its group is no longer running."""
         if child_number != self._child_number or not self._groups or self._groups[0].number != frame.group:
             return None
         work = self._groups[0].work
         return work[frame.episode] if frame.episode < len(work) else None
 
     def check(self, now: float, gap: float) -> None:
-        """Kill a child that hangs in a turn or as it starts; `gap` is how long this host itself stood still.
+        """Kill a child that makes no steps or does not start; without a child, start one when it is time.
 
-        Where there is none, start one when its time has come.
+        R21: `gap`, the seconds for which this host was suspended, do not count as hanging.
         """
         if self._child is None:
             if now >= self._start_at:
@@ -170,7 +171,10 @@ class Slot:
         self._progress = (self.steps, since)
 
     def abandon(self, digest: bytes) -> None:
-        """A job is not wanted any more; a turn without a wanted one ends at its next step, if it is not over before."""
+        """Mark a job as unwanted.
+
+        R9: a group without a wanted job ends at its next step.
+        """
         for group in self._groups:
             digests = {job.digest for job in group.jobs}
             group.unwanted |= {digest} & digests
@@ -178,7 +182,7 @@ class Slot:
                 self._child.abandon_group(group.number)
 
     def handle(self, event: SlotEvent) -> tuple[Result, ...]:
-        """Take one of this slot's events; the results of its turn, if that has ended."""
+        """Handle one of this slot's events; return the results if it ended a group."""
         if event.child_number != self._child_number:
             return ()
         if isinstance(event.message, ChildReady):
@@ -194,7 +198,7 @@ class Slot:
         return ()
 
     def stop(self) -> None:
-        """End the child."""
+        """Kill the child."""
         self._child_number += 1
         if self._child is not None:
             self._child.close()
@@ -225,8 +229,11 @@ class Slot:
         return done.results
 
     def _replace_child(self) -> tuple[Result, ...]:
-        """Another child in the place of one that is gone; errors for the jobs that it had in its hands."""
-        assert self._child is not None  # it was heard
+        """Replace a child that is gone; return errors for the jobs that it was scoring.
+
+        R8: a crash is an error of these jobs, never a fitness.
+        """
+        assert self._child is not None  # it has just sent its last event
         if not self._child.wait_for_exit():
             self._kill_reason = self._kill_reason or self._last_error
         steps = self.steps
@@ -234,7 +241,7 @@ class Slot:
         reason = self._kill_reason or ended_by or self._last_error
         if not self.ready:
             self._count_failed_start(reason)
-        lost = self._groups.popleft().jobs if self.ready and self._groups else []  # one that starts has begun nothing
+        lost = self._groups.popleft().jobs if self.ready and self._groups else []  # before it was ready it ran nothing
         log.warning("slot %d ended (%s)%s; starting another", self.number, reason, _describe_lost_jobs(lost))
         self._start_after_pause()
         return tuple(
@@ -247,7 +254,7 @@ class Slot:
             raise DreamfleetError(f"a slot cannot start: {reason}; `dreamfleet doctor` looks for the cause")
 
     def _start_after_pause(self) -> None:
-        """At once after a child that did something, ever later after those that did not: no host is kept busy so."""
+        """Start a child: at once after the first useless one in a row, then after growing pauses."""
         self._useless_children += 1
         self._clear_child(
             0.0 if self._useless_children < 2 else min(2.0 ** (self._useless_children - 3), MAX_START_DELAY)
@@ -262,7 +269,7 @@ class Slot:
         self._start_at = monotonic() + pause
 
     def _start(self) -> None:
-        """A new child; what waited for the last one goes to it."""
+        """Start a child and send it the groups that waited for the last one."""
         self._clear_child(0.0)
         self._kill_reason, self._last_error = "", "the child ended"
         self._sent = 0
@@ -294,7 +301,7 @@ class Slot:
 
 
 def _describe_lost_jobs(jobs: list[Job]) -> str:
-    """Which job a crash was in."""
+    """Which jobs a crash has ended."""
     if not jobs:
         return ""
     first, more = jobs[0], f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""

@@ -1,4 +1,4 @@
-"""All scoring slots of a worker, as one."""
+"""All scoring slots of a worker."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from dreamfleet.worker.service.failure_log import FailureLog
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import JobWithVector
 from dreamfleet.worker.service.slot import Slot, SlotEvent
-from dreamfleet.worker.service.task_allowlist import check_task_allowed
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.registry import check_task_allowed, find_task
 
 log = logging.getLogger(__name__)
 
 
 class SlotPool:
-    """So many slots that score in one task; `stop` ends their children."""
+    """The slots that score one task; `stop` kills their children."""
 
     def __init__(
         self,
@@ -35,12 +34,12 @@ class SlotPool:
         memory_limit: int,
         restore_bundle: Callable[[], object] = lambda: None,
     ) -> None:
-        """`RefusedError` for a task that is not among `allowed_tasks`; `memory_limit` in bytes a slot; 0: none."""
+        """`RefusedError` for a task that is not in `allowed_tasks`; `memory_limit` is in bytes a slot, 0 means none."""
         check_task_allowed(spec.task, allowed_tasks)
         self._task = spec.task
-        self._width = find_task(spec.task).width
+        self._batch_size = find_task(spec.task).batch_size
         self._failures = FailureLog()
-        self.host_class = ""  # as the first child found it out; not known before
+        self.host_class = ""  # reported by the first child that is ready
         self._watched = False
         self._shown_slot: Slot | None = None
         self._slots: list[Slot] = []
@@ -48,7 +47,7 @@ class SlotPool:
             for number in range(count):
                 self._slots.append(Slot(number, spec, bundle, events, allowed_tasks, memory_limit, restore_bundle))
         except BaseException:
-            self.stop()  # children that outlived us here would be waited for at the interpreter's end, and wait too
+            self.stop()  # otherwise the interpreter would wait for these children at exit, and they for it
             raise
 
     def __len__(self) -> int:
@@ -56,27 +55,30 @@ class SlotPool:
 
     @property
     def busy(self) -> bool:
-        """Whether any scores."""
+        """Whether any slot scores."""
         return any(slot.running for slot in self._slots)
 
     @property
     def idle(self) -> bool:
-        """Whether any could score and none does."""
+        """Whether a slot could score and none does."""
         return any(slot.ready for slot in self._slots) and not self.busy
 
     @property
     def capacity(self) -> int:
-        """Jobs that they score at once."""
-        return min(sum(slot.ready for slot in self._slots) * self._width, MAX_LEASES // 2)
+        """How many jobs the ready slots score at once.
+
+        R14: heartbeats report it, and it bounds how many jobs the coordinator gives this worker.
+        """
+        return min(sum(slot.ready for slot in self._slots) * self._batch_size, MAX_LEASES // 2)
 
     @property
     def steps(self) -> int:
-        """Environment steps of what runs so far."""
+        """Environment steps of all running jobs so far."""
         return sum(slot.steps for slot in self._slots)
 
     @property
     def running(self) -> list[RunningJob]:
-        """Each running job, with its share of its turn's steps."""
+        """Each running job, with its share of its group's steps."""
         return [
             RunningJob(job.digest[:TAG_BYTES], clamp_count(slot.steps // len(slot.running)))
             for slot in self._slots
@@ -85,27 +87,30 @@ class SlotPool:
 
     @property
     def waiting(self) -> list[Job]:
-        """Jobs that lie in a slot and have not begun."""
+        """Jobs that are queued in a child and have not started."""
         return [job for slot in self._slots for job in slot.waiting]
 
     @property
     def drawn_by(self) -> str:
-        """Whose picture they see; `-` where that is not known yet."""
+        """What draws the pictures; `-` if unknown."""
         return next((slot.drawn_by for slot in self._slots if slot.ready), "-")
 
     def fill(self, backlog: Backlog, undelivered: int) -> None:
-        """Take turns from the backlog, unless too many results have no verdict yet: `undelivered`."""
-        room = 4 * len(self._slots) * self._width - undelivered
+        """Give jobs from the backlog to free slots.
+
+        R26: nothing starts while too many results, `undelivered`, wait for a verdict, so the outbox stays bounded.
+        """
+        room = 4 * len(self._slots) * self._batch_size - undelivered
         idle = [slot for slot in self._slots if slot.idle and room >= 0]
         ahead = [slot for slot in self._slots if slot.can_queue_another and room > 0]
         for slot in idle + ahead:
-            if work := backlog.take(self._width):
+            if work := backlog.take(self._batch_size):
                 slot.submit(work)
         if self._watched and self._shown_slot is not None and not self._shown_slot.running:
             self._switch_shown_slot()
 
     def show(self, wanted: bool) -> None:
-        """Have one of them show its episodes, or none."""
+        """Have one slot send frames, or none."""
         self._watched = wanted
         if self._shown_slot is not None:
             self._shown_slot.show(False)
@@ -114,48 +119,48 @@ class SlotPool:
             self._switch_shown_slot()
 
     def find_job(self, number: int, child_number: int, frame: SampledFrame) -> JobWithVector | None:
-        """The job of which a slot showed a step; `None` of one that is over."""
+        """The job that a slot's frame shows; `None` if it is over."""
         return self._slots[number].find_job(child_number, frame)
 
     def handle(self, event: SlotEvent) -> tuple[Result, ...]:
-        """Take a slot's event; the results that it brings."""
+        """Handle a slot's event; return the results that it brings."""
         slot = self._slots[event.slot]
         if isinstance(event.message, ChildReady):
             self.host_class = self.host_class or event.message.host_class
         if event.failure is not None:
-            # A child that is starting has begun nothing, so no job is to blame.
+            # A child that is not ready yet has started no job, so none is named.
             text = self._failures.format_if_new(event.failure, self._task, slot.running if slot.ready else ())
             if text is not None:
                 log.error("%s", text)
         return slot.handle(event)
 
     def check(self, now: float, gap: float) -> None:
-        """Kill what hangs; `gap` is how long this host itself stood still before `now`."""
+        """Kill children that hang; `gap` is for how many seconds before `now` this host was suspended."""
         for slot in self._slots:
             slot.check(now, gap)
 
     @property
     def wanted_digests(self) -> set[bytes]:
-        """Digests of the jobs that lie in a slot, begun or not, and are wanted."""
+        """Digests of the wanted jobs that a slot has, started or not."""
         return set().union(*(slot.wanted_digests for slot in self._slots))
 
     def abandon(self, digest: bytes) -> None:
-        """A job is not wanted any more."""
+        """Mark a job as unwanted in every slot."""
         for slot in self._slots:
             slot.abandon(digest)
 
     def abandon_waiting(self) -> None:
-        """Give up what has not begun."""
+        """Abandon the jobs that have not started."""
         for job in self.waiting:
             self.abandon(job.digest)
 
     def stop(self) -> None:
-        """End all children."""
+        """Kill all children."""
         for slot in self._slots:
             slot.stop()
 
     def _switch_shown_slot(self) -> None:
-        """The first that runs shows its next turns in place of one that rests."""
+        """Let the first slot that scores send frames instead of one that idles."""
         another = next((slot for slot in self._slots if slot.running), self._shown_slot or self._slots[0])
         if another is not self._shown_slot:
             if self._shown_slot is not None:

@@ -1,4 +1,4 @@
-"""A worker process: connects, joins a run, serves it, and leaves; with `--any`, one run after another."""
+"""A worker process: it connects, joins a run, serves it, and leaves; with `--any`, it serves one run after another."""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ from dreamfleet.worker.service.membership import LeaveConditions, Membership
 from dreamfleet.worker.service.refusal_backoff import SINGLE_RUN_DELAYS, RefusalBackoff
 from dreamfleet.worker.service.run_session import CoordinatorLink, RunSession
 from dreamfleet.worker.service.slot_pool import SlotPool
-from dreamfleet.worker.service.task_allowlist import check_world_allowed
-from dreamfleet.worker.tasks.registry import find_task, known_tasks
+from dreamfleet.worker.tasks.registry import check_world_allowed, find_task, known_tasks
 
 log = logging.getLogger(__name__)
 RETRY = 1.0  # seconds between attempts to connect or join
@@ -48,9 +47,7 @@ class Worker:
 
     def __init__(self, config: WorkerConfig, network: Network, tasks: tuple[str, ...] = ()) -> None:
         for name in tasks:
-            find_task(
-                name
-            )  # one that cannot be loaded is an error now, and not once a run has taken this worker's word
+            find_task(name)  # fails now, rather than after a run has accepted this worker
         self.identity = keys.new_worker_identity(config.name)
         if network.credentials is not None:
             label, _, life = self.identity.partition("/")
@@ -61,59 +58,60 @@ class Worker:
         self._slot_count = config.slots or usable_cores()
         self._hello = make_request(self.identity, (*known_tasks(), *tasks), self._slot_count)
         lifetime = min(config.lifetime or math.inf, self._seconds_until_expiry)
-        terms = LeaveConditions(
+        conditions = LeaveConditions(
             lifetime, config.drain_timeout, leaves_without_coordinator=config.exit_when_done or config.any
         )
-        self._membership = Membership(terms, monotonic())
+        self._membership = Membership(conditions, monotonic())
         self._refusals = RefusalBackoff() if config.any else RefusalBackoff(*SINGLE_RUN_DELAYS)
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
 
     def stop(self) -> None:
-        """First: finish what runs and leave; second: leave now. Safe in a signal handler."""
+        """The first call: finish running jobs and leave. The second: leave now. Safe in a signal handler."""
         self._membership.stop()
         self._events.put(("wake", None))
 
     def serve(self) -> None:
-        """Work until told to stop, or until the run is over if so configured; `AccessError` as its join file ends."""
+        """Work until stopped, or until the run is over if configured so; `AccessError` if the join file expired."""
         session = self._startup()
         if session is not None:
             try:
                 self._main_loop(session)
             finally:
                 session.close()  # type: ignore[no-untyped-call]
-        who = self._network.credentials
-        if who is not None and self._seconds_until_expiry <= 0:
+        credentials = self._network.credentials
+        if credentials is not None and self._seconds_until_expiry <= 0:
             raise AccessError(
-                f"the join file of {who.identity} ({who.name}) ends at {who.expires:%Y-%m-%d %H:%M} UTC: have it "
-                "issued again, and start this worker with that"
+                f"the join file of {credentials.identity} ({credentials.name}) expires at "
+                f"{credentials.expires:%Y-%m-%d %H:%M} UTC: have it issued again, and start this "
+                "worker with that"
             )
 
     @property
     def _seconds_until_expiry(self) -> float:
-        """Seconds until it had better drain, for links are closed as a join file ends."""
-        who = self._network.credentials
-        return (
-            math.inf if who is None else who.time_left(datetime.now(UTC)).total_seconds() - self._config.drain_timeout
-        )
+        """Seconds until it must start to drain, because links are closed when the join file expires."""
+        credentials = self._network.credentials
+        if credentials is None:
+            return math.inf
+        return credentials.time_left(datetime.now(UTC)).total_seconds() - self._config.drain_timeout
 
     def _startup(self) -> zenoh.Session | None:
-        """A session, however long the router takes to come up; `None` if it shall leave meanwhile."""
-        times: Counter[str] = Counter()
+        """A session, as soon as the router answers; `None` if this worker stops first."""
+        failures: Counter[str] = Counter()
         while not self._is_leaving():
             try:
                 return open_session(self._network)
             except HandshakeRejectedError as error:
-                why, telling = f"{error}; trying again", 2  # a coordinator that has just come up lets it in next time
+                reason, logged_at = f"{error}; trying again", 2  # a coordinator that just started accepts the next try
             except ConnectionFailedError:
-                why, telling = f"waiting for a coordinator at {', '.join(self._network.connect)}", 1
-            times[why] += 1
-            if times[why] == telling:
-                log.warning("%s", why)
+                reason, logged_at = f"waiting for a coordinator at {', '.join(self._network.connect)}", 1
+            failures[reason] += 1
+            if failures[reason] == logged_at:
+                log.warning("%s", reason)
             self._pause()
         return None
 
     def _main_loop(self, session: zenoh.Session) -> None:
-        """One run, or one after another."""
+        """Serve one run, or one after another."""
         link = CoordinatorLink(
             session, self.identity, self.inbox, lambda *of: self._request_admission(session, *of), _jittered_retry
         )
@@ -127,11 +125,11 @@ class Worker:
                     return
 
     def _serve_run(self, link: CoordinatorLink, admission: Admission) -> None:
-        """Work for a run until it is over, or until this worker leaves."""
+        """Work for a run until it is over or this worker leaves."""
         bundle = None
         if admission.spec.bundle and (bundle := self._fetch_bundle(link.session, admission)) is None:
             return
-        # A queue of its own: what slots and coordinators of the last run still say must not pass for this one's.
+        # Each run has its own queue, so that late events of the last run are not taken for this one's.
         self._events = queue.SimpleQueue()
         with ExitStack() as stack:
             memory, path = self._config.slot_memory << 20, bundle.path if bundle else None
@@ -146,17 +144,17 @@ class Worker:
             RunSession(link, admission, self._membership, slots, self._events).serve()
 
     def _join(self, session: zenoh.Session) -> Admission | None:
-        """A run that has welcomed this worker; `None` if it shall leave meanwhile."""
-        said = False
+        """A run that welcomed this worker; `None` if this worker stops first."""
+        logged = False
         while not self._is_leaving():
             admission = self._request_any_run(session) if self._config.any else self._request_configured_run(session)
             if admission is not None:
                 return admission
-            if not said and not self._refusals.refusing_runs(monotonic()):
+            if not logged and not self._refusals.refusing_runs(monotonic()):
                 awaited = f"run {self._config.run}" if self._config.run else "a run"
-                barred = "; if it is served already, this join file was revoked" if self._network.credentials else ""
-                log.warning("waiting for %s%s", awaited, barred)
-            said = True
+                revoked = "; if it is served already, this join file was revoked" if self._network.credentials else ""
+                log.warning("waiting for %s%s", awaited, revoked)
+            logged = True
             self._pause()
         return None
 
@@ -178,16 +176,19 @@ class Worker:
             return None
 
     def _handle_refusal(self, run: str, error: RefusedError | DownloadError) -> None:
-        """A refusal ends only a worker that shall leave when it is done; any other asks again, ever later."""
+        """Raise the error with `--exit-when-done`; otherwise log it and ask again later.
+
+        R23: the reason may pass and anybody could have answered, so the worker asks again with growing pauses.
+        """
         if self._config.exit_when_done:
             raise error
         refuser = self._refusal_key(run)
         pause = self._refusals.add(refuser, monotonic())
         if self._refusals.is_news(refuser, str(error)):
-            log.warning("%s; asking again in %.0f s, and then ever later", error, pause)
+            log.warning("%s; asking again in %.0f s, then with growing pauses", error, pause)
 
     def _refusal_key(self, run: str) -> str:
-        """Under which name a refusal is remembered: a worker of one run has one that may refuse."""
+        """The key of a refusal in `RefusalBackoff`: a worker of one run remembers only one."""
         return run if self._config.any else ""
 
     def _request_admission(
@@ -204,7 +205,7 @@ class Worker:
         return self._membership.is_leaving(monotonic())
 
     def _pause(self) -> None:
-        """Wait a moment, with jitter, or until told to stop."""
+        """Wait about `RETRY` seconds, or until stopped."""
         deadline = monotonic() + _jittered_retry()
         while not self._is_leaving() and (left := deadline - monotonic()) > 0:
             try:

@@ -1,7 +1,7 @@
-"""What a task is: an environment, what a controller sees of it and may do, and all that the rest must know of a world.
+"""The contract of a task: an environment, the policy that acts in it, and what the rest of the system knows of it.
 
-The only module that a third party imports; docs/tasks.md has an example. The dream, the real track and any gymnasium
-environment satisfy the same contract, so that no caller can tell them apart.
+A package with a task imports only this module; docs/tasks.md has an example. The dream, the real track and any
+gymnasium environment satisfy the same contract.
 """
 
 from __future__ import annotations
@@ -53,68 +53,90 @@ __all__ = [
 ENVIRONMENT_LIMIT = 10**6  # steps: the environment's own limit ends an episode
 
 
+# Tasks of other packages may still use the former names on the left.
+FORMER_NAMES = {
+    "make_judge": "make_evaluation_environment",
+    "make_shown": "make_watched_environment",
+    "width": "batch_size",
+}
+FORMER_WORLD_FIELDS = {"stray": "off_course", "stray_cost": "off_course_cost"}
+
+
+def accept_former_names(*owners: Any) -> None:
+    """Give each class or instance that defines a name of `FORMER_NAMES` its counterpart too, in both directions."""
+    for owner in owners:
+        own = dict(getattr(owner, "__dict__", {}))
+        for pair in FORMER_NAMES.items():
+            for given, other in (pair, pair[::-1]):
+                if given in own and other not in own:
+                    setattr(owner, other, own[given])
+
+
 class Policy(Protocol):
-    """What turns observations into actions, under one controller."""
+    """Turns observations into actions, with the parameters of one controller."""
 
     def begin(self, parameters: NDArray[np.float32]) -> None:
-        """Begin an episode with this controller's flat vector."""
+        """Start an episode with a controller's flat parameter vector `(size,)`."""
 
     def act(self, observation: Any) -> Any:
-        """The environment's next action."""
+        """The action for an observation, as the environment's `step` takes it."""
 
 
 class RewardAwarePolicy(Protocol):
-    """A policy that also wants to know what its actions bring; a policy need not."""
+    """Optional: a policy that is informed of rewards."""
 
     def reward(self, value: float) -> None:
-        """The reward of the last action, before the next one is asked for."""
+        """Called with the reward of the last action, before the next `act`."""
 
 
 class PolicyWithOutputs(Protocol):
-    """A policy whose actions hide what it computed, such as an index of the largest output; a policy need not tell."""
+    """Optional: a policy whose actions hide the numbers they come from, for example the index of the largest output."""
 
     def outputs(self, observation: Any) -> Any:
-        """What it makes an action of, as one or more arrays: by these bits too hosts are told apart."""
+        """The numbers that an action comes from, as one or more arrays. Their bits too tell host classes apart."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """An episode's outcome: fitness, and environment steps made."""
+    """Result of an episode: its fitness, and the number of environment steps."""
 
     fitness: float
     steps: int
 
 
 Episode = tuple[NDArray[np.float32], int]
-"""A candidate's flat vector and the seed of its episode."""
+"""A candidate's flat parameter vector, and the seed of the episode."""
 
 
 class StepSnapshot(NamedTuple):
-    """A step of an episode as whoever looks on is shown it, before its action is done."""
+    """One step of an episode for a live view, taken before its action is applied."""
 
-    step: int  # those that were made before it
-    score: float  # what they brought
-    action: NDArray[Any]  # that follows
-    picture: NDArray[np.uint8] | None = None  # (height, width, 3), where one is seen
+    step: int  # number of steps before it
+    score: float  # sum of the rewards of those
+    action: NDArray[Any]  # the action of this step
+    picture: NDArray[np.uint8] | None = None  # (height, width, 3)
     latent: NDArray[np.float32] | None = None  # (latent,), of a world model
-    state: NDArray[np.float32] | None = None  # (state,), what it remembers before the action
+    state: NDArray[np.float32] | None = None  # (state,), the world model's before the action
 
 
 class StepObserver(Protocol):
-    """Somebody looks on while episodes are scored; what he sees changes no score by a bit."""
+    """Receives some steps of episodes while they are scored. It changes no score.
 
-    def due(self) -> bool:
-        """Whether the present step is to be shown: far fewer are than are made."""
+    The observer that a task gets also answers to the methods' former names `due` and `see`.
+    """
 
-    def see(self, episode: int, look: Callable[[], StepSnapshot]) -> None:
-        """Look at a step of one of the episodes that are scored together, by its place among them."""
+    def is_due(self) -> bool:
+        """Whether to call `observe` for the present step; true for few steps."""
+
+    def observe(self, episode: int, look: Callable[[], StepSnapshot]) -> None:
+        """Receive a step of the episode with this index in its batch; `look()` makes the snapshot."""
 
 
 @dataclass(frozen=True)
 class DreamReward:
-    """What a dreamt step is worth where the MDN-RNN predicts no reward itself: `gain * value - cost`.
+    """The reward of a dreamt step where the MDN-RNN does not predict it: `gain * value - cost`.
 
-    `value` is the output of the head for the reward's label, or, for `survival`, whether the dream goes on.
+    `value` is the output of the head for the reward's label, or, with `survival`, 1 if the dream goes on and else 0.
     """
 
     gain: float
@@ -124,32 +146,49 @@ class DreamReward:
 
 @dataclass(frozen=True)
 class World:
-    """All that the rest of the system must know of a world."""
+    """What the rest of the system must know of a world.
+
+    `off_course` and `off_course_cost` may also be given and read by their former names `stray` and `stray_cost`.
+    """
 
     actions: Actions
-    packages: tuple[str, ...] = ("numpy", "gymnasium")  # distributions whose versions a fitness may depend on
-    idle_cost: float = 0.0  # what a step without a reward costs: charged for steps that `patience` cuts off
-    horizon: int = ENVIRONMENT_LIMIT  # steps of a judged episode at most
-    version: int = 1  # to be raised whenever the same parameters and seeds give another fitness
-    time_cost: float = 0.0  # what a candidate pays for each step until `finish`, or its horizon; nobody who is judged
-    stray_cost: float = 0.0  # what it pays for each step whose `info` says `stray`; of 100 an episode at most
-    frames_per_second: int = 30  # of a video
-    action_names: tuple[str, ...] = ()  # of continuous actions, for people
-    dream_reward: DreamReward | None = None  # of worlds that world models are trained on
-    stray: str = ""  # of the environment's `info`: whether it left the course in this step; empty: it does not say
-    threshold: float | None = None  # mean score at which gymnasium has the world for solved; `None`: it says none
-    finish: str = ""  # of the environment's `info`: whether the course was driven to its end; empty: it does not say
+    packages: tuple[str, ...] = ("numpy", "gymnasium")  # distributions on whose versions a fitness may depend
+    idle_cost: float = 0.0  # charged for each step that `patience` cuts off: what a step without a reward costs
+    horizon: int = ENVIRONMENT_LIMIT  # most steps of an evaluation episode
+    version: int = 1  # raise it whenever the same parameters and seeds give another fitness
+    time_cost: float = 0.0  # charged to a candidate for each step until `finish` or its horizon; never in evaluations
+    off_course_cost: float = 0.0  # charged to a candidate for each step off the course, of 100 an episode at most
+    frames_per_second: int = 30  # of videos
+    action_names: tuple[str, ...] = ()  # labels of continuous actions
+    dream_reward: DreamReward | None = None  # for world models that predict no reward
+    off_course: str = ""  # key of the environment's `info`: whether this step left the course; empty: there is none
+    threshold: float | None = None  # mean score at which gymnasium considers the world solved; `None`: unknown
+    finish: str = ""  # key of the environment's `info`: whether the course was driven to its end; empty: there is none
+
+    stray = property(lambda self: self.off_course)
+    stray_cost = property(lambda self: self.off_course_cost)
+
+
+_init_world = World.__init__
+
+
+def _init_world_by_former_names(self: World, *values: Any, **fields: Any) -> None:
+    former = {present: fields.pop(name) for name, present in FORMER_WORLD_FIELDS.items() if name in fields}
+    _init_world(self, *values, **{**fields, **former})  # `dataclasses.replace` passes both; the former one is new
+
+
+World.__init__ = _init_world_by_former_names  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True)
 class Assignment:
-    """What is to be scored: the run's specification and, for tasks that need one, its world model."""
+    """What is scored: a run's specification and, for tasks that need one, its world model."""
 
     spec: TaskSpec
     bundle: Bundle | None = None
 
     def __post_init__(self) -> None:
-        """`BundleError` for another world model than the specification names: a fitness would be of another run."""
+        """`BundleError` if the bundle is not the one that the specification names."""
         if self.bundle is not None and self.bundle.sha256 != self.spec.bundle:
             raise BundleError(
                 f"{self.bundle.path} is the world model {self.bundle.sha256[:12]}..., and what is scored in is "
@@ -158,12 +197,12 @@ class Assignment:
 
     @classmethod
     def of(cls, task: str, bundle: Bundle) -> Assignment:
-        """A task on a world model outside of any run."""
+        """A task with a world model, outside of any run."""
         return cls(TaskSpec(task, bundle.sha256, ENVIRONMENT_LIMIT, 0), bundle)
 
     @property
     def world_model(self) -> Bundle:
-        """The bundle, under the run's controllers and variant; `BundleError` where there is none."""
+        """The bundle with the run's controller shape and variant; `BundleError` if there is no bundle."""
         spec = self.spec
         if self.bundle is None:
             raise BundleError(f"task {spec.task} needs a world model: give one with --bundle")
@@ -172,79 +211,96 @@ class Assignment:
 
     @property
     def controller(self) -> ControllerShape:
-        """The controllers that are scored."""
+        """The shape of the controllers that are scored."""
         if self.spec.controller is None:
             return self.world_model.controller_shape
         return self.spec.controller
 
 
 class Task:
-    """One thing to score in; what is not told here is refused by name when the task is looked up.
+    """Base class of tasks.
 
-    A subclass gives `name`, `world` and `make_environment`; one that needs no bundle also `describe(options)`: the
-    `Description` that a new run freezes, or `UsageError` for an option that it does not know. Its policy is a linear or
-    hidden controller on the flat observation unless `make_policy` says otherwise.
+    A subclass defines `name`, `world` and `make_environment`. Without a world model it also defines
+    `describe(options)`, which returns the `Description` that a new run freezes, or raises `UsageError` for an unknown
+    option. The default policy is a linear or hidden controller on the flat observation.
+    An incomplete task is refused when it is looked up, with a list of what is missing.
+
+    Three members have former names that still work, defined or called: `make_judge` is
+    `make_evaluation_environment`, `make_shown` is `make_watched_environment`, and `width` is `batch_size`.
     """
 
     name: str
-    width: ClassVar[int] = 1  # episodes that a slot scores at once
-    # Of an episode of fixed seed and parameters by which a worker finds out its host's class, before it is given
-    # anything to score; 0: nobody looks, and the host's fingerprint tells its class.
+    batch_size: ClassVar[int] = 1  # episodes that a slot scores at once
+    # Steps of a short episode with a fixed seed and fixed parameters, by which a worker determines its host class
+    # before it scores anything. 0: there is no such episode, and the host's fingerprint determines the class.
     probe_steps: ClassVar[int] = 16
     world: World
 
-    def world_of(self, assignment: Assignment) -> World:  # noqa: ARG002 - a dream asks its bundle
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        accept_former_names(*cls.__mro__)
+
+    def world_of(self, assignment: Assignment) -> World:  # noqa: ARG002 - other tasks' worlds depend on the assignment
         """The world that is scored in."""
         return self.world
 
-    def reality(self, assignment: Assignment) -> Task:  # noqa: ARG002 - a dream asks its bundle
-        """The task of the world that whole episodes are driven in: itself, unless it dreams."""
+    def reality(self, assignment: Assignment) -> Task:  # noqa: ARG002 - a dream's reality depends on its bundle
+        """The task whose world evaluation episodes are driven in: this one, unless it is a dream."""
         return self
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
-        """A new environment; its observations are what the policy takes."""
+        """A new environment that candidates are scored in; the policy takes its observations."""
         raise NotImplementedError
 
-    def make_judge(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
-        """The environment that reported scores and videos come from; the same where there is no second one."""
+    def make_evaluation_environment(
+        self, assignment: Assignment, render_mode: str | None = None
+    ) -> gymnasium.Env[Any, Any]:
+        """A new environment that reported scores and videos come from; by default `make_environment`."""
         if render_mode is not None:
-            raise UsageError(f"task {self.name} draws no pictures: its make_judge takes no render_mode")
+            raise UsageError(
+                f"task {self.name} draws no pictures: its make_evaluation_environment takes no render_mode"
+            )
         return self.make_environment(assignment)
 
-    def make_shown(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:  # noqa: ARG002 - as above
-        """What candidates are scored in while somebody looks on, where it takes another environment to have pictures.
+    def make_watched_environment(
+        self, assignment: Assignment  # noqa: ARG002 - subclasses use it
+    ) -> gymnasium.Env[Any, Any] | None:  # fmt: skip
+        """A new environment that candidates are scored in while somebody watches, for tasks that observe no pictures.
 
-        The same to the bit, and `render` gives pictures and changes nothing. `None`: there is none, and what the
-        policy observes is shown if it is a picture.
+        It must give the same scores to the bit; its `render` gives pictures and changes nothing else. `None`: there is
+        none, and observations are shown if they are pictures.
         """
         return None
 
     def make_policy(self, assignment: Assignment) -> Policy:
-        """What drives; `BundleError` if the bundle is of another task."""
+        """A new policy; `BundleError` if the bundle belongs to another task."""
         return FlatPolicy(assignment.controller, self.world_of(assignment).actions)
 
 
+accept_former_names(Task)
+
+
 class Batch(Protocol):
-    """Scores many episodes together; each is the same bits alone."""
+    """Scores many episodes together; each score has the same bits as when it is scored alone."""
 
     def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None]) -> list[Score]:
-        """The score of each; `on_step` hears of all steps made so far."""
+        """The score of each episode; calls `on_step` with the number of steps so far, over all episodes."""
 
 
 @runtime_checkable
 class WatchableBatch(Protocol):
-    """A batch that somebody may look on at."""
+    """Optional: a batch whose episodes can be watched."""
 
     def watched(self, observer: StepObserver) -> Batch:
-        """The same batch, which shows the onlooker one of its episodes; its scores are the same bits."""
+        """The same batch with the same scores, which passes steps of one episode to `observer`."""
 
 
 @runtime_checkable
 class BatchedTask(Protocol):
-    """A task that scores candidates in batches, beside its environment, in which its means are evaluated."""
+    """Optional: a task that scores candidates in batches. Its evaluations are still driven in its environment."""
 
     def make_batch(self, assignment: Assignment) -> Batch:
-        """What scores candidates; `BundleError` if the bundle has no such thing.
+        """A batch that scores candidates; `BundleError` if the bundle cannot do that.
 
         Called again whenever the specification's temperature (`--heat`), horizon or patience (`--schedule`) changes.
         """
@@ -252,12 +308,12 @@ class BatchedTask(Protocol):
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """One way from an environment's observation to the picture that a world model sees."""
+    """A function from an environment's observation to the picture that a world model sees."""
 
-    name: str  # in bundles' manifests and in recorded rollouts
+    name: str  # as bundles' manifests and recorded rollouts name it
     size: int  # height and width of its pictures
     picture: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]  # to `(size, size, 3)`, both uint8
-    mirrors: bool = True  # whether a picture turned left for right is one of a drive that steers the other way
+    mirrors: bool = True  # whether a mirrored picture shows a drive with mirrored steering
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -267,39 +323,39 @@ class Preprocessing:
 
 @runtime_checkable
 class RecordableTask(Protocol):
-    """A task whose world rollouts are recorded in and world models are trained on."""
+    """Optional: a task in whose world rollouts are recorded and world models are trained."""
 
     name: str
     world: World
     preprocessings: Mapping[str, Preprocessing]
     drivers: Mapping[str, Callable[[np.random.Generator], Driver]]
-    """Random drivers by name, in the order in which collecting takes them in turn."""
+    """Random drivers by name, in the order in which collecting uses them in turn."""
 
     def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
-        """An environment that observes the pictures of one of its preprocessings."""
+        """A new environment that observes the pictures of the preprocessing with this name."""
 
     def begin_anywhere(self, environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:
-        """Move a reset environment to somewhere else in its world; what is observed there."""
+        """Move a reset environment to a random place in its world; return the observation there."""
 
 
 @runtime_checkable
 class TaskWithPolicies(Protocol):
-    """A task that also drives for data sets as others did for theirs."""
+    """Optional: a task that also has random policies of published data sets."""
 
     policies: Mapping[str, Callable[[np.random.Generator], Policy]]
-    """Random policies by name, each for one drive; none is taken unless it is named."""
+    """Random policies by name, each for one drive; each is used only if it is named."""
 
 
 @runtime_checkable
 class TaskWithTrueState(Protocol):
-    """A task whose worlds tell their true state.
+    """Optional: a task whose worlds report their true state.
 
-    `dreamfleet inspect` measures world models against it, and `dreamfleet evaluate` tells how a controller drove.
+    `dreamfleet inspect` measures world models against it, and `dreamfleet evaluate` reports how a controller drove.
     """
 
     def truth(self, environment: gymnasium.Env[Any, Any]) -> dict[str, float]:
-        """The true state behind the last observation, the same names at every step.
+        """The true state behind the last observation, with the same names at every step.
 
-        A world whose road can be lost names `off_road`, 1 or 0, and how far off it is `lateral_offset`; one in which
-        something drives names its `speed`.
+        A world with a road names `off_road` (1 or 0) and `lateral_offset`, the distance from the road's middle; a world
+        in which something drives names its `speed`.
         """

@@ -1,4 +1,4 @@
-"""Policies that need no world model: a controller on a flat vector of observations, and a driver that does not look."""
+"""Policies without a world model: a controller on flat observations, and a driver that ignores observations."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError
 
 Floats = NDArray[np.float32]
-ALL_DRIVERS = "random"  # among names of drivers: each of a world's in turn
+ALL_DRIVERS = "random"  # as a driver's name: all drivers of a task in turn
 
 
 class FlatPolicy:
-    """Linear, or through one layer of tanh units; observations are shifted and scaled by what the run froze."""
+    """A linear controller, or one with a layer of tanh units, on observations that the run's statistics normalise."""
 
     def __init__(self, shape: ControllerShape, actions: Actions, mean: Any = 0.0, deviation: Any = 1.0) -> None:
-        """`mean` and `deviation` `(observations,)` of the observations, as they were when the run began."""
+        """`mean` and `deviation` are of the observations, `(observations,)`; `ControllerError` for a wrong size."""
         if shape.actions != actions.outputs:
             raise ControllerError(f"a controller of {shape.actions} outputs does not fit {actions.outputs} actions")
         self._shape, self._actions = shape, actions
@@ -28,15 +28,15 @@ class FlatPolicy:
         self._layers: list[tuple[Floats, Floats]] = []
 
     def begin(self, parameters: Floats) -> None:
-        """Begin an episode with this controller's flat vector."""
+        """Start an episode with a controller's flat parameter vector `(size,)`."""
         self._layers = self._shape.unpack(parameters.astype(np.float32))
 
     def act(self, observation: Any) -> Any:
-        """The action for one observation of any shape, flattened."""
+        """The action for an observation of any shape."""
         return self._actions.to_action(self.outputs(observation))
 
     def outputs(self, observation: Any) -> Floats:
-        """The controller's outputs `(outputs,)` for one observation, of which the actions are made."""
+        """The controller's outputs `(outputs,)` for an observation; the action is made of them."""
         value = (np.asarray(observation, dtype=np.float32).reshape(-1) - self._mean) * self._scale
         *before, (weights, biases) = self._layers
         for each, offsets in before:
@@ -46,7 +46,7 @@ class FlatPolicy:
 
 
 class Driver(Protocol):
-    """Chooses actions without looking: what the first world model learns from."""
+    """Chooses actions without observations; the first world model learns from such drives."""
 
     def act(self) -> Floats:
         """The next action."""
@@ -59,7 +59,7 @@ class DriverPolicy:
         self._driver = driver
 
     def begin(self, parameters: Floats) -> None:
-        """A driver has none."""
+        """Do nothing: a driver has no parameters."""
 
     def act(self, _observation: Any) -> Any:
         """The driver's next action."""

@@ -1,16 +1,36 @@
-"""Tasks as a worker finds them, and what is wrong with one that is incomplete."""
+"""Finding tasks by name: which ones this worker may look up, and what an incomplete one lacks.
+
+Looking up a task's name imports a module and calls what the name refers to. A coordinator's message must not cause
+that, so a worker announces the tasks that it has in its hello, and checks every other name before it looks it up.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 from dreamfleet.common.artifacts.actions import Continuous, Discrete
-from dreamfleet.common.errors import UsageError
-from dreamfleet.common.protocol.tasks import load_task, registered_tasks
-from dreamfleet.worker.tasks.api import Task, World
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.errors import RefusedError, UsageError
+from dreamfleet.common.protocol.tasks import family_of, load_task, registered_tasks
+from dreamfleet.worker.tasks.api import Task, World, accept_former_names
 
-REQUIRED_METHODS = ("make_environment", "make_judge", "make_policy", "world_of")
+REQUIRED_METHODS = ("make_environment", "make_evaluation_environment", "make_policy", "world_of")
+
+
+def check_task_allowed(task: str, allowed_tasks: Collection[str]) -> None:
+    """`RefusedError` unless this worker announced the task or its family."""
+    if family_of(task) not in allowed_tasks:
+        raise RefusedError(
+            f"the run scores in task {task!r}, which this worker did not announce: start it with --task {task} if you "
+            "trust that, or install the package that registers it"
+        )
+
+
+def check_world_allowed(bundle: Bundle, allowed_tasks: Collection[str]) -> None:
+    """`RefusedError` if a bundle's task is in a module that this worker did not announce."""
+    if ":" in bundle.manifest.task:
+        check_task_allowed(bundle.manifest.task, allowed_tasks)
 
 
 def known_tasks() -> tuple[str, ...]:
@@ -21,6 +41,7 @@ def known_tasks() -> tuple[str, ...]:
 def find_task(name: str) -> Task:
     """A task by name; `UsageError` lists the registered ones, or says what this one lacks."""
     task = load_task(name)
+    accept_former_names(task, *type(task).__mro__)
     if missing := list(_find_problems(task)):
         raise UsageError(f"task {name!r} is incomplete: {'; '.join(missing)}; docs/tasks.md shows a whole one")
     found: Task = task
@@ -30,12 +51,12 @@ def find_task(name: str) -> Task:
 def _find_problems(task: Any) -> Iterator[str]:
     if not isinstance(getattr(task, "name", None), str):
         yield "name must be a text"
-    width = getattr(task, "width", None)
-    if not isinstance(width, int) or not 1 <= width <= 1024:
-        yield f"width must be a whole number from 1 to 1024, not {width!r}"
+    batch_size = getattr(task, "batch_size", None)
+    if not isinstance(batch_size, int) or not 1 <= batch_size <= 1024:
+        yield f"batch_size must be a whole number from 1 to 1024, not {batch_size!r}"
     world = getattr(task, "world", None)
     if getattr(type(task), "world_of", Task.world_of) is not Task.world_of:
-        pass  # it asks its bundle
+        pass  # its world follows from the bundle
     elif not isinstance(world, World):
         yield f"world must be a World, not {type(world).__name__}"
     elif not isinstance(world.actions, (Continuous, Discrete)):

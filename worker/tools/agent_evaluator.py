@@ -1,4 +1,4 @@
-"""Whole episodes in the environment that reported scores come from, and how they were driven."""
+"""Evaluation episodes of an agent, with statistics of how it drove."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, score
 from dreamfleet.worker.tasks.api import Score, World
 
-SPEED, BRAKE = "speed", "brake"  # of a world's truth, and of its actions
+SPEED, BRAKE = "speed", "brake"  # names in a task's true state, and among a world's actions
 
 
 class AgentEvaluator:
-    """Drives an agent in the environment that reported scores come from, one episode after the other."""
+    """Drives an agent in its evaluation environment, one episode after another."""
 
     def __init__(self, agent: Agent) -> None:
         self._world, self._parameters = agent.world, agent.parameters
-        self._environment, self._policies = agent.make_judge(), agent.make_policies()
+        self._environment, self._policies = agent.make_evaluation_environment(), agent.make_policies()
         self._truth = agent.truth
 
     def drive(self, seed: int) -> EpisodeResult:
-        """One whole episode; the truth is only looked at, so that a score is the same whoever looks."""
+        """Drive one whole episode. The statistics do not change its score."""
         truth, episode_config = self._truth, EpisodeConfig(seed, self._world.horizon)
         watch = DriveStatistics(self._world, None if truth is None else lambda: truth(self._environment))
         driven = score(
@@ -36,7 +36,7 @@ class AgentEvaluator:
 
 
 class DriveStatistics:
-    """Notes how one episode is driven, as far as its world lets it know."""
+    """Collects statistics of one episode, as far as its world reports them."""
 
     def __init__(self, world: World, truth: Callable[[], dict[str, float]] | None) -> None:
         self._truth, self._finish = truth, world.finish
@@ -47,16 +47,16 @@ class DriveStatistics:
         self._finished = False
 
     def on_transition(self, moment: Transition) -> None:
-        """One step that was made."""
+        """Add a step."""
         self._finished = bool(moment.info.get(self._finish, False))
-        told = self._truth() if self._truth is not None else {}
-        if SPEED in told:
-            self._speeds.append(told[SPEED])
+        true_state = self._truth() if self._truth is not None else {}
+        if SPEED in true_state:
+            self._speeds.append(true_state[SPEED])
         if self._brake is not None:
             self._braked.append(bool(moment.action[self._brake] > 0))
 
     def drive(self, seed: int, score: Score) -> EpisodeResult:
-        """The whole of it."""
+        """The result of the whole episode."""
         finished = self._finished if self._finish else None
         return EpisodeResult(seed, score.fitness, score.steps, finished, _mean(self._speeds), _mean(self._braked))
 

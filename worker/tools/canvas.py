@@ -1,4 +1,4 @@
-"""One step of a drive as one frame: the track, beside it what the model sees, decodes and dreams."""
+"""Drawing one step of a drive as one frame: the track, and beside it what the model sees, decodes and dreams."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 import pygame
 from numpy.typing import NDArray
 
-SIDE = 192  # of the small pictures: three times or twice their size
+SIDE = 192  # pixels of the small pictures: three times or twice their size
 MARGIN, LABEL, GAP = 8, 22, 10
 BACKGROUND, INK, FAINT = (18, 20, 24), (235, 235, 235), (150, 155, 165)
 PEDALS = ("gas", "brake")
 COLOURS = ((120, 170, 255), (110, 210, 120), (240, 110, 100))
-MOST_BARS, BAR, NARROWEST = 3, 122, 600  # bars of actions, pixels of one, and of a world's picture
+MAX_BARS, BAR, MIN_WIDTH = 3, 122, 600  # bars of actions; pixels of a bar, and of a world's picture
 
 Frame = NDArray[np.uint8]
 Corner = tuple[int, int]
@@ -22,31 +22,31 @@ Corner = tuple[int, int]
 
 @dataclass(frozen=True)
 class FrameLayout:
-    """How large the world is drawn, and whether the small pictures have room beside it."""
+    """The size of the world's picture, and whether there is a column of small pictures beside it."""
 
     track: tuple[int, int]
     column: bool = True
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of a frame; both even, as the codec wants."""
+        """Width and height of a frame; both even, as the codec requires."""
         return self.track[0] + (SIDE + 32 if self.column else 2 * MARGIN), self.track[1] + 80
 
 
-AWAKE = FrameLayout((600, 400))  # two small pictures
-DREAMING = FrameLayout((900, 600))  # three
+AWAKE = FrameLayout((600, 400))  # with two small pictures
+DREAMING = FrameLayout((900, 600))  # with three
 
 
 def plain_layout(picture: Frame) -> FrameLayout:
-    """A world's picture alone, large enough for the words below it."""
+    """The layout of a world's picture alone, wide enough for the text below it."""
     height, width = picture.shape[:2]
-    scale = max(1.0, NARROWEST / width)
+    scale = max(1.0, MIN_WIDTH / width)
     return FrameLayout((round(width * scale) // 2 * 2, round(height * scale) // 2 * 2), column=False)
 
 
 @dataclass(frozen=True)
 class DreamPicture:
-    """What the model dreams at a step, and since which step it has not looked."""
+    """A dreamt picture, and the step of the drive at which the dream started."""
 
     picture: Frame
     since: int
@@ -54,7 +54,7 @@ class DreamPicture:
 
 @dataclass(frozen=True)
 class ModelPictures:
-    """What a world model sees, makes of it, and dreams."""
+    """The picture that a world model sees, the decoded latent, and the dreamt picture."""
 
     seen: Frame
     decoded: Frame
@@ -63,7 +63,7 @@ class ModelPictures:
 
 @dataclass(frozen=True)
 class DriveFrame:
-    """One step of the drive."""
+    """What is drawn of one step."""
 
     track: Frame
     action: NDArray[Any]
@@ -73,10 +73,10 @@ class DriveFrame:
 
 
 class Board:
-    """A surface on which pictures, words and bars of actions are laid out."""
+    """A surface with methods that draw pictures, text and bars of actions."""
 
     def __init__(self, size: tuple[int, int], actions: tuple[str, ...] = ()) -> None:
-        """`actions` names what the bars show."""
+        """`actions` are the labels of the bars."""
         pygame.font.init()
         self._actions = actions
         self._large = pygame.font.Font(None, 30)
@@ -84,17 +84,17 @@ class Board:
         self._surface = pygame.Surface(size)
 
     def _draw_action(self, action: NDArray[Any], right: int, top: int) -> None:
-        """Bars of continuous actions, as many as have room left of `right`; a discrete one by its number."""
+        """Draw bars of a continuous action, left of `right`; of a discrete action its number."""
         if action.dtype.kind in "iu":
             self._text(f"action {int(action[0])}", (right - 16 - BAR, top), self._small, FAINT)
             return
-        shown = action[:MOST_BARS]
+        shown = action[:MAX_BARS]
         names = self._actions or tuple(f"action {index}" for index in range(len(shown)))
         for index, (name, value) in enumerate(zip(names, shown, strict=False)):
             self._bar(name, COLOURS[index], float(value), (right - (len(shown) - index) * BAR, top))
 
     def _picture(self, picture: Frame, corner: Corner, size: tuple[int, int], *, smooth: bool = False) -> None:
-        """The small pictures keep their pixels' edges; the track is a painting."""
+        """Draw a picture at `size`: smoothed, or with visible pixels."""
         surface = pygame.surfarray.make_surface(np.transpose(picture, (1, 0, 2)))
         scale = pygame.transform.smoothscale if smooth else pygame.transform.scale
         self._surface.blit(scale(surface, size), corner)
@@ -103,7 +103,7 @@ class Board:
         self._surface.blit(font.render(text, True, colour), corner)
 
     def _bar(self, name: str, colour: tuple[int, int, int], value: float, corner: Corner) -> None:
-        """A bar from its middle; of a pedal, from its left."""
+        """Draw a bar from its middle, or, for a pedal, from its left end."""
         left, top = corner
         pedal = name in PEDALS
         self._text(f"{name} {value:.2f}" if pedal else f"{name} {value:+.2f}", corner, self._small, FAINT)
@@ -115,7 +115,7 @@ class Board:
 
 
 class Canvas(Board):
-    """Lays a moment out as one frame."""
+    """Draws frames of a recorded drive."""
 
     def __init__(self, seed: int, layout: FrameLayout = AWAKE, actions: tuple[str, ...] = ()) -> None:
         super().__init__(layout.size, actions)
@@ -145,6 +145,6 @@ class Canvas(Board):
 
 
 def pixels(surface: pygame.Surface) -> Frame:
-    """A surface as `(height, width, 3)`; ten times faster than turning pygame's array round."""
+    """A surface as an array `(height, width, 3)`; ten times faster than transposing pygame's own array."""
     width, height = surface.get_size()
     return np.frombuffer(pygame.image.tobytes(surface, "RGB"), np.uint8).reshape(height, width, 3)

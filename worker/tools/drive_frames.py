@@ -1,4 +1,4 @@
-"""A drive as frames: the world, what the model sees of it, what it makes of that, and what it dreams."""
+"""Turning the steps of a drive into frames: the world, and what the model sees, decodes and dreams."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from dreamfleet.worker.worldmodel.inference import Decoder
 
 
 class WorldModelView:
-    """What a world model sees, decodes and dreams while its controller drives."""
+    """Decodes and dreams with a world model while its controller drives."""
 
     def __init__(
         self, bundle: Bundle, policy: Any, parameters: NDArray[np.float32], dreaming: ParallelDreamConfig
@@ -37,12 +37,12 @@ class WorldModelView:
         self.layout = DREAMING if self._parallel_dream else AWAKE
 
     def follow(self, step: int, state: Any) -> None:
-        """Dream this step too; `state` is the policy's from before it acted."""
+        """Dream this step; `state` is the policy's before it acted."""
         if self._parallel_dream is not None:
             self._imagined = self._parallel_dream.follow(step, self._policy.latent, state)
 
     def pictures(self, seen: NDArray[np.uint8]) -> ModelPictures:
-        """The pictures at the step that was followed last."""
+        """The pictures of the step that was followed last; `seen` is its observation."""
         decoded, dreamt = self._decoder.decode(self._policy.latent)[0], None
         if self._parallel_dream is not None:
             dreamt = DreamPicture(self._decoder.decode(self._imagined)[0], self._parallel_dream.since)
@@ -50,7 +50,7 @@ class WorldModelView:
 
 
 class FilmedPolicy:
-    """A policy whose steps become frames, as the world looks before the action."""
+    """Wraps a policy and paints frames of its steps, each before its action."""
 
     def __init__(self, policy: Any, painter: FramePainter, model_view: WorldModelView | None) -> None:
         self._policy, self._painter, self._model_view = policy, painter, model_view
@@ -61,7 +61,7 @@ class FilmedPolicy:
         self._policy.begin(parameters)
 
     def act(self, observation: Any) -> Any:
-        """The policy's action, and a frame of it if one is due."""
+        """The policy's action; paint a frame if one is due."""
         state = getattr(self._policy, "state", None)
         action = self._policy.act(observation)
         if self._model_view is not None:
@@ -75,21 +75,21 @@ class FilmedPolicy:
         return action
 
     def reward(self, value: float) -> None:
-        """What the action brought."""
+        """Add the reward of the last action, and pass it to the policy."""
         self._score += value
-        tell = getattr(self._policy, "reward", None)
-        if tell is not None:
-            tell(value)
+        report_reward = getattr(self._policy, "reward", None)
+        if report_reward is not None:
+            report_reward(value)
 
 
 class FramePainter:
-    """Draws frames of one drive, all of one size, and passes them to `on_frame`."""
+    """Draws frames of one drive, all of the same size, and passes them to `on_frame`."""
 
     def __init__(
         self, environment: gymnasium.Env[Any, Any], world: World, seed: int, on_frame: Callable[[Frame], None],
         every: int = 1,
     ) -> None:  # fmt: skip
-        """`every` is how many steps lie between two frames."""
+        """`every` is the number of steps between two frames."""
         self.every = every
         self._environment, self._world, self._seed, self._on_frame = environment, world, seed, on_frame
         self._canvas: Canvas | None = None
@@ -97,7 +97,7 @@ class FramePainter:
     def add(
         self, action: Any, step: int, score: float, pictures: ModelPictures | None, layout: FrameLayout | None
     ) -> None:
-        """The frame of a step."""
+        """Draw the frame of a step."""
         picture: Any = self._environment.render()
         if self._canvas is None:
             self._canvas = Canvas(self._seed, layout or plain_layout(picture), self._world.action_names)

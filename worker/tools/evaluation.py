@@ -1,4 +1,4 @@
-"""Judging agents on unseen tracks, in gymnasium's own unmodified environment."""
+"""Evaluating agents on unseen tracks, in gymnasium's own unmodified environment."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from dreamfleet.worker.tools.agent_evaluator import AgentEvaluator
 
 
 def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[EpisodeResult]:
-    """Drive one whole episode a seed in `jobs` processes, in this one if it is 1; yields each as it ends."""
+    """Drive one whole episode for each seed in `jobs` processes, or in this one if it is 1; yield each when it ends."""
     pin_thread_pools()
-    if jobs == 1:  # here: a script of one's own need not guard its main part
+    if jobs == 1:  # in this process, so that a script needs no `if __name__ == "__main__"`
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         judge = AgentEvaluator(agent)
         yield from map(judge.drive, seeds)
@@ -40,8 +40,8 @@ def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Episod
             yield each.result()
     except BrokenProcessPool as error:
         raise DreamfleetError(
-            'a process that drove has crashed; in a script of your own call this under `if __name__ == "__main__":` or '
-            "with jobs=1; else `dreamfleet doctor` looks for the cause"
+            'a driving process has crashed; in your own script call this under `if __name__ == "__main__":` or with '
+            "jobs=1; otherwise `dreamfleet doctor` looks for the cause"
         ) from error
     finally:
         pool.shutdown(cancel_futures=True)
@@ -50,7 +50,7 @@ def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Episod
 def run_evaluation(
     name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, on_drive: Callable[[list[EpisodeResult]], None]
 ) -> EvaluationReport:
-    """What `evaluate` finds of an agent by the name that it was asked for; `on_drive` is shown the drives so far."""
+    """Evaluate an agent and report it under `name`; `on_drive` gets the results so far after each episode."""
     began, drives = perf_counter(), list[EpisodeResult]()
     for drive in evaluate(agent, seeds, jobs):
         drives.append(drive)
@@ -63,25 +63,25 @@ def run_evaluation(
 
 
 class _ProcessEvaluator:
-    """What drives in a process of its own."""
+    """Drives episodes in a child process."""
 
     agent: ClassVar[Agent]
 
     @classmethod
     def start(cls, agent: Agent, parent: int) -> None:
-        """Begin the process, which ends with its parent."""
+        """Initialise the process, which ends with its parent."""
         exit_with_parent(parent)
         os.environ["SDL_VIDEODRIVER"] = "dummy"
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches the whole group: end without a traceback
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches the whole process group: end without a traceback
         cls.agent = agent
 
     @classmethod
     def drive(cls, seed: int) -> EpisodeResult:
-        """One whole episode."""
+        """Drive one whole episode."""
         return cls._evaluator().drive(seed)
 
     @classmethod
     @cache
     def _evaluator(cls) -> AgentEvaluator:
-        """Made by the first drive, so that whatever is wrong is that drive's error."""
+        """Made by the first episode, so that its errors are reported as that episode's."""
         return AgentEvaluator(cls.agent)

@@ -1,4 +1,4 @@
-"""Where what is watched goes when it goes into no window: a video, a folder of pictures, or a stream of them."""
+"""Outputs of live frames other than a window: a video, a folder of pictures, or a stream."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from dreamfleet.common.monitoring.mjpeg import write_part
 from dreamfleet.worker.tools.canvas import Frame
 from dreamfleet.worker.tools.live_view import CaptionedFrame
 
-if TYPE_CHECKING:  # of the extra `views`
+if TYPE_CHECKING:  # it needs a package of the extra `views`
     from dreamfleet.worker.tools.video import Video
 
 VIDEO = ".mp4"
 
 
 SendFrame = Callable[[CaptionedFrame | None], bool]
-"""Shows a picture, or nothing yet; whether the viewer wants more."""
+"""Writes a frame (`None`: there is none yet); returns whether the viewer wants more."""
 
 
 @contextmanager
 def open_sink(out: str, rate: int, stdout: BinaryIO) -> Iterator[SendFrame]:
-    """What `--out` names: a video's file, a folder, or `-`; `UsageError` where nothing can be written."""
+    """Open what `--out` names: a video file, a folder, or `-`; `UsageError` if it cannot be written."""
     path = Path(out)
     if out == "-":
         yield lambda shown: shown is None or _write_part(stdout, shown)
@@ -50,13 +50,13 @@ def open_sink(out: str, rate: int, stdout: BinaryIO) -> Iterator[SendFrame]:
 
 
 def _write_frame(video: Video, shown: CaptionedFrame) -> bool:
-    """One more frame."""
+    """Add a frame to the video."""
     video.add(shown.picture)
     return True
 
 
 def _write_part(out: BinaryIO, shown: CaptionedFrame) -> bool:
-    """A part of `multipart/x-mixed-replace`, as a browser shows it in an image, unless the reader is gone."""
+    """Write a part of `multipart/x-mixed-replace`, which browsers show in an image; false if the reader is gone."""
     try:
         write_part(out, encode_picture(shown.picture, "jpg"), shown.facts)
     except BrokenPipeError:
@@ -65,7 +65,7 @@ def _write_part(out: BinaryIO, shown: CaptionedFrame) -> bool:
 
 
 def _write_picture(path: Path, shown: CaptionedFrame) -> bool:
-    """A PNG, and beside it its facts as JSON."""
+    """Write a PNG, and its facts as JSON beside it."""
     with open_output(path) as file:
         file.write(encode_picture(shown.picture, "png"))
     with open_output(path.with_suffix(".json")) as file:
@@ -74,7 +74,7 @@ def _write_picture(path: Path, shown: CaptionedFrame) -> bool:
 
 
 def encode_picture(picture: Frame, kind: str) -> bytes:
-    """A picture `(height, width, 3)` as `png` or `jpg`."""
+    """A picture `(height, width, 3)` as the bytes of a `png` or `jpg` file."""
     file = io.BytesIO()
     size = picture.shape[1], picture.shape[0]
     pygame.image.save(pygame.image.frombuffer(picture.tobytes(), size, "RGB"), file, f"frame.{kind}")

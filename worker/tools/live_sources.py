@@ -1,4 +1,4 @@
-"""The two things that can be watched live: what a worker scores, and a controller that is driven for the viewer."""
+"""The two sources of live frames: a worker that scores, and a controller that is driven for the viewer."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, Wor
 from dreamfleet.worker.tools.live_view import CaptionedFrame, LiveCanvas
 
 Driver = tuple[Agent, dict[str, Any]]
-"""Who drives, and the facts about him."""
+"""An agent, and the facts about it for captions."""
 
 
 def worker_frames(view: LiveView, glass: LiveCanvas, rate: float) -> Iterator[CaptionedFrame | None]:
-    """What a worker does, `rate` times a second until the run is over: the newest there is, again if nothing is newer.
+    """Yield a worker's newest frame `rate` times a second until the run is over; the last one again if none is new.
 
     `None` before the first frame.
     """
@@ -37,13 +37,13 @@ def worker_frames(view: LiveView, glass: LiveCanvas, rate: float) -> Iterator[Ca
 def driven_frames(
     driver: Callable[[], Driver], dreaming: ParallelDreamConfig, rate: float, seed: int
 ) -> Iterator[CaptionedFrame]:
-    """Whole episodes on track after track from `seed` on, at the speed of the world where `rate` are shown a second.
+    """Frames of whole episodes, one seed after another from `seed` on; `rate` frames show a second of the world.
 
-    `driver` is asked before each episode, and may be another each time.
+    `driver` is called before each episode and may return another agent each time.
     """
     for track in count(seed):
         agent, facts = driver()
-        environment = agent.make_judge("rgb_array")
+        environment = agent.make_evaluation_environment("rgb_array")
         try:
             yield from _episode(agent, facts, environment, replace(dreaming, seed=track), rate)
         finally:
@@ -53,7 +53,7 @@ def driven_frames(
 def _episode(
     agent: Agent, facts: dict[str, Any], environment: Any, dreaming: ParallelDreamConfig, rate: float
 ) -> Iterator[CaptionedFrame]:
-    """One episode; the seed is the dream's too."""
+    """Frames of one episode; its seed is also the dream's."""
     seed, world, drawn = dreaming.seed, agent.world, list[Frame]()
     policy: Any = agent.make_policies()(seed)
     policy.begin(agent.parameters)
@@ -70,7 +70,7 @@ def _episode(
 
 
 def limit_rate(pictures: Iterator[CaptionedFrame], rate: float) -> Iterator[CaptionedFrame]:
-    """At most `rate` a second: what is slower than that stays slow, and nothing is made up for."""
+    """At most `rate` frames a second; after a slow frame the following ones are not hurried."""
     due = monotonic()
     for shown in pictures:
         sleep(max(0.0, due - monotonic()))

@@ -1,4 +1,4 @@
-"""A live frame for people: what the model sees, what it decodes, and how it would dream on from there."""
+"""Drawing live frames of a worker: what the model sees, what it decodes, and how its dream continues from there."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from dreamfleet.worker.dream.parallel_dream import DreamContinuation, can_dream
 from dreamfleet.worker.tools.canvas import BACKGROUND, FAINT, INK, Board, Frame, pixels
 from dreamfleet.worker.worldmodel.inference import Decoder
 
-SIZE = 720, 680  # of a frame
-EDGE, LABEL, BIG, SMALL = 16, 22, 340, 163  # pixels: margin, a line of words, the sides of large and small pictures
-STRIP = EDGE + LABEL + BIG + 10  # where the dream's row begins
-FOOT = STRIP + LABEL + SMALL + 16  # where the words begin
-WHOLE = SIZE[0] - 2 * EDGE, FOOT - EDGE - LABEL - 10  # the room of a picture alone
-AHEAD = (10, 25, 50, 100)  # steps on: by two seconds a dream has left the track that is driven
-NAME = 28  # characters of a name that have room
+SIZE = 720, 680  # pixels of a frame
+EDGE, LABEL, BIG, SMALL = 16, 22, 340, 163  # pixels: margin, a line of text, the sides of large and small pictures
+STRIP = EDGE + LABEL + BIG + 10  # top of the row of dreamt pictures
+FOOT = STRIP + LABEL + SMALL + 16  # top of the text
+WHOLE = SIZE[0] - 2 * EDGE, FOOT - EDGE - LABEL - 10  # the space of a picture alone
+AHEAD = (10, 25, 50, 100)  # dreamt steps that are shown: after two seconds a dream has left the real track
+NAME = 28  # characters of a name that fit
 Corner = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class CaptionedFrame:
-    """A picture for people, and in facts what it shows."""
+    """A drawn frame, and the facts that it shows."""
 
     picture: Frame  # (height, width, 3)
     facts: dict[str, Any]
@@ -36,21 +36,21 @@ class CaptionedFrame:
 
 @dataclass(frozen=True)
 class DecodedDream:
-    """What a world model makes of a moment: its own picture of it, and of so many steps on."""
+    """The decoded latent of a moment, and dreamt pictures of later steps."""
 
     decoded: Frame
-    dreamt: tuple[tuple[int, Frame], ...]  # steps on, as far as the dream lasts
+    dreamt: tuple[tuple[int, Frame], ...]  # (steps ahead, picture), as far as the dream lasts
 
 
 class LiveDreamer:
-    """Decodes and dreams on what live frames tell, by the run's world model."""
+    """Decodes the latents of live frames and continues them as dreams, with the run's world model."""
 
     def __init__(self, bundle: Bundle, temperature: float) -> None:
         self._decoder, self._latent = Decoder(bundle), bundle.manifest.latent
         self._onward = DreamContinuation(bundle, temperature) if can_dream(bundle) else None
 
     def decode_and_dream(self, sight: LiveFrame) -> DecodedDream | None:
-        """`None` where the frame tells nothing of this world model."""
+        """The decoded dream of a frame; `None` if the frame has no latent of this world model."""
         latent = sight.latent
         if latent is None or len(latent) != self._latent:
             return None
@@ -59,7 +59,7 @@ class LiveDreamer:
         return DecodedDream(pictures[0], tuple(zip(dreamt, pictures[1:], strict=True)))
 
     def _dream(self, sight: LiveFrame) -> dict[int, NDArray[np.float32]]:
-        """The latents so many steps on."""
+        """The dreamt latents by steps ahead."""
         if self._onward is None or sight.latent is None or sight.state is None or sight.parameters is None:
             return {}
         moment = sight.latent, sight.state, sight.parameters
@@ -70,15 +70,15 @@ class LiveDreamer:
 
 
 class LiveCanvas(Board):
-    """Lays live frames of one run out, all of one size."""
+    """Draws live frames of one run, all of the same size."""
 
     def __init__(self, run: str, actions: tuple[str, ...] = (), dreamer: LiveDreamer | None = None) -> None:
-        """`actions` names what the bars show; without an imagination there is only what is seen."""
+        """`actions` are the labels of the bars; without a `dreamer` only observations are drawn."""
         super().__init__(SIZE, actions)
         self._run, self._dreamer = run, dreamer
 
     def draw(self, sight: LiveFrame) -> CaptionedFrame:
-        """The frame, with its facts."""
+        """Draw a frame."""
         imagined = None if self._dreamer is None else self._dreamer.decode_and_dream(sight)
         self._surface.fill(BACKGROUND)
         if imagined is not None:
@@ -91,7 +91,7 @@ class LiveCanvas(Board):
         return CaptionedFrame(pixels(self._surface), frame_facts(self._run, sight))
 
     def _draw_model(self, seen: Frame | None, imagined: DecodedDream) -> None:
-        """What is seen and decoded side by side, or, where all is dreamt, the one picture in the middle."""
+        """Draw observation and decoded latent side by side; without an observation, the decoded latent alone."""
         left, words = (SIZE[0] - BIG) // 2, "its dream, decoded"
         if seen is not None:
             self._draw_fitted("what the model sees", seen, (EDGE, EDGE), (BIG, BIG))
@@ -124,7 +124,7 @@ class LiveCanvas(Board):
             self._draw_action(action, SIZE[0] - EDGE + 16, FOOT)
 
     def _draw_fitted(self, label: str, picture: Frame, corner: Corner, room: tuple[int, int]) -> None:
-        """A picture as large as there is room, under its label."""
+        """Draw a picture as large as `room` allows, below its label."""
         height, width = picture.shape[:2]
         scale = min(room[0] / width, room[1] / height)
         self._text(label, corner, self._small, FAINT)
@@ -133,7 +133,7 @@ class LiveCanvas(Board):
 
 
 def frame_facts(run: str, sight: LiveFrame) -> dict[str, Any]:
-    """What a frame shows, for a caption."""
+    """The facts of a frame, for captions and JSON."""
     frame = sight.frame
     return {
         "run": run, "worker": sight.worker, "kind": frame.kind, "generation": frame.generation,

@@ -1,4 +1,4 @@
-"""What a program of one's own does with a controller; exported by `dreamfleet` itself."""
+"""Functions for users' own programs, which the package `dreamfleet` exports."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from dreamfleet.worker.tools import evaluation
 
 
 def find_controller(name: str, runs_dir: Path | str | None = None) -> Controller:
-    """A controller's file, a run's own, or one that ships; `ControllerError` names those that do."""
+    """A controller by the name of a file, of a run, or of one that ships; `ControllerError` lists those that ship."""
     controller, _ = lookup.find_controller(name, _folder(runs_dir))
     return controller
 
 
 def find_agent(path: Path | str) -> TrainedAgent:
-    """What `dreamfleet baseline export` wrote; it goes wherever a controller is driven here."""
+    """A trained agent that `dreamfleet baseline export` wrote. The functions here take it like a controller."""
     return TrainedAgent.load(Path(path))
 
 
 def open_run(name: str, runs_dir: Path | str | None = None) -> run_folder.RunFolder:
-    """A run's journal, read-only; to be closed, or used in a `with`. `JournalError` names those that exist."""
+    """A run's journal, read-only; close it or use it in a `with`. `JournalError` lists the existing runs."""
     return run_folder.open_run(_folder(runs_dir), name)
 
 
 def make_environment(
     controller: Controller | TrainedAgent, bundle: Bundle | None = None, render_mode: str | None = None
 ) -> gymnasium.Env[Any, Any]:
-    """The environment that a controller is judged in, observing what its policy takes."""
-    return _agent(controller, bundle).make_judge(render_mode)
+    """The environment that a controller is evaluated in, with the observations that its policy takes."""
+    return _agent(controller, bundle).make_evaluation_environment(render_mode)
 
 
 def make_policy(controller: Controller | TrainedAgent, bundle: Bundle | None = None) -> Policy:
-    """The policy of a controller, its first episode begun: `act(observation)` gives an action of its environment.
+    """The policy of a controller, with its first episode started; `act(observation)` returns the next action.
 
-    Of a policy with a `reward` method, tell it each action's reward; some world models look at it.
+    If the policy has a method `reward`, call it with the reward of each action; some world models use it.
     """
     agent = _agent(controller, bundle)
     policy = agent.make_policies()(0)
@@ -58,9 +58,10 @@ def evaluate(
     controller: Controller | TrainedAgent, bundle: Bundle | None = None, episodes: int = 100,
     first_seed: int = TEST.start, jobs: int | None = None,
 ) -> EpisodeResults:  # fmt: skip
-    """Whole episodes, one a seed, in `jobs` processes (one a core), as `dreamfleet evaluate` drives them.
+    """Evaluate a controller in whole episodes, one a seed, in `jobs` processes (default: one a core).
 
-    With more than one job a script calls this under `if __name__ == "__main__":`, for processes are spawned.
+    This is what `dreamfleet evaluate` does. With more than one job, call it under `if __name__ == "__main__":` in a
+    script, because processes are spawned.
     """
     if episodes < 1 or first_seed < 0 or (jobs is not None and jobs < 1):
         raise UsageError("episodes and jobs must be at least 1, first_seed at least 0")

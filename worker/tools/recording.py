@@ -1,4 +1,4 @@
-"""A drive as a video."""
+"""Recording a drive as a video."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def record(
     agent: Agent, seed: int, steps: int, out: Path, dreaming: ParallelDreamConfig | None = None,
     on_step: Callable[[int], None] = lambda _steps: None, stop: Stop = never_stop,
 ) -> float:  # fmt: skip
-    """Drive one episode in the agent's judge into an mp4; returns its score.
+    """Record one episode of an agent in its evaluation environment as an mp4; return its score.
 
-    Of an agent with a world model it shows what that sees and decodes beside the drive, and dreams if it can. If `stop`
-    asks for it, the video ends early, with a step at least.
+    With a world model, the video also shows what the model sees, decodes and, if it can, dreams. If `stop()` turns
+    true, the video ends early, after at least one step.
     """
-    environment = agent.make_judge("rgb_array")
+    environment = agent.make_evaluation_environment("rgb_array")
     policy: Any = agent.make_policies()(seed)
     policy.begin(agent.parameters)
     config, bundle = dreaming or ParallelDreamConfig(seed=seed), agent.bundle

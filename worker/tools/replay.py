@@ -1,4 +1,4 @@
-"""Scoring stored candidates again."""
+"""Scoring stored candidates again, to compare with the stored fitness."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from dreamfleet.common.runs.scoring_params import scoring_params_of
 
 @dataclass(frozen=True)
 class ReplayedEpisode:
-    """One episode's stored and recomputed fitness."""
+    """Stored and recomputed fitness of one episode."""
 
     episode: int
     seed: int
     stored: float
     replayed: float
     host_class: str  # of the host that scored it
-    own: bool  # whether this host is of that class, so that the bits must be the same
+    own: bool  # whether this host is of the same class, so that the bits must be equal
 
     @property
     def same(self) -> bool:
-        """To the bit."""
+        """Whether both are equal to the bit."""
         return self.stored == self.replayed
 
     def agrees(self, tolerance: float | None) -> bool | None:
-        """Whether it is what was stored; `None` where this host cannot tell.
+        """Whether both agree; `None` if this host cannot decide it.
 
-        A result of another class may differ by `tolerance`; without one nothing is known of it unless it is the same.
+        A host of another class may differ by `tolerance`; without a tolerance only equality can be decided there.
         """
         if self.same or self.own:
             return self.same
@@ -41,7 +41,7 @@ class ReplayedEpisode:
 
 
 def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[ReplayedEpisode]:
-    """Each stored episode of a candidate, scored again under its generation's terms, bundle and seeds."""
+    """Score each stored episode of a candidate again, with its generation's parameters, bundle and seeds."""
     parameters = run.candidate(generation, candidate)
     results = run.results(generation, candidate)
     pin_thread_pools()

@@ -1,4 +1,4 @@
-"""Pictures as a video file."""
+"""Writing pictures to a video file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dreamfleet.common.errors import DatasetError
 
 
 class Video:
-    """An mp4 that grows picture by picture; use it in a `with`. What came until an end can be played."""
+    """An mp4 that grows picture by picture; use it in a `with`. It is playable even if it ends early."""
 
     def __init__(self, out: Path, frames_per_second: int) -> None:
         self._out, self._rate = out, frames_per_second
@@ -34,7 +34,7 @@ class Video:
         self._container.close()
 
     def add(self, picture: NDArray[np.uint8]) -> None:
-        """One more picture `(height, width, 3)`, of the size of the first, both sides even."""
+        """Add a picture `(height, width, 3)` with even sides, of the same size as the first."""
         if self._stream is None:
             self._stream = self._open_stream(picture.shape[1], picture.shape[0])
         self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))

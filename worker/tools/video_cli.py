@@ -1,4 +1,4 @@
-"""What `record` and `baseline record` have in common: their arguments, and a video a track."""
+"""What the verbs `record` and `baseline record` share: their arguments, and one video a seed."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from dreamfleet.common.host.stop_signals import Stop, stop_on_signals
 from dreamfleet.common.runs.seeds import TEST
 
 Record = Callable[[int, Path, Callable[[int], None], Stop], float]
-"""Records the drive on the track of a seed into a file, tells of each step, ends when it is told to; its score."""
+"""Records the drive of a seed into a file and returns its score; calls the third argument with each step."""
 
 
 def add_video_flags(parser: argparse.ArgumentParser) -> None:
-    """Add what both verbs take."""
+    """Add the arguments that both verbs take."""
     parser.add_argument(
         "--seed", type=int, nargs="+", default=[TEST.start], metavar="N",
-        help=f"the seed, as of a track (default {TEST.start}); of several each has a video of its own, drive-N.mp4",
+        help=f"seed of the track (default {TEST.start}); with several seeds there is one video each, drive-N.mp4",
     )  # fmt: skip
     parser.add_argument("--steps", type=int, default=1000, help="steps at most (default 1000)")
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help="the video to write (default drive.mp4)")
@@ -28,7 +28,7 @@ def add_video_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def video_paths(args: argparse.Namespace) -> dict[int, Path]:
-    """The file of each track's video; `UsageError` for arguments that cannot be met."""
+    """The video file of each seed; `UsageError` for invalid arguments."""
     out: Path = args.out
     if args.steps < 1 or min(args.seed) < 0:
         raise UsageError("--steps must be at least 1 and --seed at least 0")
@@ -42,7 +42,7 @@ def video_paths(args: argparse.Namespace) -> dict[int, Path]:
 
 
 def record_videos(args: argparse.Namespace, videos: dict[int, Path], record: Record) -> int:
-    """Record one after the other and answer each one's score; Ctrl-C ends the one that is under way, and the verb."""
+    """Record one video after another and print each score; Ctrl-C ends the current video and the verb."""
     from dreamfleet.common.cli.progress import progress_bar
 
     with stop_on_signals() as stop:

@@ -23,6 +23,7 @@ from dreamfleet.worker.training.data.dataset import (
     preprocessing_of,
 )
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, RewardLabel
+from dreamfleet.worker.worldmodel.observation import join_features
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -57,7 +58,7 @@ class FeatureExtractor:
         action, reward = pad([drive.action for drive in drives]), pad([drive.reward for drive in drives])
         state, seen = self._memory.zero_state(len(drives)), []
         for step in range(latent.shape[1]):
-            seen.append(np.concatenate([latent[:, step], state[:, : self._hidden]], axis=1))
+            seen.append(join_features(latent[:, step], state, self._hidden))
             state = self._memory.advance(latent[:, step], action[:, step], state)
             self._label.write(state, reward[:, step].astype(np.float64))
         return np.stack(seen, axis=1)

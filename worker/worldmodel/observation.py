@@ -34,7 +34,12 @@ class Observation:
 
     def observe(self, latent: Floats, state: Floats) -> Floats:
         """Copy the observations `(N, size)` from `latent` `(N, latent)` and the model's `state` `(N, state)`."""
-        return np.concatenate([latent, state[:, : self._hidden]], axis=1)
+        return join_features(latent, state, self._hidden)
+
+
+def join_features(latent: Floats, state: Floats, hidden: int) -> Floats:
+    """The features [z, h] `(N, latent + hidden)`: latents, then the first `hidden` columns of the model's state."""
+    return np.concatenate([latent, state[:, :hidden]], axis=1)
 
 
 def open_bundle(bundle: Bundle | str) -> Bundle:

@@ -51,7 +51,7 @@ def test_gymnasium_accepts_it_and_the_dream_has_its_spaces(small, features):
 def test_it_shows_what_controllers_see_and_gives_what_they_earn_to_the_bit(model, tmp_path):
     bundle = write_random_bundle(tmp_path / "model.zip", 0, *MODELS[model])
     task, assignment = find_task("car-racing"), Assignment.of("car-racing", bundle)
-    policy, judge = task.make_policy(assignment), task.make_judge(assignment)
+    policy, judge = task.make_policy(assignment), task.make_evaluation_environment(assignment)
     policy.begin(np.random.default_rng(0).normal(size=bundle.controller_shape.size).astype(np.float32))
     picture, _ = judge.reset(seed=SEED)
     seen, actions, given = [], [], []

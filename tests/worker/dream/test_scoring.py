@@ -6,8 +6,7 @@ import pytest
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
-from dreamfleet.worker.dream.environment import CarRacingDream
-from dreamfleet.worker.dream.policy import DreamPolicy
+from dreamfleet.worker.dream.environment import CarRacingDream, DreamPolicy
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig

@@ -7,9 +7,8 @@ from dreamfleet.common.artifacts.bundle import RECORDED_STATES, write_bundle
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
-from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreamVector
+from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreamVector, DreamPolicy
 from dreamfleet.worker.dream.noise import EpisodeNoise
-from dreamfleet.worker.dream.policy import DreamPolicy
 from dreamfleet.worker.dream.start_states import StartStates
 from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.tasks.api import Score

@@ -5,9 +5,8 @@ import pytest
 
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import NoDisplayError, UsageError
-from dreamfleet.worker.driving.drive_window import BACKGROUND, DriveStatus, DriveWindow
+from dreamfleet.worker.driving.drive_window import BACKGROUND, DriveStatus, DriveWindow, Pedals
 from dreamfleet.worker.driving.loop import DrivingConfig, drive
-from dreamfleet.worker.driving.pedals import Pedals
 from dreamfleet.worker.driving.scene import CarRacingScene, DreamScene
 
 SEED = 20_003

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from dreamfleet.worker.scoring.episode import MAX_STRAYS, EpisodeConfig, score
+from dreamfleet.worker.scoring.episode import MAX_OFF_COURSE_STEPS, EpisodeConfig, score
 
 PARAMETERS = np.zeros(3, np.float32)
 
@@ -90,23 +90,25 @@ def test_time_costs_until_the_course_is_finished_and_to_crash_saves_nothing(rewa
     assert found[0].steps == found[1].steps
 
 
-class Straying(Scripted):
+class OffCourse(Scripted):
     """Says in its `info` which steps leave the course: these."""
 
-    def __init__(self, rewards, strays):
+    def __init__(self, rewards, off_course_steps):
         super().__init__(rewards)
-        self._strays = strays
+        self._off_course_steps = off_course_steps
 
     def step(self, action):
         *given, _ = super().step(action)
-        return (*given, {"off": self._step in self._strays})
+        return (*given, {"off": self._step in self._off_course_steps})
 
 
-@pytest.mark.parametrize(("strays", "paid"), [((), 0), ((3,), 1), (range(5, 9), 4), (range(1, 180), MAX_STRAYS)])
-def test_steps_off_the_course_cost_so_much_and_one_loss_no_more(strays, paid):
-    free = EpisodeConfig(1, 200, stray="off")
-    course = [free, replace(free, stray_cost=2.0)]
-    found = [score(Straying([0.0] * 199, strays), Still(), PARAMETERS, each) for each in course]
+@pytest.mark.parametrize(
+    ("off_course_steps", "paid"), [((), 0), ((3,), 1), (range(5, 9), 4), (range(1, 180), MAX_OFF_COURSE_STEPS)]
+)
+def test_steps_off_the_course_cost_so_much_and_one_loss_no_more(off_course_steps, paid):
+    free = EpisodeConfig(1, 200, off_course="off")
+    course = [free, replace(free, off_course_cost=2.0)]
+    found = [score(OffCourse([0.0] * 199, off_course_steps), Still(), PARAMETERS, each) for each in course]
     assert found[0].fitness - found[1].fitness == 2 * paid
     assert found[0].steps == found[1].steps
 

@@ -23,11 +23,11 @@ class Eyes:
     def __init__(self, every=3):
         self.seen, self._every, self._asked = [], every, 0
 
-    def due(self):
+    def is_due(self):
         self._asked += 1
         return self._asked % self._every == 0
 
-    def see(self, episode, look):
+    def observe(self, episode, look):
         self.seen.append((episode, look()))
 
 
@@ -100,7 +100,9 @@ def shape_of(world):
 
 def test_a_world_that_is_now_and_then_drawn_steps_as_one_that_is_not():
     task = find_task("gym:LunarLander-v3")
-    shown = task.make_shown(Assignment(TaskSpec(task.name, "", 200, 0, controller=shape_of(task.describe({})))))
+    shown = task.make_watched_environment(
+        Assignment(TaskSpec(task.name, "", 200, 0, controller=shape_of(task.describe({}))))
+    )
     shown.reset(seed=1)
     for _ in range(30):
         shown.step(2)  # the main engine, whose sparks are bodies that each further step computes
@@ -119,7 +121,7 @@ def test_another_packages_world_is_not_drawn_and_one_that_cannot_be_drawn_is_sho
     gymnasium.register("Sketchy-v0", Sketchy, max_episode_steps=50)
     task = find_task("gym:Sketchy-v0")
     spec = TaskSpec("gym:Sketchy-v0", "", 50, 0, controller=shape_of(task.describe({})))
-    assert task.make_shown(Assignment(spec)) is None
+    assert task.make_watched_environment(Assignment(spec)) is None
     _, seen = watched_and_not(Scorer(spec), [("score", parameters(spec.controller.size), 2**20)])
     assert {glimpse.picture for _, glimpse in seen} == {None}
 

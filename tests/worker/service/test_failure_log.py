@@ -1,5 +1,4 @@
-from dreamfleet.worker.service.failure_log import MOST_KINDS, FailureLog
-from dreamfleet.worker.service.job_group import MAX_TRACE, ScoringFailure
+from dreamfleet.worker.service.failure_log import MAX_KINDS, MAX_TRACE, FailureLog, ScoringFailure
 from tests.support.samples import job
 
 
@@ -46,9 +45,9 @@ def test_of_jobs_that_were_scored_together_the_first_is_named_and_the_others_cou
 def test_a_log_is_bounded():
     failures = FailureLog()
     told = [
-        failures.format_if_new(ScoringFailure("text", str(kind), "trace"), "moon", []) for kind in range(2 * MOST_KINDS)
+        failures.format_if_new(ScoringFailure("text", str(kind), "trace"), "moon", []) for kind in range(2 * MAX_KINDS)
     ]
-    assert sum(text is not None for text in told) == MOST_KINDS
+    assert sum(text is not None for text in told) == MAX_KINDS
     assert len(raised(RuntimeError("x" * 100_000)).trace) == MAX_TRACE
 
 

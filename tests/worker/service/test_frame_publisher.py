@@ -212,8 +212,8 @@ def test_showing_takes_no_more_than_a_hundredth_of_the_time_however_dear_a_pictu
         return StepSnapshot(0, 0.0, ACTION)
 
     for _ in range(100_000):
-        if sampler.due():
-            sampler.see(0, look)
+        if sampler.is_due():
+            sampler.observe(0, look)
         clock.now += 0.001
     assert 0.05 * len(told) <= 1.1 * MAX_TIME_SHARE * clock.now
     assert len(told) > 10
@@ -223,16 +223,16 @@ def test_cheap_pictures_come_ten_a_second_and_none_where_nobody_wants_them_any_m
     clock, told, wanted = Clock(), [], [True]
     sampler = FrameSampler(told.append, lambda: wanted[0], clock, clock)
     while clock.now < 10:
-        if sampler.due():
-            sampler.see(0, lambda: StepSnapshot(0, 0.0, ACTION))
+        if sampler.is_due():
+            sampler.observe(0, lambda: StepSnapshot(0, 0.0, ACTION))
         clock.now += 0.001
     assert len(told) == pytest.approx(10 / FRAME_INTERVAL, abs=3)
     wanted[0] = False
     clock.now += 10
-    assert not sampler.due()
+    assert not sampler.is_due()
 
 
 def test_what_goes_wrong_as_a_step_is_shown_fails_no_job():
     sampler = FrameSampler(lambda _seen: 1 / 0, lambda: True)
-    sampler.see(0, lambda: StepSnapshot(0, 0.0, ACTION))
-    assert not sampler.due()
+    sampler.observe(0, lambda: StepSnapshot(0, 0.0, ACTION))
+    assert not sampler.is_due()

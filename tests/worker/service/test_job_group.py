@@ -45,8 +45,8 @@ def test_each_job_has_its_own_result_and_an_equal_share_of_the_time():
     ("scores", "said"),
     [
         ([Score(1.0, 1)], "1 scores of 3 episodes"),
-        ([Score(1.0, 1)] * 2 + [Score(float("nan"), 1)], "no number"),
-        ([Score(1.0, 1)] * 2 + [Score(float("inf"), 1)], "no number"),
+        ([Score(1.0, 1)] * 2 + [Score(float("nan"), 1)], "not a finite number"),
+        ([Score(1.0, 1)] * 2 + [Score(float("inf"), 1)], "not a finite number"),
         ([Score(1.0, 1)] * 2 + [None], "AttributeError"),
     ],
 )

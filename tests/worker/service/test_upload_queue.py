@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dreamfleet.common.protocol.messages import MAX_PART
-from dreamfleet.worker.service.upload_queue import BURST_INTERVAL, MAX_BURST, MAX_ROUND_DELAY, UploadQueue
+from dreamfleet.worker.service.outbox import BURST_INTERVAL, MAX_BURST, MAX_ROUND_DELAY, UploadQueue
 
 DIGEST, OTHER = b"\x01" * 32, b"\x02" * 32
 

@@ -86,7 +86,7 @@ class Worldless(Task):
 
 class Bare:
     name = "bare"
-    width = 0
+    batch_size = 0
     world = "none"
 
 
@@ -95,7 +95,7 @@ class Bare:
     [
         ("Nameless", "name must be a text; make_environment"),
         ("Worldless", "world must be a World"),
-        ("Bare", "width must be a whole number.*world must be a World.*make_policy"),
+        ("Bare", "batch_size must be a whole number.*world must be a World.*make_policy"),
     ],
 )
 def test_an_incomplete_task_is_refused_with_what_is_missing(task, says):

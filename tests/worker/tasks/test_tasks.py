@@ -55,7 +55,7 @@ def test_a_bundle_of_another_task_or_of_pictures_that_it_does_not_give_is_refuse
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = BundleManifest("moon", of, preprocessing, shape, latent=4, hidden=4, actions=3)
     bundle, found = write_bundle(tmp_path / "moon.zip", manifest, parts), find_task(task)
-    for make in (found.make_environment, found.make_judge, found.make_policy):
+    for make in (found.make_environment, found.make_evaluation_environment, found.make_policy):
         asked = task == "dream" and of == "moon"  # the dream asks the bundle's own world
         says = "unknown task 'moon'" if asked else f"of task '{of}' and pictures '{preprocessing}'"
         with pytest.raises(UsageError if asked else BundleError, match=says):
@@ -70,7 +70,7 @@ def test_environment_and_judge_observe_gymnasiums_own_environment_behind_the_bun
     bundle = write_random_bundle(tmp_path / "b.zip", vae=vae, rnn=MDNRNNConfig(latent=4, hidden=4))
     task, plain = find_task("car-racing"), gymnasium.make("CarRacing-v3")
     assignment = Assignment.of("car-racing", bundle)
-    ours = [task.make_environment(assignment), task.make_judge(assignment)]
+    ours = [task.make_environment(assignment), task.make_evaluation_environment(assignment)]
     observed, _ = plain.reset(seed=10_000)
     seen = [each.reset(seed=10_000)[0] for each in ours]
     action = np.array([0.1, 0.5, 0.0], np.float32)
@@ -118,7 +118,7 @@ def varied(bundle, task="car-racing", horizon=5, **named):
 def judged(spec, bundle, vector, episode_config):
     """The score of a course in the task's judge."""
     task, assignment = find_task(spec.task), Assignment(spec, bundle)
-    judge = task.make_judge(assignment)
+    judge = task.make_evaluation_environment(assignment)
     found = score(judge, task.make_policy(assignment), vector, episode_config)
     judge.close()
     return found
@@ -154,7 +154,7 @@ def test_only_candidates_pay_for_steps_off_the_road(random_bundle):
     assert free.steps == paid.steps
     assert 2 <= free.fitness - paid.fitness <= 200
     for kind in ("evaluate", "collect"):
-        assert scorers[1].episode_config(kind, 3).stray_cost == 0
+        assert scorers[1].episode_config(kind, 3).off_course_cost == 0
     assert judged(dear, random_bundle, vector, scorers[1].episode_config("score", 3)) == paid
     for each in scorers:
         each.close()

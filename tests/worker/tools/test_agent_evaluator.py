@@ -33,7 +33,7 @@ def test_it_tells_speed_and_brake_of_a_drive_that_is_the_same_unwatched(tiny, mo
     parameters = controller.parameters.copy()
     parameters[2 * 288 : 3 * 288], parameters[-1] = 0.0, 5.0  # the brake's weights and bias: it is always on
     agent = make_agent(replace(controller, parameters=parameters, task=task), tiny)
-    judge, unwatched = AgentEvaluator(agent), agent.make_judge()
+    judge, unwatched = AgentEvaluator(agent), agent.make_evaluation_environment()
     drive = judge.drive(SEED)
     alone = score(unwatched, agent.make_policies()(SEED), parameters, EpisodeConfig(SEED, STEPS))
     judge.close()

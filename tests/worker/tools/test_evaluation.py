@@ -33,7 +33,10 @@ def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
     task = find_task(tasks.JUDGED)
     alone = {
         seed: episode.score(
-            task.make_judge(None), task.make_policy(None), controller().parameters, EpisodeConfig(seed, 10**6)
+            task.make_evaluation_environment(None),
+            task.make_policy(None),
+            controller().parameters,
+            EpisodeConfig(seed, 10**6),
         ).fitness
         for seed in SEEDS
     }

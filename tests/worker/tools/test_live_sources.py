@@ -36,11 +36,11 @@ class Once:
     def __init__(self):
         self.glimpse, self._asked = None, 0
 
-    def due(self):
+    def is_due(self):
         self._asked += 1
         return self._asked == 10
 
-    def see(self, _episode, look):
+    def observe(self, _episode, look):
         self.glimpse = look()
 
 
@@ -102,7 +102,7 @@ def test_a_controller_is_shown_at_the_worlds_pace_and_scores_as_it_would_unseen(
     agent, _ = drive()
     shown = list(islice(driven_frames(drive, ParallelDreamConfig(), 10, SEED), 8))
     assert [each.facts["step"] for each in shown] == list(range(0, 40, 5)), "50 steps a second, 10 pictures"
-    judge = agent.make_judge()
+    judge = agent.make_evaluation_environment()
     plain = episode.score(judge, agent.make_policies()(SEED), PARAMETERS, EpisodeConfig(SEED, 35))
     judge.close()
     assert shown[7].facts["score"] == pytest.approx(plain.fitness)

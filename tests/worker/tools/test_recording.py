@@ -29,7 +29,7 @@ def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_
     told, agent = [], make_agent(controller, random_bundle)
     score = record(agent, SEED, STEPS, tmp_path / "new" / "drive.mp4", on_step=told.append)
     task, assignment = find_task("car-racing"), Assignment.of("car-racing", random_bundle)
-    judge = task.make_judge(assignment)
+    judge = task.make_evaluation_environment(assignment)
     driven = episode.score(judge, task.make_policy(assignment), controller.parameters, EpisodeConfig(SEED, STEPS))
     judge.close()
     assert score == driven.fitness

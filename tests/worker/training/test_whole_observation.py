@@ -76,7 +76,7 @@ def test_environment_judge_and_video_score_alike_to_the_bit(bundle, parameters, 
     fitness.append(scorer.score("score", parameters, 20_000).fitness)
     scorer.close()
     agent = make_agent(Controller(bundle.controller_shape, parameters, "car-racing", bundle.sha256), bundle)
-    judge = agent.make_judge()
+    judge = agent.make_evaluation_environment()
     fitness.append(score(judge, agent.make_policies()(20_000), parameters, EpisodeConfig(20_000, 70)).fitness)
     judge.close()
     fitness.append(record(agent, 20_000, 70, tmp_path / "drive.mp4"))

@@ -8,10 +8,8 @@ from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError
-from dreamfleet.worker.scoring.action_bursts import ActionBursts
 from dreamfleet.worker.scoring.actors import ControllerActor
-from dreamfleet.worker.scoring.disturbance import Disturbance
-from dreamfleet.worker.scoring.disturbed_policy import DisturbedPolicy
+from dreamfleet.worker.scoring.disturbance import ActionBursts, Disturbance, DisturbedPolicy
 from dreamfleet.worker.training.data.dataset import WORLD, find_world
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 

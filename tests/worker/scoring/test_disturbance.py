@@ -6,10 +6,8 @@ import pytest
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.runs.lookup import find_controller
-from dreamfleet.worker.scoring.action_bursts import ActionBursts
 from dreamfleet.worker.scoring.actors import ControllerActor
-from dreamfleet.worker.scoring.disturbance import Disturbance, add_disturbance
-from dreamfleet.worker.scoring.disturbed_policy import DisturbedPolicy
+from dreamfleet.worker.scoring.disturbance import ActionBursts, Disturbance, DisturbedPolicy, add_disturbance
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 
