@@ -1,4 +1,4 @@
-"""Who may join a run: workers that speak its protocol and know its task; where it is strict, of one class. Pure."""
+"""Which workers may join a run: those of its protocol and task, and of its class if the run is strict. Pure."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
 from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.protocol.tasks import is_unregistered
 
-MOST_REFUSED = 8  # names that are remembered
-MOST_TOLD = 100  # refusals that are news: no log should grow with what strangers call themselves
-MOST_TASKS = 8  # of a worker that are told by name
+MAX_REFUSED = 8  # names that are remembered
+MAX_LOGGED = 100  # refusals that are logged: a stranger can invent names without end
+MAX_TASKS = 8  # of a worker that a refusal names
 LONGEST = 600  # characters of what a worker says of itself: two of them fit into an answer
 
 
 def find_refusal(
     request: HelloRequest, task: str, admitted: str | None, packages: tuple[str, ...] = NUMERIC_PACKAGES
 ) -> tuple[str, str] | None:
-    """Why a worker cannot join a run of `task` and what to do about it; `None` if it may.
+    """Why a worker cannot join a run of `task`, and the remedy; `None` if it may.
 
-    `admitted` is the class that the run keeps to, `None` admits any; fingerprints name the versions of `packages`. A
-    worker that does not know its class yet may join, and is judged once it says it.
+    `admitted` is the class of a strict run, `None` admits any. Fingerprints name the versions of `packages`. A worker
+    that does not know its class yet may join; its class is checked when a heartbeat names it. R23: a refusal has a
+    reason and a remedy, because somebody must act on it.
     """
     if not request.protocol_min <= PROTOCOL_VERSION <= request.protocol_max:
         spoken = f"the worker speaks protocol {request.protocol_min} to {request.protocol_max}"
         return f"{spoken}, this run {PROTOCOL_VERSION}", (
             f"install dreamfleet {package_version('dreamfleet')} on the worker's host"
         )
-    if not {task, task.partition(":")[0]} & set(request.tasks):  # itself, or the family that it is of
+    if not {task, task.partition(":")[0]} & set(request.tasks):  # by its name or its family
         remedy = "install the package that registers this task on the worker's host"
         if is_unregistered(task):
             remedy = f"start it with `dreamfleet worker --task {task}`, if you trust that, or {remedy}"
@@ -39,7 +40,7 @@ def find_refusal(
         )
     if request.packages != packages:
         named, own = (truncate(", ".join(each), LONGEST) for each in (request.packages, packages))
-        return f"its fingerprint names {named}, this run's {own}", ("say hello again about those")
+        return f"its fingerprint names {named}, this run's {own}", "say hello again about those"
     host_class = effective_class(request.host_class, request.fingerprint, admitted)
     if admitted is None or host_class in ("", admitted):
         return None
@@ -47,7 +48,7 @@ def find_refusal(
 
 
 def class_mismatch(run: str | None, host_class: str, fingerprint: str) -> tuple[str, str]:
-    """Why a worker of another class than a strict run's cannot add to it, and what to do about it."""
+    """Why a strict run refuses a worker of another class, and the remedy."""
     own, other, host = (truncate(each or "", LONGEST) for each in (run, host_class, fingerprint))
     return f"classes differ: the run is strict, of class {own}, and this host is of {other} [{host}]", (
         "install the same dreamfleet and package versions on a host of the same CPU features; or continue the run with "
@@ -56,28 +57,31 @@ def class_mismatch(run: str | None, host_class: str, fingerprint: str) -> tuple[
 
 
 def _describe_tasks(tasks: tuple[str, ...]) -> str:
-    """A worker's tasks in words: so many by name that an answer holds them."""
-    more = f" and {len(tasks) - MOST_TASKS} more" if len(tasks) > MOST_TASKS else ""
-    return truncate(", ".join(tasks[:MOST_TASKS]), LONGEST) + more or "none"
+    """A worker's tasks in words, cut to what an answer holds."""
+    more = f" and {len(tasks) - MAX_TASKS} more" if len(tasks) > MAX_TASKS else ""
+    return truncate(", ".join(tasks[:MAX_TASKS]), LONGEST) + more or "none"
 
 
 class RefusedWorkers:
-    """Workers that could not join, the latest last: for whoever wonders why a run waits."""
+    """Workers that were refused, the latest last: the status shows them, as a run may wait for them."""
 
     def __init__(self) -> None:
         self.latest: dict[str, str] = {}  # name of a worker -> why
-        self._told = 0
+        self._logged = 0
 
     def add(self, worker: str, why: str) -> bool:
-        """Remember one; whether that is news. A worker that is started again and again has one name, many lives."""
+        """Remember a refusal; return whether to log it. All workers of a host count as one.
+
+        R26: both the remembered names and the logged refusals are bounded.
+        """
         name, why = worker.partition("/")[0], truncate(why, 2 * LONGEST)
-        news = self.latest.pop(name, None) != why and self._told < MOST_TOLD
-        self._told += news
+        news = self.latest.pop(name, None) != why and self._logged < MAX_LOGGED
+        self._logged += news
         self.latest[name] = why
-        while len(self.latest) > MOST_REFUSED:
+        while len(self.latest) > MAX_REFUSED:
             del self.latest[next(iter(self.latest))]
         return news
 
     def remove(self, worker: str) -> None:
-        """It could join after all."""
+        """Forget a worker that could join after all."""
         self.latest.pop(worker.partition("/")[0], None)

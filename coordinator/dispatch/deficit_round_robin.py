@@ -1,29 +1,30 @@
-"""What evaluations and kept rollouts get of a busy fleet: a share of its slots' time. Pure.
+"""The share of a busy fleet's slot time that evaluations and kept rollouts get. Pure.
 
-Counted in the slots' seconds, as results tell them, not in jobs: an evaluation is a whole episode, which may take a
-hundred times as long as a dreamt one. A deficit counter (Shreedhar and Varghese 1995): each second that a slot worked
-earns `share` of a second, and a job that went by its share costs its seconds.
+R18: background jobs get a fixed share, so an evaluation neither starves nor stops the fleet. The share is of seconds in
+a slot, as results report them, not of jobs: an evaluation is a whole episode, which may take a hundred times as long as
+a dreamt one. A deficit counter (Shreedhar and Varghese 1995): each second that a slot worked earns `share` of a second,
+and a job that was given by its share costs its seconds.
 """
 
 from __future__ import annotations
 
-SMOOTHING = 0.1  # weight of the newest job in the typical one
-OUTLIER = 10  # times the typical: more is a suspended host's or a confused clock's, and no job's
+SMOOTHING = 0.1  # weight of the newest job in the typical duration
+OUTLIER = 10  # times the typical duration: a longer one comes from a suspended host or a wrong clock
 
 
 class DeficitCounter:
-    """Says when a job that else waits for idle slots goes before what is scored."""
+    """Decides when a background job goes before candidates' jobs."""
 
     def __init__(self, share: float) -> None:
         self.share = share
-        self._earned = 0.0  # seconds; below zero: owed
-        self._typical_seconds: dict[bool, float] = {}  # seconds of a job, by whether it is of those that wait
-        self._outstanding: set[bytes] = set()  # jobs that went by their share and have not come back
+        self._earned = 0.0  # seconds; negative: a debt
+        self._typical_seconds: dict[bool, float] = {}  # of a job, by whether it is a background job
+        self._outstanding: set[bytes] = set()  # jobs that were given by their share and are not done
 
     def is_due(self, slots: int) -> bool:
-        """Whether one more job may go now: what those in workers' hands should take is set aside.
+        """Whether one more background job may be given now, beside what the outstanding ones will cost.
 
-        Its share of so many slots is lent at once, so that a large fleet does not wait for the first to come back.
+        The share of `slots` slots is lent at once, so that a large fleet need not wait for the first result.
         """
         if not self.share:
             return False
@@ -31,17 +32,17 @@ class DeficitCounter:
         return self._earned + self.share * slots * typical >= self._reserved if typical else not self._outstanding
 
     def reserve(self, digest: bytes) -> None:
-        """A job goes by its share."""
+        """Note that a job is given by its share."""
         self._outstanding.add(digest)
 
     def release(self, digest: bytes) -> None:
-        """A job that went comes back undone."""
+        """Note that a job came back without a result."""
         self._outstanding.discard(digest)
 
     def charge(self, digest: bytes, seconds: float, *, is_background: bool, waiting: bool) -> None:
-        """A job was done in so many of a slot's seconds; `waiting`: there are others that wait for their share.
+        """Note that a job took `seconds` of a slot; `waiting`: other background jobs are queued.
 
-        While none waits, nothing is saved up: a later evaluation must not stop the fleet.
+        While none is queued, unused time is not saved: a later evaluation must not stop the fleet.
         """
         typical = self._typical_seconds.get(is_background)
         if typical:

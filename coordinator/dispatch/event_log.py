@@ -1,6 +1,6 @@
-"""What happened to jobs and workers of late: a bounded ring of typed events. Pure: events and a clock in.
+"""The latest events of jobs and workers: a bounded log of typed events. Pure: events and a clock in.
 
-Kept in blocks that only grow, so that a view of it costs the same however much is kept, and any thread may read it.
+Events are kept in blocks that only grow, so a view costs the same however long the log is, and any thread may read it.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import NamedTuple
 from dreamfleet.common.monitoring.status import EventKind
 from dreamfleet.common.protocol.messages import Job
 
-BLOCK, BLOCKS = 256, 128  # events of a block, and blocks that are kept
-MOST_NAMED = 10_000  # jobs whose names are kept: many more than can be in workers' hands
+BLOCK, BLOCKS = 256, 128  # events in a block, and blocks that are kept
+MAX_NAMED = 10_000  # jobs whose names are kept: many more than workers can hold
 
 
 class FleetEvent(NamedTuple):
@@ -26,16 +26,16 @@ class FleetEvent(NamedTuple):
 
 
 class EventLogView:
-    """The story as it was when the view was taken."""
+    """The log as it was when the view was taken."""
 
     def __init__(self, blocks: tuple[list[FleetEvent], ...], last: int) -> None:
         self._blocks = blocks
-        self._last = last  # events of the last block, which may grow
+        self._last = last  # events in the last block, which may grow
 
     def latest(
         self, worker: str = "", job: tuple[int, int] | None = None, kinds: Collection[str] = ()
     ) -> Iterator[FleetEvent]:
-        """Events from the newest to the oldest: of a worker or a host by name, of a candidate, of `kinds`, or all."""
+        """Events from the newest to the oldest, filtered by worker or host name, by candidate and by kind."""
         for number, block in enumerate(reversed(self._blocks)):
             for each in reversed(block if number else block[: self._last]):
                 if worker and worker not in (each.worker, each.worker.partition("/")[0]):
@@ -47,26 +47,26 @@ class EventLogView:
 
 
 class EventLog:
-    """Takes events in; what is too old is forgotten."""
+    """Records events and forgets the oldest (R26: its length is bounded)."""
 
     def __init__(self) -> None:
         self._blocks: deque[list[FleetEvent]] = deque([[]], maxlen=BLOCKS)
         self._names: dict[bytes, tuple[str, int, int, int]] = {}
 
     def add_given(self, now: float, worker: str, job: Job) -> None:
-        """A worker was given a job."""
-        if job.digest not in self._names and len(self._names) >= MOST_NAMED:
+        """Record that a worker was given a job, and remember the job's name."""
+        if job.digest not in self._names and len(self._names) >= MAX_NAMED:
             del self._names[next(iter(self._names))]
         self._names[job.digest] = (job.kind, job.generation, job.candidate, job.episode)
         self.add(now, "given", worker, job.digest)
 
     def add(self, now: float, what: EventKind, worker: str, digest: bytes | None = None) -> None:
-        """Something happened to a worker, or to a job in its hands."""
+        """Record an event of a worker, or of a job that it holds."""
         if len(self._blocks[-1]) >= BLOCK:
             self._blocks.append([])
         job = None if digest is None else self._names.get(digest)
         self._blocks[-1].append(FleetEvent(now, what, worker, job))
 
     def view(self) -> EventLogView:
-        """It as it is now, for other threads."""
+        """The log as it is now, for other threads."""
         return EventLogView(tuple(self._blocks), len(self._blocks[-1]))

@@ -1,149 +1,136 @@
-"""Who works on what: credits, leases, losses, verdicts. Pure: events and a clock in, batches out.
+"""The workers of a run and the jobs between them. Pure: events and a clock in, batches out.
 
-No message is trusted to arrive. A batch is kept until its worker has seen it; a job is wanted until its first valid
-result; what a beat does not show is dispatched again. Rules 2, 3, 5, 6, 7 and 8 of the protocol.
+No message is trusted to arrive. A batch is kept until its worker confirms it, a job is wanted until its first valid
+result, and a job that heartbeats do not list is given again.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import count
 
 from dreamfleet.common.monitoring.status import EventKind
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Kind, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.dispatch.event_log import EventLog
-from dreamfleet.coordinator.dispatch.host_stats import HostStats
-from dreamfleet.coordinator.dispatch.member import DispatchGroup, Lease, Member, SentBatch
-from dreamfleet.coordinator.dispatch.packing import BatchContent, pack
-from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
+from dreamfleet.coordinator.dispatch.host_stats import HostRecords
+from dreamfleet.coordinator.dispatch.member import DispatchGroup, Lease, LostWorkers, Member, MemberState, SentBatch
+from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch, pack
+from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob, PendingJobs
 from dreamfleet.coordinator.dispatch.speculative_execution import Move, SpeculativeExecution
-from dreamfleet.coordinator.dispatch.worker_selection import WorkerSelection
+from dreamfleet.coordinator.dispatch.worker_selection import assign_jobs
 from dreamfleet.coordinator.jobs.work import Work
 
-DEPARTURE_GRACE = 0.05  # seconds: a token's end overtakes results that are still on their way
-CLOCK_GAP = 2.0  # seconds between ticks that mean a suspended host
-SILENT_BEATS = 5
-ABSENT_BEATS = 2
-ALIVE_BEATS = 2  # within which a worker has spoken that lives
-ANSWER_BEATS = 2  # after which a worker that was sent nothing hears that it is known
-FORGET_AFTER = 600.0  # seconds of silence after which a worker must say hello again
-GUEST_TIMEOUT = 60.0  # the same for one that was welcomed and has not beaten yet: a guest
-MOST_GUESTS = 256
-LOST_TIMEOUT = 600.0  # seconds for which who vanished without a word is told as lost, unless he is back
-MOST_LOST = 256  # of whom so many are told, those that vanished last
-MOST_RECORDS = 4096  # of hosts, those that joined last
-
-
-@dataclass(frozen=True)
-class OutgoingBatch:
-    """A numbered batch for one worker; 0 is an empty one that only says that the worker is known."""
-
-    identity: str
-    numbering: int
-    number: int
-    content: BatchContent
+DEPARTURE_GRACE = 0.05  # seconds: a vanished token overtakes results that are still on their way
+CLOCK_GAP = 2.0  # seconds between ticks that mean that this host was suspended
+# In heartbeat intervals:
+SILENT_AFTER = 5  # without a message a worker counts as silent
+ALIVE_WITHIN = 2  # of its last message a worker is surely alive
+REPLY_AFTER = 2  # a worker to which nothing was sent gets an empty batch
+RESEND_AFTER = 2  # an unconfirmed batch is sent again
+# In seconds without a message:
+FORGET_AFTER = 600.0  # a worker is forgotten and must say hello again
+GUEST_TIMEOUT = 60.0  # the same for a guest
+MAX_GUESTS = 256
 
 
 class Fleet:
     """The workers of one run and the jobs between them."""
 
-    def __init__(self, beat: float, evaluation_share: float = 0.25) -> None:
-        self._beat = beat
-        self._tail = SpeculativeExecution(beat)
-        self._numberings = 0  # that were begun
+    def __init__(self, heartbeat_interval: float, evaluation_share: float = 0.25) -> None:
+        self._interval = heartbeat_interval  # seconds
+        self._speculation = SpeculativeExecution(heartbeat_interval)
+        self._numberings = count(1)
         self._last_tick: float | None = None
-        self._now = 0.0  # of what is being handled
-        self._host_stats: dict[str, HostStats] = {}  # by name of a host, the one that joined last at the end
-        self._guests: dict[str, None] = {}  # identities, oldest first
-        self.lost: dict[str, Member] = {}  # who vanished without a word, the last one at the end; told, no more
+        self._now = 0.0  # of the event that is being handled
+        self._hosts = HostRecords()
+        self.lost = LostWorkers()
         self.jobs = PendingJobs(evaluation_share)
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
-        self.dropped: Counter[str] = Counter()  # what was not believed, by reason
-        self.event_log = EventLog()  # of workers and jobs, for whoever asks
-        self.notes: list[str] = []  # what happened, for whoever writes it down and clears it
-        self.drain_background = False  # nothing but evaluations and collected rollouts is left to wait for
+        self.dropped: Counter[str] = Counter()  # results and reports that were not accepted, by reason
+        self.event_log = EventLog()
+        self.notes: list[str] = []  # lines for a log; its writer clears them
+        self.drain_background = False  # only evaluations and kept rollouts are left to wait for
         self.paused = False
-        self.single_job = False  # what is scored now, a slot does by itself, however wide the run's task is
+        self.single_job = False  # a slot scores one job at a time, even of a task whose slots score several at once
 
     def cancel_kind(self, kind: Kind) -> None:
-        """No longer want jobs of this kind; what runs already becomes obsolete."""
+        """Withdraw all jobs of a kind; results that still come are obsolete."""
         for digest in self.jobs.digests_of_kind(kind):
             self._cancel(digest, self.jobs.remove(digest))
 
     def add_worker(self, identity: str, slots: int, fingerprint: str, now: float) -> int:
-        """A worker was admitted; it has credit from its first beat on, and until then it is one of a few guests.
+        """Welcome a worker as a guest; return the numbering of its batches.
 
-        Its batches are counted anew, under the number that is returned. But a hello in the name of one that beats
-        changes nothing: the worker is told what it missed, and a stranger who greets as somebody else takes nothing.
+        R12: a welcome starts a new numbering, so messages from before cannot be mistaken for current ones. R19: hello
+        in the name of a live worker changes nothing, so a stranger cannot take its leases; that worker only gets again
+        what it may have missed. R26: the number of guests is bounded.
         """
-        old = self.members.get(identity)
-        if old is not None and old.has_beaten and old.present and now - old.last_heard <= ALIVE_BEATS * self._beat:
-            old.mark_for_resend(now - self._beat)
+        old, recent = self.members.get(identity), ALIVE_WITHIN * self._interval
+        if old is not None and old.state is MemberState.PRESENT and now - old.last_heard <= recent:
+            old.resend_sent_before(now - self._interval)
             return old.numbering
-        if old is not None:
-            self._remove_member(old)
-        if len(self._guests) >= MOST_GUESTS:
-            self._remove_member(self.members[next(iter(self._guests))])
-        self._guests[identity] = None
+        self.remove_worker(identity)
+        guests = [member for member in self.members.values() if member.is_guest]
+        if len(guests) >= MAX_GUESTS:
+            self.remove_worker(guests[0].identity)
         slots, joined_at = min(slots, MAX_SLOTS), now if old is None else old.joined_at
-        host_stats = self._find_host_stats(identity, old)
-        member = Member(identity, slots, fingerprint, self._next_numbering(), now, joined_at, host_stats)
+        host_stats = self._hosts.join(identity, None if old is None else old.host_stats)
+        member = Member(identity, slots, fingerprint, next(self._numberings), now, joined_at, host_stats)
         self.members[identity] = member
         return member.numbering
 
     def handle_departure(self, identity: str, now: float) -> None:
-        """A worker's token vanished."""
-        if (member := self.members.get(identity)) and member.lost is None:
-            member.lost = now
+        """Note that a worker's token vanished."""
+        if (member := self.members.get(identity)) and member.gone_since is None:
+            member.gone_since = now
 
     def remove_worker(self, identity: str) -> None:
-        """Forget a worker; others get its jobs, and what it says counts no more until it is welcomed again."""
-        if member := self.members.get(identity):
-            self._remove_member(member)
+        """Forget a worker: others get its jobs. If it is alive it gets no answer, and so says hello again (R22)."""
+        if member := self.members.pop(identity, None):
+            self._release_leases(member)
 
     def handle_heartbeat(self, identity: str, beat: Heartbeat, now: float) -> None:
-        """Reconcile what the worker holds with what it was given."""
+        """Compare what a worker reports with what it was given.
+
+        R3, R20: a lease that the worker does not show ends. R11: a confirmed batch is not sent again. R19: the first
+        heartbeat makes a guest a member.
+        """
         member, self._now = self.members.get(identity), now
         if member is None:
             return
         self._mark_heard(member, now)
-        if identity in self._guests:  # until it has beaten it may be anybody, and strangers would fill the story
-            del self._guests[identity]
+        if member.is_guest:  # R26: only now is it logged, as strangers could fill the log with names
             self.event_log.add(now, "back" if identity in self.lost else "joined", identity)
-            self._drop_from_lost(identity)
-        if beat.numbering != member.numbering:
-            # It was late, or its worker has not heard of the welcome: what it had queued, it will then forget.
-            beat = replace(beat, seen=0, queued=())
-        elif beat.seen > member.number:  # somebody else sent batches in this coordinator's name: they are counted anew
-            self._restart_numbering(member)
-            self.dropped["count of batches"] += 1
-            beat = replace(beat, seen=0, queued=())
+            self.lost.remove(identity)
+        beat = self._check_numbering(member, beat)
         if self.single_job:
             beat = replace(beat, capacity=min(beat.capacity, beat.slots))
-        for sent in member.apply_beat(beat, now):
+        for sent in member.apply_heartbeat(beat, now):
             for work in sent.content.work:
                 self.event_log.add(now, "seen", identity, work.job.digest)
         running = {self.jobs.digest_of_tag(run.tag): run.steps for run in beat.running}
-        shown = {self.jobs.digest_of_tag(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
-        for digest, lease in list(member.leases.items()):
-            lease.absent_beats = 0 if digest in shown or lease.batch > beat.seen else lease.absent_beats + 1
-            lease.steps, lease.steps_seen_at = running.get(digest), now
-            if lease.absent_beats >= ABSENT_BEATS:
-                self._drop_lease(member, digest)
+        listed = {self.jobs.digest_of_tag(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
+        for digest in member.update_leases(listed, running, now):
+            self._drop_lease(member, digest)
         held = DispatchGroup(now, len(member.leases), only_scoring=False)
-        for found in shown - member.leases.keys():
+        for found in listed - member.leases.keys():
             if found is not None and self._may_readopt(found, identity):
                 self._add_lease(member, found, Lease(beat.seen, held, steps=running.get(found), steps_seen_at=now))
-        member.mark_lost_before(max((lease.batch for each, lease in member.leases.items() if each in shown), default=0))
+        member.resend_before(max((lease.batch for each, lease in member.leases.items() if each in listed), default=0))
 
     def handle_result(self, identity: str, result: Result, now: float) -> tuple[VerdictWord, Work | None]:
-        """Judge one result; the work comes back when it is the first wanted one, for the journal."""
+        """Judge one result; return its work if it is the first valid one of a wanted job, for the journal.
+
+        R5: a stranger's result is dropped. R7: a worker of this run gets a verdict on each result, a duplicate too, so
+        it can stop repeating it.
+        """
         member, self._now = self.members.get(identity), now
-        if self.find_job_for_result(identity, result) is None and (member is None or not member.has_beaten):
-            self.dropped["result of a stranger"] += 1  # who says it again once the run knows him
+        if self.find_job_for_result(identity, result) is None and (member is None or member.is_guest):
+            self.dropped["result of a stranger"] += 1  # a worker of this run repeats it after its first heartbeat
             return "refused", None
         if member is not None:
             self._mark_heard(member, now)
@@ -151,7 +138,7 @@ class Fleet:
         lease = None if member is None else member.leases.get(result.digest)
         verdict, work = self._judge(identity, result)
         if lease is not None and work is not None:
-            self._tail.record_duration(now - lease.group.given_at, is_background=lease.is_background)
+            self._speculation.record_duration(now - lease.group.given_at, is_background=lease.is_background)
         if member is not None or verdict == "accepted":
             self.event_log.add(now, verdict, identity, result.digest)
         if member is not None:
@@ -161,34 +148,37 @@ class Fleet:
             if work is not None:
                 member.host_stats.record_duration(work.job.kind, result.seconds)
         if verdict == "accepted":
-            self._tail.record_episode(result.steps)
+            self._speculation.record_episode(result.steps)
         self.counts["accepted_steps" if verdict == "accepted" else "discarded_steps"] += result.steps
         self.counts[verdict] += 1
         return verdict, work
 
     def find_job_for_result(self, identity: str, result: Result) -> Work | None:
-        """The wanted job of which this worker may bring this result; `None` where there is none.
+        """The wanted job that this worker may answer with this result; `None` if there is none.
 
-        It brings what it was given in this life of the coordinator, whether or not it still holds the lease. What an
-        earlier life may have given counts from any worker that has been welcomed and has beaten, for nobody knows
-        whom it was given to. A failure counts only from who holds the lease.
+        R5: a result counts from a worker that was given the job in this life of the coordinator, with or without the
+        lease. If an earlier life may have given the job, it counts from any worker that has sent a heartbeat. An error
+        counts only from a holder of the lease. So a stranger can neither score nor fail a job.
         """
         pending, member = self.jobs.get(result.digest), self.members.get(identity)
         if pending is None or not self.jobs.may_have_been_given(result.digest, identity):
             return None
-        known = identity in pending.given_to or (member is not None and member.has_beaten)
+        known = identity in pending.given_to or (member is not None and not member.is_guest)
         return pending.work if known and (result.fitness is not None or identity in pending.holders) else None
 
     def overrun(self, identity: str, digest: bytes) -> None:
-        """A worker tells more steps of a job than it can have: it had better be scored elsewhere."""
+        """End the lease of a worker that reports more steps than the job can have.
+
+        R20: such a worker may never finish, so another one gets the job.
+        """
         if (member := self.members.get(identity)) and digest in member.leases:
             self.dropped["lease with more steps than a job has"] += 1
-            self.jobs.overrun(digest, identity)
+            self.jobs.record_overrun(digest, identity)
             member.cancels.append(digest)
             self._drop_lease(member, digest)
 
     def defer_verdict(self, identity: str, digest: bytes, now: float) -> None:
-        """A result came whose upload is still on its way: no verdict yet, and the lease stays."""
+        """Keep the lease of a job whose result came and whose upload is still on the way."""
         member = self.members.get(identity)
         if member is None:
             return
@@ -198,77 +188,99 @@ class Fleet:
             lease.upload_pending_since = now
 
     def tick(self, now: float) -> None:
-        """Let time pass: departures, silences, batches to send again."""
+        """Let time pass.
+
+        R20: the leases of a worker end shortly after its token vanished, or after five silent intervals. R12: a
+        silence starts a new numbering. R21: a gap in this process's own clock is added to all deadlines.
+        """
         gap = now - self._last_tick if self._last_tick is not None else 0.0
         self._last_tick = self._now = now
-        self.lost = {name: each for name, each in self.lost.items() if now - each.last_heard <= LOST_TIMEOUT}
+        self.lost.expire(now)
         for member in list(self.members.values()):
             if gap > CLOCK_GAP:
-                self._excuse_suspension(member, gap)
-            if member.lost is not None:
-                if now - max(member.lost, member.last_heard) >= DEPARTURE_GRACE:
+                member.shift_clock(gap)
+            if member.gone_since is not None:
+                if now - max(member.gone_since, member.last_heard) >= DEPARTURE_GRACE:
                     self._release_lost(member, now, "is gone without a word" if member.capacity else "left")
-                    self._remove_member(member)
-                    self._remember_lost(member)
-            elif now - member.last_heard > (FORGET_AFTER if member.has_beaten else GUEST_TIMEOUT):
-                self._remove_member(member)
-            elif not member.silent and now - member.last_heard > SILENT_BEATS * self._beat:
+                    self.remove_worker(member.identity)
+                    self.lost.add(member)
+            elif now - member.last_heard > (GUEST_TIMEOUT if member.is_guest else FORGET_AFTER):
+                self.remove_worker(member.identity)
+            elif not member.silent and now - member.last_heard > SILENT_AFTER * self._interval:
                 member.silent = True
                 self._release_lost(member, now, "is silent")
-                self._restart_numbering(member)  # what it has not seen is not sent again
+                self._restart_numbering(member)
                 self.counts["silences"] += 1
 
     def dispatch(self, now: float, *, durable: bool = True) -> list[OutgoingBatch]:
-        """Batches to send now: verdicts, cancellations, jobs to credit, and what was not seen in time.
+        """Batches to send now: verdicts, cancellations, new jobs, and batches to send again.
 
-        Verdicts stay until everything so far is `durable`.
+        R6: verdicts wait until the journal has committed everything so far (`durable`), so a crash loses no result.
+        R22: a member without news gets an empty batch, else it would say hello again.
         """
         self._now = now
         for member in self.members.values():
-            member.learn(now)
-        given = self._assign(now)
-        if not self.jobs.queued and not self.paused:
-            for move in self._tail.plan(self.jobs, self.members, given, now):
-                self._apply_move(move, given, now)
-        if not self.paused:
-            for move in self._tail.plan_trials(self.jobs, self.members, given.keys(), now):
-                self._apply_move(move, given, now)
+            member.record_turnarounds(now)
+        given = {} if self.paused else self._plan(now)
         sends: list[OutgoingBatch] = []
         for member in self.members.values():
-            if not (member.present and member.has_beaten):
+            if member.state is not MemberState.PRESENT:
                 continue
-            said = [
+            batches = [
                 *self._overdue_batches(member, now),
                 *self._new_batches(member, given.get(member.identity, ()), durable, now),
             ]
-            if not said and member.is_owed_reply(now, ANSWER_BEATS * self._beat):
-                said = [OutgoingBatch(member.identity, member.numbering, 0, BatchContent())]
-            member.last_sent = now if said else member.last_sent
-            sends += said
+            if not batches and member.is_owed_reply(now, REPLY_AFTER * self._interval):
+                batches = [OutgoingBatch(member.identity, member.numbering, 0, BatchContent())]
+            member.last_sent = now if batches else member.last_sent
+            sends += batches
         return sends
 
     @property
     def lease_count(self) -> int:
-        """Jobs in workers' hands, copies counted."""
+        """Leases of all workers, copies included."""
         return sum(len(member.leases) for member in self.members.values())
 
+    def _check_numbering(self, member: Member, beat: Heartbeat) -> Heartbeat:
+        """The heartbeat, without what it says of batches and queued jobs if that cannot be right.
+
+        R12: a heartbeat of another numbering confirms no batch; what the worker has queued it will forget. One that
+        confirms a batch that was not sent shows that somebody else sends in this coordinator's name.
+        """
+        if beat.numbering == member.numbering:
+            if beat.seen <= member.number:
+                return beat
+            self._restart_numbering(member)
+            self.dropped["count of batches"] += 1
+        return replace(beat, seen=0, queued=())
+
+    def _plan(self, now: float) -> dict[str, list[Work]]:
+        """The work that each member is given now."""
+        given = assign_jobs(self.jobs, self.members, now, drain_background=self.drain_background)
+        if not self.jobs.queue_length:
+            for move in self._speculation.plan(self.jobs, self.members, given, now):
+                self._apply_move(move, given, now)
+        for move in self._speculation.plan_trials(self.jobs, self.members, given.keys(), now):
+            self._apply_move(move, given, now)
+        return given
+
     def _overdue_batches(self, member: Member, now: float) -> Iterator[OutgoingBatch]:
-        """Batches that were not seen in time."""
-        for number in member.overdue(now, 2 * self._beat):
-            sent = member.unseen[number]
-            sent.sent_at, sent.times = now, sent.times + 1
+        """Batches to send again, because no heartbeat has confirmed them in time (R11)."""
+        for number, sent in member.take_overdue_batches(now, RESEND_AFTER * self._interval):
             self.counts["resent_batches"] += 1
-            member.resent += 1
             for work in sent.content.work:
                 self.event_log.add(now, "sent again", member.identity, work.job.digest)
             yield OutgoingBatch(member.identity, member.numbering, number, sent.content)
 
     def _new_batches(self, member: Member, given: Sequence[Work], durable: bool, now: float) -> Iterator[OutgoingBatch]:
-        """Batches that it was not sent yet."""
-        group = member.new_group(now)
+        """New batches.
+
+        R10: they are numbered without a gap, so the worker can report how many it has.
+        """
+        group = member.start_group(now)
         for content in pack(given, member.cancels, member.verdicts if durable else []):
             member.number += 1
-            member.unseen[member.number] = SentBatch(content, now, now)
+            member.unconfirmed[member.number] = SentBatch(content, now, now)
             for work in content.work:
                 self._add_lease(member, work.job.digest, Lease(member.number, group))
                 self.event_log.add_given(now, member.identity, work.job)
@@ -278,6 +290,10 @@ class Fleet:
             member.verdicts = []
 
     def _judge(self, identity: str, result: Result) -> tuple[VerdictWord, Work | None]:
+        """The verdict on a result, and its work if it is accepted.
+
+        R4: only the first valid result of a wanted job is accepted. R8: an error is recorded, never a fitness.
+        """
         if result.digest not in self.jobs:
             return ("duplicate" if self.jobs.is_accepted(result.digest) else "obsolete"), None
         if self.find_job_for_result(identity, result) is None:
@@ -295,64 +311,49 @@ class Fleet:
         return "accepted", pending.work
 
     def _cancel(self, digest: bytes, pending: PendingJob) -> None:
-        """Whoever holds a job that is wanted no more hears so."""
+        """End all leases of a job that is wanted no more.
+
+        R9: each holder gets a cancellation, so nobody works for nothing; except a trial copy, whose duration is wanted.
+        """
         for holder in pending.holders:
             member = self.members[holder]
             lease = member.leases.pop(digest, None)
             if lease is not None:
                 member.record_superseded(lease, self._now)
-            if digest not in member.trial_copies:  # which is worth its end
+            if digest not in member.trial_copies:
                 member.cancels.append(digest)
             self.counts["discarded_steps"] += (lease and lease.steps) or 0
 
     def _may_readopt(self, digest: bytes, identity: str) -> bool:
-        """Whether a worker that shows a wanted job has its lease again."""
+        """Whether a worker that lists a wanted job gets its lease back.
+
+        R5: only if it may have been given the job. R17: a job has at most two holders.
+        """
         pending = self.jobs[digest]
-        free = len(pending.holders) < 2 and identity not in pending.overrun
+        free = pending.state is not JobState.COPIED and identity not in pending.overrun_by
         return free and self.jobs.may_have_been_given(digest, identity)
 
     def _restart_numbering(self, member: Member) -> None:
-        """Whatever a worker has is given again, in another numbering, unless it shows it."""
+        """Start a new numbering: its jobs are given again, unless a heartbeat lists them."""
         self._release_leases(member)
-        member.begin_numbering(self._next_numbering())
-
-    def _next_numbering(self) -> int:
-        self._numberings += 1
-        return self._numberings
+        member.start_numbering(next(self._numberings))
 
     def _mark_heard(self, member: Member, now: float) -> None:
         member.last_heard = now
-        if member.silent and member.has_beaten:  # else its silence was not told either
+        if member.silent and not member.is_guest:  # a guest's silence was not logged either
             self.event_log.add(now, "back", member.identity)
         member.silent = False
 
-    def _excuse_suspension(self, member: Member, gap: float) -> None:
-        """A suspended host's gap is nobody's silence."""
-        member.last_heard += gap
-        for sent in member.unseen.values():
-            sent.sent_at += gap
-        member.shift_clock(gap)
-
-    def _find_host_stats(self, identity: str, old: Member | None) -> HostStats:
-        """What is known of this worker's host, which every life of it goes on from."""
-        name = identity.partition("/")[0]
-        last = self._host_stats.pop(name, None)
-        host_stats = old.host_stats if old else last.copy() if last else HostStats()
-        self._host_stats[name] = host_stats
-        while len(self._host_stats) > MOST_RECORDS:
-            del self._host_stats[next(iter(self._host_stats))]
-        return host_stats
-
     def _release_lost(self, member: Member, now: float, what: str) -> None:
-        if not member.has_beaten:
-            return  # nothing was given to it, and no log should grow with what strangers call themselves
+        """Release and log a worker that is gone or silent; its host's record counts a loss of jobs."""
+        if member.is_guest:
+            return  # it has no jobs, and a stranger can invent names without end
         freed = f"{plural(len(member.leases), 'job')} {'is' if len(member.leases) == 1 else 'are'} free again"
         self.notes.append(f"worker {member.identity} {what}: {freed}")
         gone: EventKind = "lost" if member.capacity else "left"
-        self.event_log.add(now, "silent" if member.lost is None else gone, member.identity)
+        self.event_log.add(now, "silent" if member.gone_since is None else gone, member.identity)
         if member.leases:
-            last = self._host_stats.get(member.identity.partition("/")[0], member.host_stats)
-            last.record_death(now - member.joined_at)
+            (self._hosts.get(member.identity) or member.host_stats).record_loss(now - member.joined_at)
         self._release_leases(member)
 
     def _add_lease(self, member: Member, digest: bytes, lease: Lease) -> None:
@@ -361,92 +362,35 @@ class Fleet:
         self.jobs.add_holder(digest, member.identity)
 
     def _apply_move(self, move: Move, given: dict[str, list[Work]], now: float) -> None:
-        """Give a job to an idle slot too, or instead of to a worker that has not begun it."""
-        if move.instead_of:
-            donor = self.members[move.instead_of]
+        """Give a job to an idle slot, as a copy or instead of to its former holder."""
+        if move.donor:
+            donor = self.members[move.donor]
             donor.leases.pop(move.digest)
             donor.cancels.append(move.digest)
             self.jobs.remove_holder(move.digest, donor.identity)
             self.event_log.add(now, "recalled", donor.identity, move.digest)
         else:
-            self.event_log.add(now, "copied", move.to, move.digest)
+            self.event_log.add(now, "copied", move.taker, move.digest)
         if move.trial:
-            self.members[move.to].trial_copies[move.digest] = DispatchGroup(now, 0)
-        self.counts["recalled" if move.instead_of else "copied"] += 1
-        self.jobs.add_holder(move.digest, move.to)
-        given.setdefault(move.to, []).append(self.jobs[move.digest].work)
+            self.members[move.taker].trial_copies[move.digest] = DispatchGroup(now, 0)
+        self.counts["recalled" if move.donor else "copied"] += 1
+        self.jobs.add_holder(move.digest, move.taker)
+        given.setdefault(move.taker, []).append(self.jobs[move.digest].work)
 
     def _drop_lease(self, member: Member, digest: bytes) -> None:
-        """End a lease without a result; the job is queued again unless another worker holds it."""
+        """End a lease without a result.
+
+        R3: when the last lease of a wanted job ends, the job goes back into the queue.
+        """
         member.leases.pop(digest, None)
         if self.jobs.remove_holder(digest, member.identity):
             self.counts["reissued"] += 1
             self.event_log.add(self._now, "reissued", member.identity, digest)
             self.jobs.enqueue(digest)
 
-    def _remove_member(self, member: Member) -> None:
-        """It is nobody's member any more; one that lives says hello again, for it is silent to it in turn."""
-        self._release_leases(member)
-        self._guests.pop(member.identity, None)
-        del self.members[member.identity]
-
-    def _remember_lost(self, member: Member) -> None:
-        """Its token vanished. One that left had said that it takes no more; of any other it is told that it is lost."""
-        if member.has_beaten and member.capacity:
-            self.lost[member.identity] = member
-            if len(self.lost) > MOST_LOST:
-                del self.lost[next(iter(self.lost))]
-
-    def _drop_from_lost(self, identity: str) -> None:
-        """It is back, or another life of a lost worker of its host is there in its place."""
-        host = identity.partition("/")[0]
-        others = (name for name in self.lost if name.partition("/")[0] == host)
-        self.lost.pop(identity if identity in self.lost else next(others, ""), None)
-
     def _release_leases(self, member: Member) -> None:
+        """End all leases of a member (R3: each job goes back into the queue)."""
         for digest in list(member.leases):
             self._drop_lease(member, digest)
-        member.unseen.clear()
+        member.unconfirmed.clear()
         member.trial_copies.clear()
-
-    def _assign(self, now: float) -> dict[str, list[Work]]:
-        """One job at a time to the least loaded worker with credit that helps, so that a tail is spread evenly."""
-        given: dict[str, list[Work]] = {}
-        if self.paused:
-            return given
-        loads = {name: len(member.leases) for name, member in self.members.items() if member.credit > 0}
-        choice = WorkerSelection(self.members, loads, self.jobs.queued, now)
-        slots = sum(member.slots for member in self.members.values() if member.present and member.capacity)
-        passed_over = []
-        while loads:
-            idle = any(load < self.members[name].capacity for name, load in loads.items())
-            if (next_job := self.jobs.next(slots, idle=idle, drain_background=self.drain_background)) is None:
-                break
-            pending = self.jobs[next_job.digest]
-            eligible = self._eligible_workers(pending, loads)
-            if not eligible:
-                passed_over.append(next_job.digest)
-                continue
-            name = choice.pick(eligible)
-            if name is None and not pending.avoided_workers:
-                passed_over.append(next_job.digest)
-                break  # nor the jobs after it: they had better wait for whoever is sooner
-            name = name or min(eligible, key=lambda name: loads[name])
-            choice.assign(name)
-            given.setdefault(name, []).append(pending.work)
-            self.jobs.add_holder(next_job.digest, name, by_share=next_job.by_share)
-            loads[name] += 1
-            if len(given[name]) >= self.members[name].credit:
-                del loads[name]
-        for digest in passed_over:
-            self.jobs.enqueue(digest)
-        return given
-
-    def _eligible_workers(self, pending: PendingJob, loads: Mapping[str, int]) -> list[str]:
-        """Who of these may be given this job: not where it failed, unless nobody else is there or about to be.
-
-        A killed child must not hang a run, nor may a stranger who only said hello.
-        """
-        eligible = [name for name in loads if name not in pending.avoided_workers]
-        there = (name for name, member in self.members.items() if member.present and member.has_beaten)
-        return list(loads) if not eligible and all(name in pending.avoided_workers for name in there) else eligible

@@ -1,6 +1,7 @@
-"""What experience with a host says: how soon it brings jobs back, what its link carries, how long it lives. Pure.
+"""What experience with a host says: how soon it returns jobs, how fast its link is, how long it stays up. Pure.
 
-It outlives a worker's life: whoever joins again, or is started again under the same name, is known already.
+R16: the coordinator measures a host before it relies on it. The record outlives a worker: the next worker of the same
+host starts with it.
 """
 
 from __future__ import annotations
@@ -10,84 +11,84 @@ from dataclasses import dataclass, field, replace
 
 from dreamfleet.common.protocol.messages import Kind
 
-UNKNOWN_LINK = 32_000.0  # bytes a second that a link is thought to carry before it has shown what it does
-RATE_DECAY = 0.95  # of the best rate that a link has shown remains with each new one
-RISING, FALLING = 0.5, 0.2  # weight of a slower and of a faster turnaround
-GROWTH, SHRINKING = 0.9, 0.25  # powers of their number that more jobs than ever, or fewer, should take
-TURNAROUND_MEMORY = 60.0  # seconds that a turnaround is remembered where there is a newer one
-DEVIATIONS = 2.0  # above the mean that are still expected, as TCP's retransmission timer reckons (RFC 6298: four)
-LIFETIMES = 8.0  # a host that dies is given what it should bring back in this part of a life
-DEATHS = 2  # with jobs in its hands, after which a host counts as one that dies
+UNKNOWN_LINK = 32_000.0  # bytes a second: assumed of a link before the first measurement
+RATE_DECAY = 0.95  # factor of the best measured rate at each new measurement
+RISING, FALLING = 0.5, 0.2  # weights of a slower and of a faster new value in a moving mean
+GROWTH, SHRINKING = 0.9, 0.25  # exponents: expected time of more, and of fewer, jobs than ever measured
+TURNAROUND_MEMORY = 60.0  # seconds that a turnaround is remembered after a newer one
+DEVIATIONS = 2.0  # above the mean that are still expected, like TCP's retransmission timer (RFC 6298: four)
+LIFETIMES = 8.0  # an unreliable host is given only jobs that take less than this part of its lifetime
+UNRELIABLE_LOSSES = 2  # losses with jobs in hand after which a host counts as unreliable
+MAX_HOSTS = 4096  # hosts that are remembered, the latest that joined
 
 
 @dataclass
 class Turnaround:
-    """Seconds until so many jobs are back: mean and mean deviation."""
+    """Seconds until a number of jobs is back: moving mean and mean deviation."""
 
     mean: float
-    at: float  # when it was last seen
+    at: float  # when it was last measured
     deviation: float = 0.0
 
-    def learn(self, seconds: float) -> None:
-        """It took so long this time."""
+    def update(self, seconds: float) -> None:
+        """Add a measurement."""
         error = seconds - self.mean
         self.deviation += FALLING * (abs(error) - self.deviation)
         self.mean += (RISING if error > 0 else FALLING) * error
 
     @property
     def seconds(self) -> float:
-        """That nearly all should take."""
+        """An upper bound that nearly all jobs keep."""
         return self.mean + DEVIATIONS * self.deviation
 
 
 @dataclass
 class HostStats:
-    """One host's; `turnarounds` by the power of two that the number of jobs in its hands came up to."""
+    """One host's record; `turnarounds` by size class, the logarithm to base 2 of the number of jobs, rounded up."""
 
     turnarounds: dict[int, Turnaround] = field(default_factory=dict)
     bandwidth: float = UNKNOWN_LINK  # bytes a second towards it
-    last_return: float = -math.inf  # when a job last came back
-    deaths: int = 0  # since it last proved to live
-    mean_lifetime: float = math.inf  # seconds between them
+    last_return: float = -math.inf  # when it last returned a job
+    losses: int = 0  # how often it was lost with jobs in hand
+    mean_lifetime: float = math.inf  # seconds, of the workers that were lost
     steps_per_second: float = 0.0  # environment steps a second of one of its slots
     job_seconds: float | None = None  # seconds that a candidate's job takes one of its slots
     evaluation_seconds: float | None = None  # the same of an evaluation's
-    round_trip: float | None = None  # seconds until a batch was known to have arrived, at best
+    round_trip: float | None = None  # seconds until a heartbeat confirmed a batch, at best
 
     def copy(self) -> HostStats:
-        """The same for another life of it."""
+        """An independent copy, for another worker of the host."""
         return replace(self, turnarounds={size: replace(each) for size, each in self.turnarounds.items()})
 
     @property
     def has_history(self) -> bool:
-        """Whether it ever brought a job back."""
+        """Whether it ever returned a job."""
         return bool(self.turnarounds)
 
-    def learn(self, jobs: int, seconds: float, now: float) -> None:
-        """So many jobs in its hands were back after so long."""
+    def record_turnaround(self, jobs: int, seconds: float, now: float) -> None:
+        """Note that the host returned `jobs` jobs within `seconds`."""
         self.last_return = now
         size = _size_class(jobs)
         here = self.turnarounds.setdefault(size, Turnaround(seconds, now))
-        here.learn(seconds)
+        here.update(seconds)
         here.at = now
         self.turnarounds = {
             other: each for other, each in self.turnarounds.items() if now - each.at < TURNAROUND_MEMORY
         }
         for larger, old in self.turnarounds.items():
-            most = here.seconds * 2 ** (larger - size)
-            if larger > size and old.seconds > most:  # that was another time
-                self.turnarounds[larger] = Turnaround(most, now)
+            bound = here.seconds * 2 ** (larger - size)
+            if larger > size and old.seconds > bound:  # the host was slower then
+                self.turnarounds[larger] = Turnaround(bound, now)
 
     def record_superseded(self, jobs: int, seconds: float, now: float) -> None:
-        """A job was not back after so long, when another host's result made it needless."""
+        """Note that a job was not back after `seconds`, when another host's result came."""
         if self.has_history and seconds > self.expected_seconds(jobs):
-            self.turnarounds.setdefault(_size_class(jobs), Turnaround(seconds, now)).learn(seconds)
+            self.turnarounds.setdefault(_size_class(jobs), Turnaround(seconds, now)).update(seconds)
 
     def expected_seconds(self, jobs: int) -> float:
-        """Seconds until it has brought so many back, if they are all that it has.
+        """Seconds until the host has returned `jobs` jobs, if it holds no others; infinite without a record.
 
-        More jobs than it ever had are expected to take nearly as much longer, fewer somewhat less; a host of which
-        nothing is known never brings any back.
+        More jobs than ever measured take nearly proportionally longer, fewer somewhat less.
         """
         size = _size_class(jobs)
         if (exactly := self.turnarounds.get(size)) is not None:
@@ -98,45 +99,67 @@ class HostStats:
         if smaller is not None:
             bounds.append(self.turnarounds[smaller].seconds * 2 ** (GROWTH * (size - smaller)))
         if larger is not None:
-            bounds.append(
-                self.turnarounds[larger].seconds * (1.0 if smaller is not None else 2 ** ((size - larger) / 4))
-            )
+            factor = 1.0 if smaller is not None else 2 ** (SHRINKING * (size - larger))
+            bounds.append(self.turnarounds[larger].seconds * factor)
         return min(bounds)
 
     @property
     def rate(self) -> float:
-        """Jobs a second that it has brought back at best."""
+        """The highest measured rate, in jobs a second."""
         return max((2**size / max(each.mean, 1e-9) for size, each in self.turnarounds.items()), default=0.0)
 
-    def record_death(self, age: float) -> None:
-        """It was lost at this age, with jobs in its hands."""
-        self.deaths += 1
+    def record_loss(self, age: float) -> None:
+        """Note that a worker of this host was lost with jobs in hand, `age` seconds after it joined."""
+        self.losses += 1
         self.mean_lifetime = (
             age if self.mean_lifetime == math.inf else self.mean_lifetime + RISING * (age - self.mean_lifetime)
         )
 
     def is_likely_lost(self, jobs: int, age: float) -> bool:
-        """Whether it may well be lost before it brings so many back."""
-        return self.deaths >= DEATHS and self.expected_seconds(jobs) * LIFETIMES > max(self.mean_lifetime, age)
+        """Whether a worker of this age may well be lost before it has returned `jobs` jobs."""
+        return self.losses >= UNRELIABLE_LOSSES and self.expected_seconds(jobs) * LIFETIMES > max(
+            self.mean_lifetime, age
+        )
 
     def record_duration(self, kind: Kind, seconds: float) -> None:
-        """A job of this kind took a slot so long."""
+        """Note how long a job of this kind took a slot."""
         if kind == "score":
             self.job_seconds = _smoothed(self.job_seconds, seconds)
         elif kind == "evaluate":
             self.evaluation_seconds = _smoothed(self.evaluation_seconds, seconds)
 
     def record_round_trip(self, seconds: float) -> None:
-        """A batch was known to have arrived so long after it was sent."""
+        """Note the time from sending a batch to its confirmation."""
         self.round_trip = seconds if self.round_trip is None else min(seconds, self.round_trip / RATE_DECAY)
 
     def record_transfer(self, size: int, seconds: float) -> None:
-        """So many bytes had arrived after so long; a beat says so, which makes it a lower bound."""
+        """Note that `size` bytes arrived within `seconds`: a lower bound, as heartbeats confirm late."""
         self.bandwidth = max(size / max(seconds, 1e-3), RATE_DECAY * self.bandwidth)
 
     def transfer_seconds(self, size: int) -> float:
-        """Seconds that its link takes for so many bytes."""
+        """Seconds that the link takes for `size` bytes."""
         return size / self.bandwidth
+
+
+class HostRecords:
+    """The records of the hosts that joined last, by host name."""
+
+    def __init__(self) -> None:
+        self._records: dict[str, HostStats] = {}  # the latest that joined last
+
+    def join(self, identity: str, current: HostStats | None) -> HostStats:
+        """The record for a worker that joins: its `current` one, else a copy of its host's, else an empty one."""
+        name = identity.partition("/")[0]
+        last = self._records.pop(name, None)
+        host_stats = current or (last.copy() if last else HostStats())
+        self._records[name] = host_stats
+        while len(self._records) > MAX_HOSTS:  # R26: strangers can invent names without end
+            del self._records[next(iter(self._records))]
+        return host_stats
+
+    def get(self, identity: str) -> HostStats | None:
+        """The record of a worker's host."""
+        return self._records.get(identity.partition("/")[0])
 
 
 def _size_class(jobs: int) -> int:

@@ -1,15 +1,30 @@
-"""What the coordinator believes of one worker."""
+"""What the coordinator knows of one worker: its state, leases, unconfirmed batches and speed. Pure."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, field
+from enum import Enum, auto
 
 from dreamfleet.common.protocol.messages import MAX_LEASES, Heartbeat, Result, Verdict
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.packing import BatchContent
 
-TRIAL_SECONDS = 60.0  # after which a copy that shows nothing is given up
+TRIAL_SECONDS = 60.0  # after which a trial copy without a result is forgotten
+MAX_BACKOFF = 4  # doublings of the pause before a batch is sent again
+ABSENT_HEARTBEATS = 2  # in a row that confirm a job's batch and do not list the job: its lease ends
+LOST_TIMEOUT = 600.0  # seconds for which a lost worker is listed, unless its host is back
+MAX_LOST = 256  # lost workers that are listed, the latest ones
+
+
+class MemberState(Enum):
+    """A member's state; a lost worker is no member any more (`LostWorkers`)."""
+
+    GUEST = auto()  # welcomed, no heartbeat yet: anybody can say hello
+    PRESENT = auto()
+    SILENT = auto()  # no message for several intervals: it has no leases
+    GONE = auto()  # its token vanished: results that are under way have a moment to arrive
 
 
 @dataclass(eq=False)
@@ -19,20 +34,20 @@ class DispatchGroup:
     given_at: float
     held_before: int
     returned_count: int = 0
-    only_scoring: bool = True  # whether it held nothing but candidates' jobs, so that its time says how soon it is
+    only_scoring: bool = True  # whether the worker held only candidates' jobs, so that the time measures its speed
 
 
 @dataclass
 class Lease:
-    """A job in a worker's hands."""
+    """A job that a worker holds: sent in `batch`, then running once a heartbeat shows its `steps`."""
 
     batch: int
     group: DispatchGroup
     is_background: bool = False
-    absent_beats: int = 0  # beats in a row that have seen the batch and do not show the job
-    steps: int | None = None  # environment steps that it has made, once a beat has shown it running
-    steps_seen_at: float = 0.0  # when it did
-    upload_pending_since: float | None = None  # when its result first came, of which the upload is still on its way
+    absent_heartbeats: int = 0  # in a row that confirm the batch and do not list the job
+    steps: int | None = None  # environment steps so far, once a heartbeat has shown the job running
+    steps_seen_at: float = 0.0  # when the last heartbeat came
+    upload_pending_since: float | None = None  # when its result first came, while its upload is still on the way
 
 
 @dataclass
@@ -40,14 +55,14 @@ class SentBatch:
     """A batch that its worker has not confirmed."""
 
     content: BatchContent
-    sent_at: float
-    first_sent_at: float  # when it was sent for the first time
+    sent_at: float  # the last time; -inf: send it again at once
+    first_sent_at: float
     times: int = 1
 
 
 @dataclass
 class Member:
-    """What the coordinator believes of one worker."""
+    """What the coordinator knows of one worker."""
 
     identity: str
     slots: int
@@ -56,114 +71,53 @@ class Member:
     last_heard: float
     joined_at: float = 0.0
     host_stats: HostStats = field(default_factory=HostStats)
-    capacity: int = 0  # unknown, and so without credit, before its first beat
-    lost: float | None = None
+    capacity: int = 0  # slots that take jobs; 0, and so no credit, before the first heartbeat and once it drains
+    gone_since: float | None = None  # when its token vanished
     silent: bool = False
-    has_beaten: bool = False  # by a beat: anybody can say hello
-    number: int = 0
-    seen: int = 0
+    is_guest: bool = True  # until its first heartbeat
+    number: int = 0  # of the last batch in its numbering
+    confirmed: int = 0  # the worker has all batches up to this number
     load: float = 0.0
     steps_per_second: float = 0.0
     drawn_by: str = "-"
-    host_class: str = ""  # not known yet
-    finished: int = 0
+    host_class: str = ""  # empty: not known yet
+    finished: int = 0  # accepted results
     resent: int = 0  # batches that were sent again
-    leases: dict[bytes, Lease] = field(default_factory=dict)  # in the order in which they were given
-    trial_copies: dict[bytes, DispatchGroup] = field(
-        default_factory=dict
-    )  # copies that show how soon it is, wanted or not
-    returned: list[DispatchGroup] = field(default_factory=list)  # of which something came back since the last dispatch
-    last_delivery: float = 0.0  # when it was last known to have seen everything, or something more
-    last_sent: float = 0.0  # when anything was last sent
-    unseen: dict[int, SentBatch] = field(default_factory=dict)
-    verdicts: list[Verdict] = field(default_factory=list)
-    cancels: list[bytes] = field(default_factory=list)
+    leases: dict[bytes, Lease] = field(default_factory=dict)  # by digest, in the order in which they were given
+    trial_copies: dict[bytes, DispatchGroup] = field(default_factory=dict)  # copies that measure it, wanted or not
+    returned: list[DispatchGroup] = field(default_factory=list)  # groups with a new result since the last dispatch
+    last_delivery: float = 0.0  # when a heartbeat last confirmed a batch
+    last_sent: float = 0.0  # when anything was last sent to it
+    unconfirmed: dict[int, SentBatch] = field(default_factory=dict)
+    verdicts: list[Verdict] = field(default_factory=list)  # to send
+    cancels: list[bytes] = field(default_factory=list)  # to send
 
-    def begin_numbering(self, numbering: int) -> None:
-        """What it is given is counted from 1 again; it is owed no word, for it will say again what it did."""
-        self.numbering, self.number, self.seen = numbering, 0, 0
-        self.unseen.clear()
-        self.cancels, self.verdicts = [], []
+    @property
+    def state(self) -> MemberState:
+        """Its state now."""
+        if self.gone_since is not None:
+            return MemberState.GONE
+        if self.is_guest:
+            return MemberState.GUEST
+        return MemberState.SILENT if self.silent else MemberState.PRESENT
 
-    def apply_beat(self, beat: Heartbeat, now: float) -> list[SentBatch]:
-        """Take what a beat says of the worker itself; the batches that it has seen since the last one."""
-        self.has_beaten = True
-        self.capacity, self.slots, self.seen = beat.capacity, beat.slots, beat.seen
-        self.load, self.steps_per_second, self.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
-        if beat.running and beat.steps_per_second:
-            self.host_stats.steps_per_second = beat.steps_per_second / len(beat.running)
-        arrived = [self.unseen.pop(number) for number in list(self.unseen) if number <= beat.seen]
-        if arrived and all(sent.times == 1 for sent in arrived):  # else nobody knows which of them arrived
-            since = max(self.last_delivery, min(sent.first_sent_at for sent in arrived))
-            self.host_stats.record_transfer(sum(sent.content.size for sent in arrived), now - since)
-            self.host_stats.record_round_trip(now - max(sent.first_sent_at for sent in arrived))
-        if arrived:
-            self.last_delivery = now
-        return arrived
+    @property
+    def is_reachable(self) -> bool:
+        """Whether it is present, or a guest that was heard lately."""
+        return self.gone_since is None and not self.silent
 
-    def overdue(self, now: float, patience: float) -> list[int]:
-        """Batches to send again: not seen for `patience`, and what the link takes for all that is on the way."""
-        late, ahead = [], 0
-        for number, sent in self.unseen.items():
-            ahead += sent.content.size
-            since = (
-                sent.sent_at if sent.sent_at == -math.inf else max(sent.sent_at, self.last_delivery)
-            )  # the link is free since then
-            if now - since > (patience + self.host_stats.transfer_seconds(ahead)) * 2 ** min(sent.times - 1, 4):
-                late.append(number)
-        return late
+    @property
+    def takes_jobs(self) -> bool:
+        """Whether it is present and does not drain."""
+        return self.is_reachable and self.capacity > 0
 
-    def new_group(self, now: float) -> DispatchGroup:
-        """What it is given now."""
-        return DispatchGroup(now, len(self.leases), only_scoring=not self.background_slots)
+    @property
+    def credit(self) -> int:
+        """How many more jobs it may be given.
 
-    def record_return(self, result: Result) -> None:
-        """One of its jobs is done."""
-        group = self.trial_copies.pop(result.digest, None)
-        if (lease := self.leases.get(result.digest)) is not None:
-            group = lease.group
-        if group is not None and result.fitness is not None:
-            group.returned_count += 1
-            self.returned.append(group)
-
-    def record_superseded(self, lease: Lease, now: float) -> None:
-        """A job of its is not needed any more."""
-        if not lease.group.only_scoring or self.background_slots:
-            return
-        self.host_stats.record_superseded(
-            lease.group.held_before + lease.group.returned_count + 1, now - lease.group.given_at, now
-        )
-
-    def mark_lost_before(self, batch: int) -> None:
-        """What it shows came with this batch: those before it that it has not seen were lost."""
-        for number, sent in self.unseen.items():
-            if number < batch and sent.times == 1:
-                sent.sent_at = -math.inf
-
-    def mark_for_resend(self, since: float) -> None:
-        """It may have been out of reach: what it has not seen is sent again at once, unless it was sent since then."""
-        for sent in self.unseen.values():
-            sent.sent_at = -math.inf if sent.sent_at <= since else sent.sent_at
-
-    def is_owed_reply(self, now: float, patience: float) -> bool:
-        """Whether it has spoken since it was last spoken to, so long ago."""
-        return self.present and self.last_heard > self.last_sent and now - self.last_sent > patience
-
-    def shift_clock(self, gap: float) -> None:
-        """The clock stood still."""
-        for group in {*(lease.group for lease in self.leases.values()), *self.trial_copies.values()}:
-            group.given_at += gap
-        self.last_sent += gap
-
-    def learn(self, now: float) -> None:
-        """How soon what has come back since the last time was back."""
-        for each in dict.fromkeys(self.returned):
-            if each.only_scoring and not self.background_slots:
-                self.host_stats.learn(each.held_before + each.returned_count, now - each.given_at, now)
-        self.returned.clear()
-        self.trial_copies = {
-            digest: each for digest, each in self.trial_copies.items() if now - each.given_at < TRIAL_SECONDS
-        }
+        R14: at most twice as many jobs as it scores at once, so it never waits and its loss costs little.
+        """
+        return min(2 * self.capacity, MAX_LEASES) - len(self.leases) if self.is_reachable else 0
 
     @property
     def slot_steps_per_second(self) -> float:
@@ -175,12 +129,167 @@ class Member:
         """Slots that evaluations and collected rollouts take."""
         return sum(lease.is_background for lease in self.leases.values())
 
-    @property
-    def present(self) -> bool:
-        """Whether it may be given work."""
-        return self.lost is None and not self.silent
+    def start_numbering(self, numbering: int) -> None:
+        """Number its batches from 1 again, and forget what was to be sent: the worker repeats its results.
 
-    @property
-    def credit(self) -> int:
-        """How many more jobs it may be given."""
-        return min(2 * self.capacity, MAX_LEASES) - len(self.leases) if self.present else 0
+        R12: a new numbering separates what follows from all messages before a cut.
+        """
+        self.numbering, self.number, self.confirmed = numbering, 0, 0
+        self.unconfirmed.clear()
+        self.cancels, self.verdicts = [], []
+
+    def apply_heartbeat(self, beat: Heartbeat, now: float) -> list[SentBatch]:
+        """Take what a heartbeat says of the worker; return the batches that it confirms for the first time.
+
+        R11: a batch is kept until a heartbeat confirms it. R19: the first heartbeat turns a guest into a member
+        with credit.
+        """
+        self.is_guest = False
+        self.capacity, self.slots, self.confirmed = beat.capacity, beat.slots, beat.seen
+        self.load, self.steps_per_second, self.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
+        if beat.running and beat.steps_per_second:
+            self.host_stats.steps_per_second = beat.steps_per_second / len(beat.running)
+        arrived = [self.unconfirmed.pop(number) for number in list(self.unconfirmed) if number <= beat.seen]
+        if arrived and all(sent.times == 1 for sent in arrived):  # of a repeated batch, any sending may have arrived
+            since = max(self.last_delivery, min(sent.first_sent_at for sent in arrived))
+            self.host_stats.record_transfer(sum(sent.content.size for sent in arrived), now - since)
+            self.host_stats.record_round_trip(now - max(sent.first_sent_at for sent in arrived))
+        if arrived:
+            self.last_delivery = now
+        return arrived
+
+    def update_leases(self, listed: Set[bytes | None], running: Mapping[bytes | None, int], now: float) -> list[bytes]:
+        """Note which jobs the last heartbeat listed and how far they are; return the digests whose leases end.
+
+        R20: a lease ends when two heartbeats that confirm its batch do not list the job, so another worker gets it
+        soon.
+        """
+        for digest, lease in self.leases.items():
+            present = digest in listed or lease.batch > self.confirmed
+            lease.absent_heartbeats = 0 if present else lease.absent_heartbeats + 1
+            lease.steps, lease.steps_seen_at = running.get(digest), now
+        return [digest for digest, lease in self.leases.items() if lease.absent_heartbeats >= ABSENT_HEARTBEATS]
+
+    def take_overdue_batches(self, now: float, patience: float) -> Iterator[tuple[int, SentBatch]]:
+        """Batches to send again, with their numbers.
+
+        R11: a batch is due after `patience` and the time that the link needs for all that is on the way, then after
+        twice as long each time, so a slow link is not flooded.
+        """
+        ahead = 0
+        for number, sent in self.unconfirmed.items():
+            ahead += sent.content.size
+            # The link is free since the last delivery.
+            since = sent.sent_at if sent.sent_at == -math.inf else max(sent.sent_at, self.last_delivery)
+            pause = patience + self.host_stats.transfer_seconds(ahead)
+            if now - since > pause * 2 ** min(sent.times - 1, MAX_BACKOFF):
+                sent.sent_at, sent.times = now, sent.times + 1
+                self.resent += 1
+                yield number, sent
+
+    def resend_before(self, batch: int) -> None:
+        """Send unconfirmed batches with lower numbers again at once.
+
+        R11: a later batch has arrived, so these were lost.
+        """
+        for number, sent in self.unconfirmed.items():
+            if number < batch and sent.times == 1:
+                sent.sent_at = -math.inf
+
+    def resend_sent_before(self, moment: float) -> None:
+        """Send unconfirmed batches again at once, except those sent after `moment`.
+
+        R19: a hello in the name of a live worker only repeats what that worker may have missed.
+        """
+        for sent in self.unconfirmed.values():
+            sent.sent_at = -math.inf if sent.sent_at <= moment else sent.sent_at
+
+    def start_group(self, now: float) -> DispatchGroup:
+        """Open the group of the jobs that the worker is given now."""
+        return DispatchGroup(now, len(self.leases), only_scoring=not self.background_slots)
+
+    def record_return(self, result: Result) -> None:
+        """Note that one of its jobs is done."""
+        group = self.trial_copies.pop(result.digest, None)
+        if (lease := self.leases.get(result.digest)) is not None:
+            group = lease.group
+        if group is not None and result.fitness is not None:
+            group.returned_count += 1
+            self.returned.append(group)
+
+    def record_superseded(self, lease: Lease, now: float) -> None:
+        """Note that another worker's result came before the one of this lease."""
+        if not lease.group.only_scoring or self.background_slots:
+            return
+        self.host_stats.record_superseded(
+            lease.group.held_before + lease.group.returned_count + 1, now - lease.group.given_at, now
+        )
+
+    def record_turnarounds(self, now: float) -> None:
+        """Learn from the results since the last call how soon this host returns jobs.
+
+        R16: measured times, not a host's word, decide what it is given.
+        """
+        for each in dict.fromkeys(self.returned):
+            if each.only_scoring and not self.background_slots:
+                self.host_stats.record_turnaround(each.held_before + each.returned_count, now - each.given_at, now)
+        self.returned.clear()
+        self.trial_copies = {
+            digest: each for digest, each in self.trial_copies.items() if now - each.given_at < TRIAL_SECONDS
+        }
+
+    def is_owed_reply(self, now: float, patience: float) -> bool:
+        """Whether it has spoken since the coordinator last did, and that was longer than `patience` ago.
+
+        R22: a worker without any answer would say hello again.
+        """
+        return self.is_reachable and self.last_heard > self.last_sent and now - self.last_sent > patience
+
+    def shift_clock(self, gap: float) -> None:
+        """Add `gap` seconds to all that is timed.
+
+        R21: while this process was suspended it could hear nobody, so the gap is not the worker's silence.
+        """
+        self.last_heard += gap
+        self.last_sent += gap
+        for sent in self.unconfirmed.values():
+            sent.sent_at += gap
+        for group in {*(lease.group for lease in self.leases.values()), *self.trial_copies.values()}:
+            group.given_at += gap
+
+
+class LostWorkers(dict[str, Member]):
+    """Workers that vanished without leaving, by identity, the latest last: listed in the status, no members."""
+
+    def add(self, member: Member) -> None:
+        """List a worker whose token vanished, unless it was draining: then it left in order."""
+        if not member.is_guest and member.capacity:
+            self[member.identity] = member
+            if len(self) > MAX_LOST:  # R26: the list is bounded
+                del self[next(iter(self))]
+
+    def remove(self, identity: str) -> None:
+        """Unlist a worker that is back; else one of the same host, of which this is another life."""
+        host = identity.partition("/")[0]
+        others = (name for name in self if name.partition("/")[0] == host)
+        self.pop(identity if identity in self else next(others, ""), None)
+
+    def expire(self, now: float) -> None:
+        """Unlist the workers that were not heard for too long."""
+        for name in [name for name, each in self.items() if now - each.last_heard > LOST_TIMEOUT]:
+            del self[name]
+
+
+def episodes_per_second(members: Iterable[Member], seconds: Callable[[HostStats], float | None]) -> float | None:
+    """Episodes a second of the reachable members together; `seconds` is a host's time for one episode in one slot.
+
+    A member whose host has no such record counts as the mean of the others. `None` if no host has one.
+    """
+    slots, rate, measured = 0, 0.0, 0
+    for member in members:
+        if member.is_reachable:
+            slots += member.slots
+            if (each := seconds(member.host_stats)) is not None:
+                rate += member.slots / max(each, 1e-6)
+                measured += member.slots
+    return rate * slots / measured if measured else None

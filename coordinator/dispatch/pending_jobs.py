@@ -1,4 +1,4 @@
-"""The jobs without a result: who holds them, in which order they go, what failed, what was answered. Pure."""
+"""The jobs without a result: who holds them, in which order they are given, which failed. Pure."""
 
 from __future__ import annotations
 
@@ -6,14 +6,55 @@ import heapq
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from enum import Enum, auto
 
+from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
-from dreamfleet.coordinator.dispatch.job_failure import JobFailure
 from dreamfleet.coordinator.jobs.work import Work
 
-MOST_FAILED = 16  # workers that a job's failures are remembered of; two pause the run
-ATTEMPTS = 3  # of a failing job on one worker, where there is no other
+MAX_FAILED = 16  # workers of which a job's failures are remembered; two pause the run
+MAX_ATTEMPTS = 3  # of a failing job on one worker, where there is no other
+MAX_HOLDERS = 2  # workers that a job is leased to at a time
+LONGEST_ERROR = 300  # characters of a worker's error that are shown
+MAX_NAMED = 4  # workers that a failure names
+
+
+class JobState(Enum):
+    """The state of a wanted job; an accepted one is wanted no more (`PendingJobs.is_accepted`)."""
+
+    QUEUED = auto()
+    LEASED = auto()  # to one worker
+    COPIED = auto()  # leased to two workers
+
+
+@dataclass(frozen=True)
+class JobFailure:
+    """A wanted job that failed on some workers: the last error of each, and how often it failed there."""
+
+    work: Work
+    errors: dict[str, str]  # worker -> error
+    attempts: dict[str, int]  # worker -> how often
+
+    @property
+    def subject(self) -> str:
+        """What the job scores, in words."""
+        job = self.work.job
+        words = {
+            "score": f"candidate {job.generation}/{job.candidate}",
+            "evaluate": f"the evaluation of generation {job.generation}'s mean",
+            "collect": f"a kept rollout of generation {job.generation}'s mean",
+        }
+        return f"{words[job.kind]}, seed {', '.join(map(str, job.seeds))},"
+
+    def __str__(self) -> str:
+        """One sentence for people: what failed, on which workers, how often, and why."""
+        names = list(self.errors)
+        number = "two" if len(names) == 2 else str(len(names))
+        where = "on one worker" if len(names) == 1 else f"on {number} workers"
+        parts = [f"{name} ({_times(self.attempts[name])}): {shorten(self.errors[name])}" for name in names[:MAX_NAMED]]
+        more = [f"and {len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else []
+        return f"{self.subject} failed {where}: {'; '.join(parts + more)}"
 
 
 @dataclass
@@ -22,32 +63,42 @@ class PendingJob:
 
     work: Work
     order: int
-    queued: bool = False  # whether a queue names it, so that one does so once whatever its workers do
-    holders: set[str] = field(default_factory=set)
-    given_to: set[str] = field(default_factory=set)  # lives of workers that held it, now or before
-    overrun: set[str] = field(default_factory=set)  # those that told more steps of it than it can have
+    in_queue: bool = False  # whether a queue has an entry for it; the entry may outlive the state `QUEUED`
+    holders: set[str] = field(default_factory=set)  # workers that have a lease
+    given_to: set[str] = field(default_factory=set)  # workers that hold it or held it
+    overrun_by: set[str] = field(default_factory=set)  # workers that reported more steps than it can have
     failed: dict[str, str] = field(default_factory=dict)  # worker -> error
     attempts: Counter[str] = field(default_factory=Counter)  # worker -> how often it failed there
 
     @property
+    def state(self) -> JobState:
+        """Its state, by the number of its holders."""
+        if not self.holders:
+            return JobState.QUEUED
+        return JobState.LEASED if len(self.holders) < MAX_HOLDERS else JobState.COPIED
+
+    @property
     def is_background(self) -> bool:
-        """Whether it fills what scoring leaves idle, and has a share of what it does not."""
+        """Whether it is an evaluation or a kept rollout: it uses idle slots, and a share of busy ones."""
         return self.work.job.kind != "score"
 
     @property
     def avoided_workers(self) -> Set[str]:
-        """Who is given it again only where nobody else is there."""
-        return self.failed.keys() | self.overrun
+        """Workers that get it again only if there is no other.
+
+        R8: a job that failed is given to another worker.
+        """
+        return self.failed.keys() | self.overrun_by
 
     @property
     def failure(self) -> JobFailure:
-        """What failed so far."""
+        """Its failures so far."""
         return JobFailure(self.work, dict(self.failed), dict(self.attempts))
 
 
 @dataclass(frozen=True)
 class NextJob:
-    """A job whose turn it is; `by_share`: before those that are scored."""
+    """The job to give next; `by_share`: a background job that goes before candidates' jobs."""
 
     digest: bytes
     by_share: bool
@@ -57,16 +108,16 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     """Every wanted job by its digest. Workers are only names here."""
 
     def __init__(self, evaluation_share: float) -> None:
-        self.previous_epoch_until = -1  # jobs up to this generation an earlier life of the coordinator may have given
+        self.previous_epoch_until = -1  # an earlier life of the coordinator may have given jobs up to this generation
         self._pending: dict[bytes, PendingJob] = {}
-        self._tags: dict[bytes, bytes] = {}
-        self._queue: list[tuple[int, bytes]] = []  # what is scored, in order of offer
-        self._background_queue: list[tuple[int, bytes]] = []  # what waits for slack or for its share
+        self._tags: dict[bytes, bytes] = {}  # first bytes of a digest -> digest
+        self._queue: list[tuple[int, bytes]] = []  # candidates' jobs, in order of offer
+        self._background_queue: list[tuple[int, bytes]] = []
         self._share = DeficitCounter(evaluation_share)
         self._next_order = 0
-        self._background_held = 0  # evaluations and collected rollouts that somebody holds
-        self._failing: dict[bytes, PendingJob] = {}  # those of the wanted that failed somewhere
-        self._accepted: dict[bytes, int] = {}  # digest -> generation, of this one and the last
+        self._background_held = 0  # background jobs with a holder
+        self._failing: dict[bytes, PendingJob] = {}  # wanted jobs that failed somewhere
+        self._accepted: dict[bytes, int] = {}  # digest -> generation, of this generation and the last
 
     def __getitem__(self, digest: bytes) -> PendingJob:
         return self._pending[digest]
@@ -78,30 +129,36 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         return len(self._pending)
 
     def work(self, digest: bytes) -> Work | None:
-        """The work of a wanted job; `None` where it is not wanted."""
+        """The work of a wanted job; `None` if it is not wanted."""
         pending = self._pending.get(digest)
         return None if pending is None else pending.work
 
     def digest_of_tag(self, tag: bytes) -> bytes | None:
-        """The digest of the wanted job of which a beat tells the first bytes."""
+        """The digest of the wanted job that begins with `tag`, as heartbeats name jobs."""
         return self._tags.get(tag)
 
     def may_have_been_given(self, digest: bytes, worker: str) -> bool:
-        """Whether a worker may have a wanted job: it was given to that very life, or may have been before ours."""
+        """Whether a worker may have a wanted job.
+
+        R5: it was given the job in this life of the coordinator; or an earlier life may have given it, to anybody.
+        """
         pending = self._pending[digest]
         return worker in pending.given_to or pending.work.job.generation <= self.previous_epoch_until
 
     def is_accepted(self, digest: bytes) -> bool:
-        """Whether its result has come, in this generation or the last."""
+        """Whether its result was accepted, in this generation or the last."""
         return digest in self._accepted
 
     @property
-    def queued(self) -> int:
-        """Jobs that are scored and wait for a worker."""
+    def queue_length(self) -> int:
+        """Candidates' jobs that wait for a worker."""
         return len(self._queue)
 
     def offer(self, work: Iterable[Work]) -> None:
-        """Want these jobs; what is wanted or accepted already is not offered twice."""
+        """Want these jobs, except those that are wanted or accepted already.
+
+        R3: a wanted job goes into the queue, so some worker will get it.
+        """
         for each in work:
             digest = each.job.digest
             if digest in self._pending or digest in self._accepted:
@@ -112,7 +169,10 @@ class PendingJobs(Mapping[bytes, PendingJob]):
             self.enqueue(digest)
 
     def begin_generation(self, generation: int) -> None:
-        """A generation opens: what was accepted before the last one is forgotten."""
+        """Forget the accepted jobs of generations before the last one.
+
+        R26: the memory of accepted jobs is bounded; an even later copy of a result is obsolete, not a duplicate.
+        """
         self._accepted = {digest: number for digest, number in self._accepted.items() if number >= generation - 1}
 
     def digests_of_kind(self, kind: Kind) -> Sequence[bytes]:
@@ -120,31 +180,31 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         return [digest for digest, pending in self._pending.items() if pending.work.job.kind == kind]
 
     def enqueue(self, digest: bytes) -> None:
-        """It waits for a worker, in order of offer."""
+        """Put a wanted job into its queue, in order of offer."""
         pending = self._pending[digest]
         self._share.release(digest)
-        if not pending.queued:
-            pending.queued = True
+        if not pending.in_queue:
+            pending.in_queue = True
             heapq.heappush(self._background_queue if pending.is_background else self._queue, (pending.order, digest))
 
     def next(self, slots: int, *, idle: bool, drain_background: bool) -> NextJob | None:
-        """Take the next job from its queue; `None` where none may go now.
+        """Take the next job from its queue; `None` if none may be given now.
 
-        `slots` is the fleet's number of slots, `idle` whether one of them is. With `drain_background` all take
-        background jobs.
+        `slots` is the fleet's number of slots, `idle` whether one of them is. With `drain_background` background
+        jobs may use all slots.
         """
         while (next_job := self._next_queue(slots, idle=idle, drain_background=drain_background)) is not None:
             queue, by_share = next_job
             _, digest = heapq.heappop(queue)
             if (pending := self._pending.get(digest)) is None:
                 continue  # answered meanwhile
-            pending.queued = False
-            if not pending.holders:  # else adopted again from a worker that came back
+            pending.in_queue = False
+            if pending.state is JobState.QUEUED:  # else a former holder has its lease again
                 return NextJob(digest, by_share)
         return None
 
     def add_holder(self, digest: bytes, worker: str, *, by_share: bool = False) -> None:
-        """A worker has this job, or is about to be sent it."""
+        """Note that a worker has this job, or is about to be sent it."""
         pending = self._pending[digest]
         self._background_held += pending.is_background and not pending.holders
         pending.holders.add(worker)
@@ -153,7 +213,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
             self._share.reserve(digest)
 
     def remove_holder(self, digest: bytes, worker: str) -> bool:
-        """A worker has this job no more; whether it was the last one."""
+        """Note that a worker has this job no more; return whether it was the last holder of a wanted job."""
         pending = self._pending.get(digest)
         if pending is None or worker not in pending.holders:
             return False
@@ -162,18 +222,24 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         return not pending.holders
 
     def record_failure(self, worker: str, result: Result) -> None:
-        """A wanted job gave an error instead of a fitness."""
+        """Note the error that a worker sent for a wanted job.
+
+        R8: an error is no fitness; it only decides who is given the job next, and whether the run pauses.
+        """
         pending = self._failing[result.digest] = self._pending[result.digest]
-        if worker in pending.failed or len(pending.failed) < MOST_FAILED:
+        if worker in pending.failed or len(pending.failed) < MAX_FAILED:
             pending.attempts[worker] += 1
             pending.failed[worker] = result.error or "no fitness and no reason"
 
-    def overrun(self, digest: bytes, worker: str) -> None:
-        """A worker told more steps of this job than it can have."""
-        self._pending[digest].overrun.add(worker)
+    def record_overrun(self, digest: bytes, worker: str) -> None:
+        """Note that a worker reported more steps of this job than it can have."""
+        self._pending[digest].overrun_by.add(worker)
 
     def accept(self, result: Result) -> PendingJob:
-        """A wanted job's first valid result: it is wanted no more."""
+        """Take a wanted job's first valid result, and want the job no more.
+
+        R4: it is remembered as accepted, so a later result of it is a duplicate.
+        """
         pending = self._pending[result.digest]
         self._share.charge(
             result.digest, result.seconds, is_background=pending.is_background, waiting=bool(self._background_queue)
@@ -182,7 +248,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         return self.remove(result.digest)
 
     def remove(self, digest: bytes) -> PendingJob:
-        """Want a job no more; it still says who holds it."""
+        """Want a job no more; the returned job still names its holders."""
         pending = self._pending.pop(digest)
         self._failing.pop(digest, None)
         self._tags.pop(digest[:TAG_BYTES], None)
@@ -195,15 +261,18 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """Wanted jobs that failed somewhere."""
         return [pending.failure for pending in self._failing.values()]
 
-    def find_poison_job(self) -> JobFailure | None:
-        """A job that failed on two different workers, or again and again on the only one there is."""
+    def find_pausing_failure(self) -> JobFailure | None:
+        """A job that failed so often that the run must pause; `None` if there is none.
+
+        R8: two workers, or three attempts on the only one, show that the job itself is at fault.
+        """
         for pending in self._failing.values():
-            if len(pending.failed) > 1 or any(count >= ATTEMPTS for count in pending.attempts.values()):
+            if len(pending.failed) > 1 or any(count >= MAX_ATTEMPTS for count in pending.attempts.values()):
                 return pending.failure
         return None
 
     def clear_failures(self) -> None:
-        """Forget what failed."""
+        """Forget all failures, so that each job may be tried anew."""
         for pending in self._failing.values():
             pending.failed.clear()
             pending.attempts.clear()
@@ -212,11 +281,24 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     def _next_queue(
         self, slots: int, *, idle: bool, drain_background: bool
     ) -> tuple[list[tuple[int, bytes]], bool] | None:
-        """The queue that gives the next job, and whether that job goes by its share; `None` where none may go."""
+        """The queue that gives the next job, and whether that job goes by its share; `None` if none may be given.
+
+        R18: background jobs get their share of busy slots, and of idle ones at most as many as their share holds:
+        more would delay the next generation.
+        """
         if self._queue:
             by_share = bool(self._background_queue) and self._share.is_due(slots)
             return (self._background_queue, True) if by_share else (self._queue, False)
-        most = max(1, int(slots * self._share.share))  # more in idle slots would keep the next generation waiting
-        if self._background_queue and (drain_background or (idle and self._background_held < most)):
+        limit = max(1, int(slots * self._share.share))
+        if self._background_queue and (drain_background or (idle and self._background_held < limit)):
             return self._background_queue, False
         return None
+
+
+def shorten(error: str, longest: int = LONGEST_ERROR) -> str:
+    """An error's text, cut to what a line can hold."""
+    return truncate(error, longest)  # it came over the wire
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"

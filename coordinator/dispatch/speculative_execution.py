@@ -1,117 +1,107 @@
-"""The end of a generation: when nothing is left to give, idle slots take over what waits elsewhere. Pure.
+"""At the end of a generation, when the queue is empty, idle slots help other workers. Pure.
 
-First jobs that another worker was given and cannot have begun; then, where it should pay, a second copy of a straggler.
-A worker of which nothing is known, or nothing new, is given copies only: they show what it is worth, and nobody waits
-for them. Rule 8 of the protocol.
+R17: an idle slot first takes a job that waits elsewhere; then it copies a straggler, if that should pay. R16: a worker
+without a recent record, beside one with a record, first gets a trial copy of a job, for which nobody waits.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.member import Lease, Member
+from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob
 from dreamfleet.coordinator.dispatch.worker_selection import is_dependable
 from dreamfleet.coordinator.jobs.work import Work
 
 SMOOTHING = 0.1  # weight of the newest episode in the typical one
-QUIET_BEATS = 2  # without a word: a straggler that nothing is known of
-UPLOAD_SECONDS = 30.0  # after a result, in which its upload should have come
-MARGIN = 1.5  # how many times sooner a copy must be expected to finish
-LONGEST_HELD, LONGEST_HELD_TIMES = (
-    60.0,
-    8.0,
-)  # seconds, and times that a job of its kind was away: longer no worker's word is relied on
-STALE, STALE_TIMES = 10.0, 20.0  # seconds, and turnarounds: what is known of a host is old then
-
-
-class PendingJobView(Protocol):
-    """What is known of a wanted job."""
-
-    work: Work
-    holders: set[str]
-
-    @property
-    def avoided_workers(self) -> Set[str]:
-        """Workers that are not to have it."""
-        ...
+QUIET_INTERVALS = 2  # heartbeat intervals without a message after which a holder's jobs may be copied
+UPLOAD_SECONDS = 30.0  # after its result, within which an upload should arrive
+MARGIN = 1.5  # a copy must be expected to finish this many times sooner
+# A job held longer than so many seconds and so many typical times may be copied, whatever progress its worker reports.
+LONGEST_HELD, LONGEST_HELD_TIMES = 60.0, 8.0
+STALE, STALE_TIMES = 10.0, 20.0  # seconds, and turnarounds, after which a host's record is too old
 
 
 @dataclass(frozen=True)
 class Move:
-    """Give a job to another worker: a copy, or `instead_of` one that has not begun it; `trial`: to get to know it."""
+    """Give the job `digest` to an idle slot of `taker`: from `donor`, which has not begun it, or else as a copy."""
 
     digest: bytes
-    to: str
-    instead_of: str | None = None
-    trial: bool = False
+    taker: str
+    donor: str | None = None
+    trial: bool = False  # a copy that only measures the taker
 
 
 class SpeculativeExecution:
-    """Plans moves; remembers how long an episode typically is, in steps."""
+    """Plans moves of jobs to idle slots, from the typical length and duration of accepted jobs."""
 
-    def __init__(self, beat: float) -> None:
-        self._beat = beat
-        self._typical_steps = 0.0
-        self._typical_seconds = {False: 0.0, True: 0.0}  # seconds, by whether jobs fill the slack
+    def __init__(self, heartbeat_interval: float) -> None:
+        self._heartbeat_interval = heartbeat_interval
+        self._typical_steps = 0.0  # of an episode
+        self._typical_seconds = {False: 0.0, True: 0.0}  # from giving a job to its result, by whether it is background
 
     def record_duration(self, seconds: float, *, is_background: bool) -> None:
-        """A job that was accepted had been with its worker for so long, by our clock."""
+        """Note how long an accepted job was with its worker, by the coordinator's clock."""
         before = self._typical_seconds[is_background]
         self._typical_seconds[is_background] += SMOOTHING * (seconds - before) if before else seconds
 
     def record_episode(self, steps: int) -> None:
-        """An episode of so many steps was accepted."""
+        """Note the length of an accepted episode."""
         self._typical_steps += SMOOTHING * (steps - self._typical_steps) if self._typical_steps else steps
 
     def plan(
         self,
-        pending: Mapping[bytes, PendingJobView],
+        jobs: Mapping[bytes, PendingJob],
         members: Mapping[str, Member],
         given: Mapping[str, Sequence[Work]],
         now: float,
     ) -> Iterator[Move]:
-        """Moves for the slots that are idle, fastest first; `given` is about to be sent."""
-        present = [member for member in members.values() if member.present and member.capacity]
-        loads = {member.identity: len(member.leases) + len(given.get(member.identity, ())) for member in present}
-        idle = [member for member in present if loads[member.identity] < member.capacity]
+        """Moves to the idle slots, the fastest member first; `given` is the work that is about to be sent.
+
+        R17: an idle slot helps with what other workers hold, so the last jobs of a generation end sooner.
+        """
+        takers = [member for member in members.values() if member.takes_jobs]
+        loads = {member.identity: len(member.leases) + len(given.get(member.identity, ())) for member in takers}
+        idle = [member for member in takers if loads[member.identity] < member.capacity]
         moved: set[bytes] = set()
         for taker in sorted(
             idle, key=lambda member: (member.host_stats.expected_seconds(1), -member.slot_steps_per_second)
         ):
-            for move in self._moves(taker, present, loads, pending, moved, now):
+            for move in self._moves(taker, takers, loads, jobs, moved, now):
                 moved.add(move.digest)
                 loads[taker.identity] += 1
-                if move.instead_of:
-                    loads[move.instead_of] -= 1
+                if move.donor:
+                    loads[move.donor] -= 1
                 yield move
 
     def _moves(
         self,
         taker: Member,
-        present: Sequence[Member],
+        members: Sequence[Member],
         loads: Mapping[str, int],
-        pending: Mapping[bytes, PendingJobView],
+        jobs: Mapping[bytes, PendingJob],
         moved: set[bytes],
         now: float,
     ) -> Iterator[Move]:
-        """What this worker takes until its slots are full."""
-        others = [member for member in present if member is not taker]
+        """Moves to one member until its slots are full."""
+        others = [member for member in members if member is not taker]
         if not taker.host_stats.has_history and any(is_dependable(other, now) for other in others):
-            return  # it is tried first
-        stragglers = self._stragglers(others, taker, pending, now)
+            return  # a trial copy measures it first
+        stragglers = self._stragglers(others, taker, jobs, now)
         while loads[taker.identity] < taker.capacity:
-            soon = self._expected_seconds(taker, loads[taker.identity] + 1)
-            if (move := self._find_recall(taker, soon, others, loads, pending, moved, now)) is not None:
+            expected = self._expected_seconds(taker, loads[taker.identity] + 1)
+            if (move := self._find_recall(taker, expected, others, loads, jobs, moved, now)) is not None:
                 yield move
                 continue
-            pays = (
-                each for left, each in stragglers if each not in moved and (left > MARGIN * soon or left == math.inf)
+            worthwhile = (
+                digest
+                for left, digest in stragglers
+                if digest not in moved and (left > MARGIN * expected or left == math.inf)
             )
-            if (copied := next(pays, None)) is None:
+            if (copied := next(worthwhile, None)) is None:
                 return
             yield Move(copied, taker.identity)
 
@@ -121,69 +111,68 @@ class SpeculativeExecution:
         return taker.host_stats.expected_seconds(jobs)
 
     def plan_trials(
-        self, pending: Mapping[bytes, PendingJobView], members: Mapping[str, Member], busy: Collection[str], now: float
+        self, jobs: Mapping[bytes, PendingJob], members: Mapping[str, Member], busy: Collection[str], now: float
     ) -> Iterator[Move]:
-        """A copy for each idle worker of which nothing is known, or nothing new, beside one that is known."""
-        present = [member for member in members.values() if member.present and member.capacity]
-        for taker in present:
+        """One trial copy for each idle member without a recent record, if another one has a record.
+
+        R16: a member is measured on a job for which nobody waits, before anything depends on it.
+        """
+        takers = [member for member in members.values() if member.takes_jobs]
+        for taker in takers:
             if taker.leases or taker.identity in busy or not _is_trial_due(taker, now):
                 continue
-            known = [other for other in present if other is not taker and is_dependable(other, now)]
+            known = [other for other in takers if other is not taker and is_dependable(other, now)]
             donors = sorted(known, key=lambda member: -len(member.leases) / member.capacity)
             copied = (digest for donor in donors for digest, lease in reversed(donor.leases.items())
-                      if not lease.is_background and _has_single_holder(digest, taker, pending))  # fmt: skip
+                      if not lease.is_background and _may_take(digest, taker, jobs))  # fmt: skip
             if (digest := next(copied, None)) is not None:
                 yield Move(digest, taker.identity, trial=True)
 
     def _find_recall(
-        self, taker: Member, soon: float, others: Sequence[Member], loads: Mapping[str, int],
-        pending: Mapping[bytes, PendingJobView], moved: set[bytes], now: float,
+        self, taker: Member, expected: float, others: Sequence[Member], loads: Mapping[str, int],
+        jobs: Mapping[bytes, PendingJob], moved: set[bytes], now: float,
     ) -> Move | None:  # fmt: skip
-        """The job that was given last to whoever has most waiting: more leases than slots means that some wait."""
+        """The latest job of the most loaded member with more leases than slots: it waits there, not begun."""
         donors = [member for member in others if loads[member.identity] > member.capacity]
         for donor in sorted(donors, key=lambda member: -loads[member.identity] / member.capacity):
             for digest, lease in reversed(donor.leases.items()):
                 waits = lease.steps is None and lease.upload_pending_since is None and digest not in moved
-                if waits and _has_single_holder(digest, taker, pending):
+                if waits and _may_take(digest, taker, jobs):
                     known = taker.host_stats.has_history and donor.host_stats.has_history
-                    if known and _seconds_until_due(donor, lease, now) <= soon and not donor.background_slots:
-                        break  # it is back sooner from where it is
+                    if known and _seconds_until_due(donor, lease, now) <= expected and not donor.background_slots:
+                        break  # its holder should return it sooner
                     return Move(digest, taker.identity, donor.identity)
         return None
 
     def _stragglers(
-        self, others: Sequence[Member], taker: Member, pending: Mapping[bytes, PendingJobView], now: float
+        self, others: Sequence[Member], taker: Member, jobs: Mapping[bytes, PendingJob], now: float
     ) -> list[tuple[float, bytes]]:
-        """Jobs that this worker may copy, and the seconds that they still take where they are; the longest first."""
+        """Jobs that `taker` may copy, with the seconds that their holder still needs; the longest first."""
         known = [member.host_stats for member in (*others, taker) if member.host_stats.has_history]
         found = []
         for holder in others:
             for digest, lease in holder.leases.items():
-                if _has_single_holder(digest, taker, pending):
+                if _may_take(digest, taker, jobs):
                     left = self._remaining_seconds(holder, lease, taker, known, now)
                     found.append((left, digest))
         return sorted(found, key=lambda each: -each[0])
 
     def _remaining_seconds(
         self, holder: Member, lease: Lease, taker: Member, known: Sequence[HostStats], now: float
-    ) -> float:  # fmt: skip
-        """Seconds that a job should still take where it is; of two estimates the longer."""
-        quiet = now - holder.last_heard
-        if quiet > QUIET_BEATS * self._beat:
+    ) -> float:
+        """Seconds that the holder of a job still needs; of two estimates the longer. Infinite: copy it in any case."""
+        if now - holder.last_heard > QUIET_INTERVALS * self._heartbeat_interval:
             return math.inf
         if now - lease.group.given_at > LONGEST_HELD + LONGEST_HELD_TIMES * self._typical_seconds[lease.is_background]:
-            return math.inf  # whatever it tells of its steps: anybody can tell them
+            return math.inf
         if lease.upload_pending_since is not None:
             return math.inf if now - lease.upload_pending_since > UPLOAD_SECONDS else 0.0
         if lease.steps is None:
-            return (
-                0.0
-                if lease.is_background or not taker.host_stats.has_history
-                else _overdue_seconds(holder, lease, known, now)
-            )
-        left = (
-            _seconds_until_due(holder, lease, now) if holder.host_stats.has_history and not lease.is_background else 0.0
-        )
+            measured = not lease.is_background and taker.host_stats.has_history
+            return _overdue_seconds(holder, lease, known, now) if measured else 0.0
+        left = 0.0
+        if holder.host_stats.has_history and not lease.is_background:
+            left = _seconds_until_due(holder, lease, now)
         if holder.slot_steps_per_second and taker.slot_steps_per_second and self._typical_steps:
             since = holder.slot_steps_per_second * (now - lease.steps_seen_at)
             steps = max(self._typical_steps - lease.steps - since, self._typical_steps / 10)
@@ -191,14 +180,17 @@ class SpeculativeExecution:
         return left
 
 
-def _has_single_holder(digest: bytes, taker: Member, pending: Mapping[bytes, PendingJobView]) -> bool:
-    """Whether a job is in one worker's hands and may be given to another."""
-    job = pending.get(digest)
-    return job is not None and len(job.holders) == 1 and taker.identity not in job.avoided_workers
+def _may_take(digest: bytes, taker: Member, jobs: Mapping[bytes, PendingJob]) -> bool:
+    """Whether a job has one holder and may be given to `taker`.
+
+    R17: a job has at most two holders, which bounds the wasted work.
+    """
+    job = jobs.get(digest)
+    return job is not None and job.state is JobState.LEASED and taker.identity not in job.avoided_workers
 
 
 def _is_trial_due(taker: Member, now: float) -> bool:
-    """Whether it is time to try a worker: at once if it is unknown, else when what is known is old."""
+    """Whether to measure a member: at once if its host has no record, else when the record is old."""
     if taker.trial_copies or taker.background_slots:
         return False
     return not taker.host_stats.has_history or now - taker.host_stats.last_return > max(
@@ -207,15 +199,15 @@ def _is_trial_due(taker: Member, now: float) -> bool:
 
 
 def _seconds_until_due(holder: Member, lease: Lease, now: float) -> float:
-    """Seconds until a job should be back; below 0 if it is late."""
-    expected_seconds = holder.host_stats.expected_seconds(lease.group.held_before + lease.group.returned_count + 1)
-    return lease.group.given_at + expected_seconds - now
+    """Seconds until a job should be back; negative if it is late."""
+    expected = holder.host_stats.expected_seconds(lease.group.held_before + lease.group.returned_count + 1)
+    return lease.group.given_at + expected - now
 
 
 def _overdue_seconds(holder: Member, lease: Lease, known: Sequence[HostStats], now: float) -> float:
-    """Seconds until a job that was not seen to run should be back: one that is late, as long again as it is late.
+    """Seconds until a job that no heartbeat has shown running should be back; a late one takes as long again.
 
-    Of a host of which nothing is known yet no more is expected than of the best that is.
+    A holder without a record is expected to be as fast as the best host with one.
     """
     jobs = lease.group.held_before + lease.group.returned_count + 1
     records = [holder.host_stats] if holder.host_stats.has_history else known

@@ -1,7 +1,7 @@
-"""Which worker is given the next job. Pure.
+"""Which worker is given which job. Pure.
 
-The least loaded one, unless it is known to be slower than others: then only what it should bring back before these have
-done all the rest. So a worker that is slow, far away or often lost is given less, or nothing. Rule 3 of the protocol.
+R15: the least loaded worker is next, unless it is known to be slower than others. A slower one gets only jobs that it
+should return before the others have finished the rest, so a bad worker does not delay a generation.
 """
 
 from __future__ import annotations
@@ -9,14 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 
-from dreamfleet.coordinator.dispatch.member import Member
+from dreamfleet.coordinator.dispatch.member import Member, MemberState
+from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
+from dreamfleet.coordinator.jobs.work import Work
 
-PEER_RATIO = 1.5  # times slower than the best at most: such workers share evenly
-REST_FRACTION = 0.8  # part of the time that the others need for the rest in which a slower worker must be back
+PEER_RATIO = 1.5  # workers at most this many times slower than the best share jobs evenly with it
+REST_FRACTION = 0.8  # a slower worker must return a job within this part of the time that the rest takes
 
 
 class WorkerSelection:
-    """Chooses among `members`, who hold `loads` jobs, while so many `waiting` are in the queue."""
+    """Chooses among the members in `loads`, which hold so many jobs, while `waiting` jobs are in the queue."""
 
     def __init__(self, members: Mapping[str, Member], loads: Mapping[str, int], waiting: int, now: float) -> None:
         self._members = members
@@ -33,34 +35,35 @@ class WorkerSelection:
             members[name].host_stats.expected_seconds(len(members[name].leases) + 1)
             for name in self._dependable - loads.keys()
         )
-        self._soonest_full = min(full, default=math.inf)  # seconds of the soonest that may be given no more now
-        self._best: dict[int, list[tuple[float, str]]] = {}  # by number of jobs: the two that are soonest
+        self._soonest_full = min(full, default=math.inf)  # seconds of the fastest member without credit
+        self._best: dict[int, list[tuple[float, str]]] = {}  # size class of a load -> the two fastest members
 
     def assign(self, name: str) -> None:
-        """It is given one."""
+        """Note that this member is given one more job."""
         self._loads[name] += 1
         self._expected_seconds[name] = self._members[name].host_stats.expected_seconds(self._loads[name] + 1)
         self._waiting -= 1
         self._jobs += name in self._dependable
 
     def pick(self, eligible: Collection[str]) -> str | None:
-        """The worker to give the next job to; `None` if a worker that is not `eligible` now is worth waiting for."""
-        fit = [name for name in eligible if self._finishes_in_time(name)]
-        if not fit:
+        """The worker to give the next job to; `None` if it pays to wait for one that is not `eligible` now."""
+        suitable = [name for name in eligible if self._finishes_in_time(name)]
+        if not suitable:
             return self._soonest(eligible)
         return min(
-            fit, key=lambda name: (self._loads[name] / self._members[name].capacity, self._expected_seconds[name])
+            suitable, key=lambda name: (self._loads[name] / self._members[name].capacity, self._expected_seconds[name])
         )
 
     def _soonest(self, eligible: Collection[str]) -> str | None:
-        """The soonest of all, unless that is one that may be given no more now."""
+        """The fastest dependable worker, if it is eligible and no worker without credit is faster."""
         candidates = self._dependable & self._expected_seconds.keys()
         first = min(candidates, key=self._expected_seconds.__getitem__, default=None)
         return first if first in eligible and self._expected_seconds[str(first)] <= self._soonest_full else None
 
     def _finishes_in_time(self, name: str) -> bool:
+        """Whether this worker should return one more job without delaying the generation."""
         if self._dependable <= {name}:
-            return True  # nobody else is there whom it could keep waiting
+            return True  # there is no other that would wait for it
         member = self._members[name]
         if name not in self._dependable or member.host_stats.is_likely_lost(
             self._loads[name] + 1, self._now - member.joined_at
@@ -71,12 +74,12 @@ class WorkerSelection:
         )
 
     def _rest_seconds(self, name: str) -> float:
-        """Seconds that the others need for what they hold and what waits."""
+        """Seconds that the other workers need for the jobs that they hold and those in the queue."""
         jobs = self._waiting + self._jobs - self._loads[name]
         return jobs / max(self._rate - self._members[name].host_stats.rate, 1e-9)
 
     def _best_other_seconds(self, name: str) -> float:
-        """Seconds in which the best of the others brings as many jobs back as this one would hold."""
+        """Seconds in which the fastest other worker returns about as many jobs as this one holds."""
         size = self._loads[name].bit_length()
         if size not in self._best:
             records = ((self._members[other].host_stats.expected_seconds(2**size), other) for other in self._dependable)
@@ -84,11 +87,59 @@ class WorkerSelection:
         return next(seconds for seconds, other in self._best[size] if other != name)
 
 
+def assign_jobs(
+    jobs: PendingJobs, members: Mapping[str, Member], now: float, *, drain_background: bool
+) -> dict[str, list[Work]]:
+    """Take queued jobs one by one and choose a member with credit for each; the work by member.
+
+    With `drain_background` background jobs may use all slots. A job without a suitable member stays queued.
+    """
+    given: dict[str, list[Work]] = {}
+    loads = {name: len(member.leases) for name, member in members.items() if member.credit > 0}
+    selection = WorkerSelection(members, loads, jobs.queue_length, now)
+    slots = sum(member.slots for member in members.values() if member.takes_jobs)
+    passed_over = []
+    while loads:
+        idle = any(load < members[name].capacity for name, load in loads.items())
+        if (next_job := jobs.next(slots, idle=idle, drain_background=drain_background)) is None:
+            break
+        pending = jobs[next_job.digest]
+        eligible = _eligible_workers(pending, loads, members)
+        if not eligible:
+            passed_over.append(next_job.digest)
+            continue
+        name = selection.pick(eligible)
+        if name is None and not pending.avoided_workers:
+            passed_over.append(next_job.digest)
+            break  # the jobs after it wait for a faster worker too
+        name = name or min(eligible, key=lambda name: loads[name])
+        selection.assign(name)
+        given.setdefault(name, []).append(pending.work)
+        jobs.add_holder(next_job.digest, name, by_share=next_job.by_share)
+        loads[name] += 1
+        if len(given[name]) >= members[name].credit:
+            del loads[name]
+    for digest in passed_over:
+        jobs.enqueue(digest)
+    return given
+
+
+def _eligible_workers(pending: PendingJob, loads: Mapping[str, int], members: Mapping[str, Member]) -> list[str]:
+    """Which of these members may be given a job.
+
+    R8: not one where it failed, unless every present member is such: a process that was killed once must not stop the
+    run. Guests do not count, so a stranger's hello cannot keep a failed job from being tried again.
+    """
+    eligible = [name for name in loads if name not in pending.avoided_workers]
+    present = (name for name, member in members.items() if member.state is MemberState.PRESENT)
+    return list(loads) if not eligible and all(name in pending.avoided_workers for name in present) else eligible
+
+
 def is_dependable(member: Member, now: float) -> bool:
-    """Whether a worker is known to bring jobs back, and free to."""
-    known = member.present and member.capacity and member.host_stats.has_history
+    """Whether a worker takes jobs, has returned some before, has slots for candidates and will likely stay up."""
     return (
-        bool(known)
+        member.takes_jobs
+        and member.host_stats.has_history
         and member.background_slots < member.slots
         and not member.host_stats.is_likely_lost(1, now - member.joined_at)
     )

@@ -95,8 +95,8 @@ class Evaluations:
         return generation in self._open
 
     @property
-    def in_progress(self) -> int:
-        """Evaluations that were begun and not finished."""
+    def open_count(self) -> int:
+        """Evaluations in progress."""
         return len(self._open)
 
     @property

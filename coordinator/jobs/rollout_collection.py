@@ -50,7 +50,7 @@ class RolloutCollections:
         self._missing.discard(digest)
 
     @property
-    def in_progress(self) -> int:
+    def missing_count(self) -> int:
         """Rollouts that are still to come."""
         return len(self._missing)
 

@@ -44,7 +44,7 @@ class BackgroundJobs:
     def in_progress(self) -> bool:
         """Whether anything is still to come of what was begun."""
         confirming = self._confirmation is not None and self._confirmation.in_progress
-        return bool(self.evaluations.in_progress or self.rollout_collections.in_progress or confirming)
+        return bool(self.evaluations.open_count or self.rollout_collections.missing_count or confirming)
 
     @property
     def confirmed(self) -> StoredConfirmation | None:
@@ -68,7 +68,7 @@ class BackgroundJobs:
         if ending and self._confirmed is not None and self._confirmed.closed == len(self._history):
             return wanted - done
         last = not ending and settings.evaluate_every > 0
-        finalists = min(len(self.evaluations) + self.evaluations.in_progress + last, FINALISTS)
+        finalists = min(len(self.evaluations) + self.evaluations.open_count + last, FINALISTS)
         confirming = total_episodes(finalists, settings.confirm_episodes)
         return wanted - done + last * settings.evaluation_episodes + confirming
 

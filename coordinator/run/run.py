@@ -120,7 +120,7 @@ class Run:
             return "ended"
         if self.paused is not None:
             return "paused"
-        if not any(member.present and member.capacity for member in self.worker_protocol.members):
+        if not any(member.takes_jobs for member in self.worker_protocol.members):
             return "waiting for workers"
         return "evaluating" if self.fleet.drain_background else "running"
 
@@ -129,7 +129,7 @@ class Run:
         closed = len(self.history)
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
             self._close(now)
-        failure = self.fleet.jobs.find_poison_job()
+        failure = self.fleet.jobs.find_pausing_failure()
         if failure is not None and self.paused is None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
         self.fleet.drain_background = self._is_waiting

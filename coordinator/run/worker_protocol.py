@@ -13,9 +13,10 @@ from dreamfleet.common.protocol.messages import Heartbeat, HelloRequest, Job, Ki
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, max_steps, rejection_reason
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.coordinator.dispatch.admission import RefusedWorkers, class_mismatch, find_refusal
-from dreamfleet.coordinator.dispatch.fleet import Fleet, OutgoingBatch
-from dreamfleet.coordinator.dispatch.job_failure import LONGEST_ERROR, JobFailure
+from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.member import Member
+from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
+from dreamfleet.coordinator.dispatch.pending_jobs import LONGEST_ERROR, JobFailure
 from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
 from dreamfleet.coordinator.storage.journal import FINGERPRINT, HOST_CLASS, Journal

@@ -38,8 +38,7 @@ from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time
 from dreamfleet.common.serialization.validation import MalformedError
 from dreamfleet.common.transport.network import is_loopback
 from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.coordinator.dispatch.fleet import OutgoingBatch
-from dreamfleet.coordinator.dispatch.packing import BatchContent
+from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.service import status_json
 from dreamfleet.coordinator.service.inbound_queue import InboundQueue
@@ -365,7 +364,7 @@ class Service:
         """Tell the workers to leave, again and again; stop when all have, or take too long."""
         if self._disbanding_since is None:
             return
-        there = [each for each in self._worker_protocol.members if each.lost is None]
+        there = [each for each in self._worker_protocol.members if each.gone_since is None]
         if not there or now - self._disbanding_since > DISBAND_TIMEOUT:
             self.stop()
         elif now - self._leave_sent_at >= self._intervals.beat:

@@ -26,9 +26,8 @@ from dreamfleet.common.monitoring.status import (
 from dreamfleet.common.protocol.result_bounds import MAX_SECONDS, clamp_count
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.coordinator.dispatch.event_log import EventLogView
-from dreamfleet.coordinator.dispatch.job_failure import JobFailure, shorten
-from dreamfleet.coordinator.dispatch.member import Member
-from dreamfleet.coordinator.dispatch.throughput import episodes_per_second
+from dreamfleet.coordinator.dispatch.member import Member, episodes_per_second
+from dreamfleet.coordinator.dispatch.pending_jobs import JobFailure, shorten
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import HistoryView
 from dreamfleet.coordinator.run.report import ReportedMean
@@ -78,7 +77,7 @@ def take_snapshot(
 
 def _status(run: Run, name: str, candidate_scores: CandidateScores, now: float) -> Status:
     """The status without heads, and without what only the service knows."""
-    present = [member for member in run.worker_protocol.members if member.present]
+    present = [member for member in run.worker_protocol.members if member.is_reachable]
     evaluations, failures = run.background_jobs.evaluations, run.worker_protocol.failures
     return Status(
         schema=STATUS_SCHEMA_VERSION,
@@ -217,11 +216,11 @@ def _failure(failure: JobFailure) -> FailureStatus:
 def _worker(member: Member, now: float) -> WorkerStatus:
     return WorkerStatus(
         worker=member.identity,
-        state="lost" if member.lost is not None else "silent" if member.silent else "present",
+        state="lost" if member.gone_since is not None else "silent" if member.silent else "present",
         slots=member.slots,
         leases=len(member.leases),
         finished=member.finished,
-        steps_per_second=round(member.steps_per_second, 1) if member.present else 0.0,
+        steps_per_second=round(member.steps_per_second, 1) if member.is_reachable else 0.0,
         load=round(member.load, 2),
         drawn_by=member.drawn_by,
         heard=round(now - member.last_heard, 1),

@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections import Counter
 
 from dreamfleet.common.protocol.messages import TAG_BYTES
-from dreamfleet.coordinator.dispatch.fleet import Fleet, OutgoingBatch
+from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.worker.service.backlog import MAX_UNUSED_VECTORS
 from tests.simulation.violation import Violation
 from tests.simulation.worker import Worker
 
-MOST_HOLDERS = 2
-MOST_ABSENCES = 1  # beats in a row that have seen a lease's batch and do not show it: the next one ends the lease
+MAX_HOLDERS = 2
+MAX_ABSENCES = 1  # beats in a row that have seen a lease's batch and do not show it: the next one ends the lease
 # Virtual seconds, each a little longer than the product's own rule, which a wake of either side may overshoot.
 SENT_AGAIN_WITHIN = 3.6  # a batch that was not seen, while its coordinator is awake; twice as long each time
-MOST_PATIENCE = 16  # times that
+MAX_PATIENCE = 16  # times that
 REPEATED_WITHIN = 8.6  # a result without a verdict, while its worker is awake
 ASKS_WITHIN = 4.0  # a worker that sees another life than it has joined
 
@@ -30,9 +31,9 @@ def check_coordinator(fleet: Fleet) -> None:
     is_background = 0
     for digest, each in jobs.items():
         holders = each.holders
-        _require(each.queued == (digest in named), "a job and the queue disagree on whether it is queued")
+        _require(each.in_queue == (digest in named), "a job and the queue disagree on whether it is queued")
         _require(bool(holders) or digest in named, "a wanted job is neither held nor queued")
-        _require(len(holders) <= MOST_HOLDERS, "a job has more copies than two")
+        _require(len(holders) <= MAX_HOLDERS, "a job has more copies than two")
         for holder in holders:
             _require(holder in members, "a job is held by no member")
             _require(digest in members[holder].leases, "a holder has no lease")
@@ -40,11 +41,11 @@ def check_coordinator(fleet: Fleet) -> None:
     for name, member in members.items():
         _require(name == member.identity, "a member has another's name")
         for digest, lease in member.leases.items():
-            _require(lease.absent_beats <= MOST_ABSENCES, "a lease outlives beats that do not show it")
+            _require(lease.absent_heartbeats <= MAX_ABSENCES, "a lease outlives beats that do not show it")
             _require(digest in jobs, "a lease is on a job that nobody wants")
             _require(name in jobs[digest].holders, "a lease is on a job that it does not hold")
         _require(not (member.silent and member.leases), "a silent worker holds leases")
-        _require(all(number <= member.number for number in member.unseen), "a batch is unseen that was not sent")
+        _require(all(number <= member.number for number in member.unconfirmed), "a batch is unseen that was not sent")
     _require(jobs._background_held == is_background, "what fills the slack is miscounted")
     _require(jobs._tags.keys() == {digest[:TAG_BYTES] for digest in jobs}, "tags are not those of the wanted jobs")
     _require(jobs._failing.keys() <= jobs.keys(), "a job fails that nobody wants")
@@ -63,7 +64,7 @@ def check_opening(fleet: Fleet, run: Run) -> None:
 def check_credit(fleet: Fleet, send: OutgoingBatch) -> None:
     """A batch with new work fits the credit of its worker; one that is sent again was within it then."""
     member = fleet.members[send.identity]
-    if send.content.work and send.number == member.number and member.unseen[send.number].times == 1:
+    if send.content.work and send.number == member.number and member.unconfirmed[send.number].times == 1:
         _require(len(member.leases) <= 2 * member.capacity, "a worker was given more than its credit", "credit")
 
 
@@ -89,14 +90,14 @@ class Sendings:
     def check(self, fleet: Fleet) -> None:
         """What a present worker has not seen is sent again before long."""
         for member in fleet.members.values():
-            if self._arrived.get(id(member), (-1, 0.0))[0] != member.seen:
-                self._arrived[id(member)] = member.seen, self._awake
+            if self._arrived.get(id(member), (-1, 0.0))[0] != member.confirmed:
+                self._arrived[id(member)] = member.confirmed, self._awake
             _, free = self._arrived[id(member)]  # its link, of what was sent before
-            for number in member.unseen if member.present else ():
+            for number in member.unconfirmed if member.is_reachable else ():
                 batch = id(member), number
                 quiet = self._awake - max(self._last.get(batch, self._awake), free)
-                link = member.host_stats.transfer_seconds(sum(sent.content.size for sent in member.unseen.values()))
-                patience = (SENT_AGAIN_WITHIN + link) * min(2 ** (self._times[batch] - 1), MOST_PATIENCE)
+                link = member.host_stats.transfer_seconds(sum(sent.content.size for sent in member.unconfirmed.values()))
+                patience = (SENT_AGAIN_WITHIN + link) * min(2 ** (self._times[batch] - 1), MAX_PATIENCE)
                 _require(quiet <= patience, "a batch that was not seen is not sent again", "promptness")
 
 
@@ -123,7 +124,7 @@ def check_rest(fleet: Fleet, run: Run) -> None:
     """After the last verdict nothing is left of anything but what waits for the run to be resumed."""
     _require(not fleet.lease_count, "a paused fleet holds leases", "memory")
     for member in fleet.members.values():
-        _require(not member.unseen, f"{member.identity} has batches that are not seen", "memory")
+        _require(not member.unconfirmed, f"{member.identity} has batches that are not seen", "memory")
         _require(not member.verdicts and not member.cancels, f"{member.identity} is owed words", "memory")
     _require(len(run.background_jobs.rollout_collections.uploads) == 0, "an upload is open that nobody sends", "memory")
 

@@ -16,7 +16,7 @@ from tests.simulation.shrink import Shrinker
 from tests.simulation.world import Outcome, play
 
 CHUNK = 250  # schedules that a process plays before it reports
-MOST_SHRUNK = 5  # violations that are cut down: more are counted
+MAX_SHRUNK = 5  # violations that are cut down: more are counted
 
 
 @dataclass
@@ -84,7 +84,7 @@ def shrunk(tally: Tally, seed: int) -> Iterator[Outcome]:
         outcome = play(draw(seed, number))
         assert outcome.violation is not None, "a schedule gave two plays"
         rules[outcome.violation.rule] += 1
-        if rules[outcome.violation.rule] == 1 and len(rules) <= MOST_SHRUNK:
+        if rules[outcome.violation.rule] == 1 and len(rules) <= MAX_SHRUNK:
             yield Shrinker(outcome).shrink()
 
 

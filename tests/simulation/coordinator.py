@@ -11,7 +11,8 @@ from typing import Any, cast
 from unittest.mock import patch
 
 from dreamfleet.common.protocol.messages import Heartbeat, HelloRequest, JobBatch, ResultBatch, UploadPart
-from dreamfleet.coordinator.dispatch.fleet import Fleet, OutgoingBatch
+from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
 from dreamfleet.coordinator.jobs import rollout_collection
 from dreamfleet.coordinator.optimisers import evolution
 from dreamfleet.coordinator.run.report import ControllerWriter

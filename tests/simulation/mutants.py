@@ -16,7 +16,7 @@ from unittest.mock import patch
 
 from dreamfleet.common.protocol.messages import MAX_PART
 from dreamfleet.common.runs.stages import StageTracker, stages_of
-from dreamfleet.coordinator.dispatch import fleet, packing
+from dreamfleet.coordinator.dispatch import fleet, member, packing
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.member import Member, SentBatch
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
@@ -92,7 +92,7 @@ def mutant(target: Any, attribute: str, **shape: Any) -> Callable[[Callable[...,
 def fleet_forgets_to_queue_what_a_lost_worker_held(_original):
     def release(self, member):
         member.leases.clear()
-        member.unseen.clear()
+        member.unconfirmed.clear()
 
     return release
 
@@ -126,7 +126,7 @@ def fleet_never_sends_a_batch_again(_original):
     return lambda content, _at, first: SentBatch(content, math.inf, first)
 
 
-@mutant(fleet, "ABSENT_BEATS")
+@mutant(member, "ABSENT_HEARTBEATS")
 def fleet_never_misses_a_job_that_beats_do_not_show(_original):
     return 10**9
 
@@ -134,7 +134,7 @@ def fleet_never_misses_a_job_that_beats_do_not_show(_original):
 @mutant(Fleet, "add_worker")
 def fleet_keeps_the_leases_of_a_worker_that_joins_again(_original):
     def add_worker(self, identity, slots, fingerprint, now):
-        numbering = self._next_numbering()
+        numbering = next(self._numberings)
         self.members[identity] = Member(identity, slots, fingerprint, numbering, last_heard=now)
         return numbering
 
@@ -156,7 +156,7 @@ def fleet_asks_for_results_of_nobody(_original):
     return lambda self, identity, result: None
 
 
-@mutant(Member, "begin_numbering")
+@mutant(Member, "start_numbering")
 def member_counts_on_after_a_silence(_original):
     return lambda self, numbering: None
 
@@ -205,7 +205,7 @@ def jobs_keep_their_tags_when_they_are_answered(original):
 
 @mutant(Member, "credit")
 def member_has_credit_whatever_it_holds(_original):
-    return property(lambda self: 2 * self.capacity if self.present else 0)
+    return property(lambda self: 2 * self.capacity if self.is_reachable else 0)
 
 
 @mutant(packing, "vector_parts", **LONG)

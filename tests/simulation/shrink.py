@@ -8,7 +8,7 @@ from dataclasses import replace
 from tests.simulation.schedule import Fault, Schedule, Shape
 from tests.simulation.world import Outcome, play
 
-MOST_PLAYS = 600
+MAX_PLAYS = 600
 # What a shape can do without; heat goes before the evaluations that it follows from.
 PLAINER = (
     "first_score", "first_stage", "anew", "heat", "racing", "width", "parameters", "rollout", "collect_every",
@@ -29,7 +29,7 @@ class Shrinker:
     def shrink(self) -> Outcome:
         """The smallest that was found: removing any one fault from it would make it harmless."""
         before = None
-        while before is not self.best and self._plays < MOST_PLAYS:
+        while before is not self.best and self._plays < MAX_PLAYS:
             before = self.best
             self._drop_faults()
             self._simplify()
@@ -62,7 +62,7 @@ class Shrinker:
 
     def _try(self, schedule: Schedule) -> bool:
         heated_blindly = schedule.shape.heat != 1.0 and not schedule.shape.evaluate_every
-        if schedule == self.best.schedule or heated_blindly or self._plays >= MOST_PLAYS:
+        if schedule == self.best.schedule or heated_blindly or self._plays >= MAX_PLAYS:
             return False
         self._plays += 1
         outcome = play(schedule)

@@ -12,7 +12,7 @@ from itertools import count
 from typing import Any
 
 from dreamfleet.common.protocol.messages import HelloRequest, JobBatch
-from dreamfleet.coordinator.dispatch.fleet import OutgoingBatch
+from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
 from tests.simulation import books
 from tests.simulation.coordinator import COMMITTED, LINGER, OPENED, TICK, Coordinator, simulated_surroundings
 from tests.simulation.disk import Disk
@@ -26,7 +26,7 @@ from tests.simulation.worker import Scored, Token, Welcome, Worker
 PATIENCE = 120.0  # virtual seconds after the last fault in which everything must be finished
 OPERATOR = 0.5  # virtual seconds after which somebody resumes a run that failing jobs have paused
 AUDIT = 4  # turns of the coordinator between two looks into the books
-MOST_EVENTS = 200_000  # of one play: more is a loop
+MAX_EVENTS = 200_000  # of one play: more is a loop
 
 
 @dataclass
@@ -96,7 +96,7 @@ class World:
         while not self._done:
             self.now, _, action, arguments = heapq.heappop(self._heap)
             self.events += 1
-            if self.now > self._calm_at + PATIENCE or self.events > MOST_EVENTS:
+            if self.now > self._calm_at + PATIENCE or self.events > MAX_EVENTS:
                 self._give_up()
             action(*arguments)
         self.witness.finished(self.disk)

@@ -5,7 +5,7 @@ import pytest
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol.host_classes import class_from_fingerprint
 from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
-from dreamfleet.coordinator.dispatch.admission import MOST_REFUSED, RefusedWorkers, find_refusal
+from dreamfleet.coordinator.dispatch.admission import MAX_REFUSED, RefusedWorkers, find_refusal
 from tests.support.samples import JSON
 
 HELLO = next(each for each in JSON.values() if type(each).__name__ == "HelloRequest")
@@ -67,9 +67,9 @@ def test_refusals_are_news_once_are_bounded_and_end_with_admission():
     assert refused_workers.add("a/1", "no task")
     assert not refused_workers.add("a/2", "no task")
     assert refused_workers.add("a/3", "another fingerprint")
-    for number in range(MOST_REFUSED):
+    for number in range(MAX_REFUSED):
         refused_workers.add(f"w{number}/1", "no task")
-    assert len(refused_workers.latest) == MOST_REFUSED
+    assert len(refused_workers.latest) == MAX_REFUSED
     assert "a" not in refused_workers.latest
     refused_workers.remove("w3/9")
     assert "w3" not in refused_workers.latest

@@ -6,7 +6,7 @@ from dreamfleet.common.monitoring.prometheus import exposition
 from dreamfleet.common.monitoring.status import WorkerCount, read_status
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.coordinator.dispatch.event_log import BLOCK, BLOCKS, EventLog
-from dreamfleet.coordinator.dispatch.fleet import DEPARTURE_GRACE, SILENT_BEATS
+from dreamfleet.coordinator.dispatch.fleet import DEPARTURE_GRACE, SILENT_AFTER
 from tests.coordinator.run.test_run import A, B, Bench
 from tests.coordinator.service.test_status import SCORED, answered, score, snapshot_of
 
@@ -50,7 +50,7 @@ def test_jobs_of_a_silent_worker_are_told_as_given_out_again(bench):
     sends = bench.run.worker_protocol.dispatch(bench.now)
     held = sum(len(send.content.work) for send in sends if send.identity == A)
     bench.handle_heartbeat(A)
-    bench.now += SILENT_BEATS + 0.1
+    bench.now += SILENT_AFTER + 0.1
     bench.handle_heartbeat(B)
     bench.run.worker_protocol.tick(bench.now)
     whats = [what for what, _, _ in told(bench, worker=A)]

@@ -5,18 +5,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dreamfleet.common.protocol.messages import TAG_BYTES, Heartbeat, Result, RunningJob
+from dreamfleet.common.protocol.messages import MAX_SLOTS, TAG_BYTES, Heartbeat, Result, RunningJob
 from dreamfleet.coordinator.dispatch.fleet import (
     DEPARTURE_GRACE,
     FORGET_AFTER,
     GUEST_TIMEOUT,
-    LOST_TIMEOUT,
-    MAX_SLOTS,
-    MOST_GUESTS,
-    MOST_LOST,
-    SILENT_BEATS,
+    MAX_GUESTS,
+    SILENT_AFTER,
 )
 from dreamfleet.coordinator.dispatch.fleet import Fleet as _Fleet
+from dreamfleet.coordinator.dispatch.member import LOST_TIMEOUT, MAX_LOST
 from dreamfleet.coordinator.dispatch.speculative_execution import LONGEST_HELD, LONGEST_HELD_TIMES, UPLOAD_SECONDS
 from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
 from tests.support.samples import HEAD, SPEC
@@ -176,18 +174,18 @@ def test_who_vanishes_without_a_word_is_told_as_lost_until_he_is_back_or_for_min
 
 
 def test_so_many_lost_workers_are_told_and_no_more():
-    fleet = fleet_of(*(f"h{number}/0" for number in range(MOST_LOST + 3)))
+    fleet = fleet_of(*(f"h{number}/0" for number in range(MAX_LOST + 3)))
     for name in list(fleet.members):
         fleet.handle_departure(name, 1.0)
     fleet.tick(1.0 + 2 * DEPARTURE_GRACE)
-    assert len(fleet.lost) == MOST_LOST
+    assert len(fleet.lost) == MAX_LOST
     assert "h0/0" not in fleet.lost
 
 
 def test_a_silent_workers_jobs_are_issued_again_and_its_voice_brings_it_back():
     fleet = fleet_of(A, B, jobs=2)
     (digest,) = digests(fleet.dispatch(0.0), A)
-    late = SILENT_BEATS * BEAT + 0.1
+    late = SILENT_AFTER * BEAT + 0.1
     for step in range(1, 6):
         fleet.handle_heartbeat(B, beat(seen=1, running=digests([], B)), float(step))
         fleet.tick(float(step))
@@ -233,19 +231,19 @@ def test_an_error_is_no_fitness_and_another_worker_tries():
     (digest,) = digests(fleet.dispatch(0.0), A)
     assert fleet.handle_result(A, result(digest, error="boom"), 0.1) == ("refused", None)
     assert digests(fleet.dispatch(0.1), B) == [digest]
-    assert fleet.jobs.find_poison_job() is None
+    assert fleet.jobs.find_pausing_failure() is None
     fleet.handle_result(B, result(digest, error="boom"), 0.2)
-    errors = fleet.jobs.find_poison_job().errors
+    errors = fleet.jobs.find_pausing_failure().errors
     assert errors == {A: "boom", B: "boom"}
 
 
 def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
     fleet = fleet_of(A, jobs=1)
     for attempt in range(3):
-        assert fleet.jobs.find_poison_job() is None
+        assert fleet.jobs.find_pausing_failure() is None
         (digest,) = digests(fleet.dispatch(attempt), A)
         fleet.handle_result(A, result(digest, error="boom"), attempt)
-    assert fleet.jobs.find_poison_job().errors == {A: "boom"}
+    assert fleet.jobs.find_pausing_failure().errors == {A: "boom"}
 
 
 def test_a_failed_job_waits_for_another_worker_that_is_busy():
@@ -424,7 +422,7 @@ def test_who_says_hello_and_never_beats_is_one_of_a_few_and_soon_forgotten():
     fleet = fleet_of(A)
     for number in range(20_000):
         fleet.add_worker(f"stranger/{number:08x}", 2**62, "f", 1.0)
-    assert len(fleet.members) == 1 + MOST_GUESTS
+    assert len(fleet.members) == 1 + MAX_GUESTS
     assert max(member.slots for member in fleet.members.values()) == MAX_SLOTS
     for now in range(1, int(GUEST_TIMEOUT) + 3):
         fleet.handle_heartbeat(A, beat(), float(now))
@@ -471,7 +469,7 @@ def test_an_idle_worker_hears_that_it_is_known_and_no_more_often_than_that():
         heard += [(tenth / 10, send.number) for send in fleet.dispatch(tenth / 10)]
     assert {number for _, number in heard} == {0}
     assert 2 <= len(heard) <= 5
-    assert max(late - early for (early, _), (late, _) in pairwise(heard)) < SILENT_BEATS * BEAT
+    assert max(late - early for (early, _), (late, _) in pairwise(heard)) < SILENT_AFTER * BEAT
 
 
 def test_a_worker_that_says_nothing_is_told_nothing():
@@ -520,7 +518,7 @@ def test_a_worker_that_did_not_hear_the_answer_to_its_hello_is_given_work_at_onc
     assert (send.numbering, send.number) == (second, 1)
     assert second > first
     fleet.handle_heartbeat(A, beat(seen=1, numbering=second), 1.2)
-    assert not fleet.members[A].unseen
+    assert not fleet.members[A].unconfirmed
 
 
 def test_a_hello_in_the_name_of_a_worker_that_beats_takes_nothing_from_it():
@@ -633,7 +631,7 @@ def test_a_worker_that_was_silent_is_not_waited_for_to_see_what_is_not_sent_agai
     fleet = fleet_of(A, jobs=4)
     lost = fleet.dispatch(0.0)[0]
     fleet.tick(0.5)
-    for now in np.arange(1.0, SILENT_BEATS * BEAT + 1.5):
+    for now in np.arange(1.0, SILENT_AFTER * BEAT + 1.5):
         fleet.tick(now)
     assert fleet.members[A].silent
     fleet.handle_heartbeat(A, beat(numbering=lost.numbering), 7.0)
@@ -650,7 +648,7 @@ def test_a_late_beat_from_before_a_hello_says_nothing_of_the_batches_since():
     fleet.handle_heartbeat(A, beat(), 1.1)
     given = digests(fleet.dispatch(1.1), A)
     fleet.handle_heartbeat(A, beat(seen=7, numbering=first), 1.2)
-    assert list(fleet.members[A].unseen) == [1]
+    assert list(fleet.members[A].unconfirmed) == [1]
     for now in (1.3, 1.4):
         fleet.handle_heartbeat(A, beat(seen=7, numbering=first), now)
     assert list(fleet.members[A].leases) == given, "they are not missed in what cannot show them"
@@ -699,7 +697,7 @@ def test_a_host_that_dies_again_and_again_is_given_what_it_brings_back_in_time()
         fleet.handle_departure(name, now + 1.5)
         fleet.tick(now + 1.6)
         now += 2.0
-    assert fleet._host_stats["b"].deaths == 3
-    fleet._host_stats["b"].learn(1, 1.0, now)
-    assert fleet._host_stats["b"].is_likely_lost(1, age=0.0)
-    assert not fleet._host_stats["b"].is_likely_lost(1, age=60.0)
+    assert fleet._hosts.get("b").losses == 3
+    fleet._hosts.get("b").record_turnaround(1, 1.0, now)
+    assert fleet._hosts.get("b").is_likely_lost(1, age=0.0)
+    assert not fleet._hosts.get("b").is_likely_lost(1, age=60.0)
