@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, DEFAULT_VARIANT, Variant
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
-from dreamfleet.common.artifacts.delta_bundle import write_stored
 from dreamfleet.common.artifacts.onnx_checks import (
     UnsafeModelError,
     check_model,
@@ -27,7 +26,7 @@ from dreamfleet.common.artifacts.onnx_checks import (
     read_float_array,
 )
 from dreamfleet.common.errors import BundleError, ControllerError
-from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive
+from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import open_regular, read_regular
 from dreamfleet.common.serialization.constraints import Between, Word
@@ -215,7 +214,7 @@ def write_bundle(path: Path, manifest: BundleManifest, parts: Mapping[str, bytes
     if len(text) > _MAX_MANIFEST:
         raise BundleError(f"the manifest of {path} would have {len(text)} bytes, and {_MAX_MANIFEST} are read")
     with atomic_write(path) as file:
-        write_stored(file, [(MANIFEST, text.encode()), *sorted(parts.items())])
+        write_archive(file, [(MANIFEST, text.encode()), *sorted(parts.items())])
     return Bundle.open(path)
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from importlib.resources import files
 from pathlib import Path
 
@@ -20,6 +19,8 @@ from dreamfleet.common.artifacts.delta_bundle import (
     write_delta,
 )
 from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
+from dreamfleet.common.files.locks import wait_for_lock
 from dreamfleet.common.files.regular_files import open_append, path_exists
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -65,11 +66,8 @@ class BundleStore:
         with self.lock_download(lean.sha256) as partial:
             if (found := self._find_cached(lean.sha256)) is not None:
                 return found
-            try:
-                with partial.open("wb") as file:
-                    rebuild_bundle(path, base, file, LIMITS)
-            except OSError as error:
-                raise self.write_error(error) from error
+            with self.reporting_write_errors(), partial.open("wb") as file:
+                rebuild_bundle(path, base, file, LIMITS)
             return self.finish_download(lean.sha256)
 
     @contextmanager
@@ -79,33 +77,29 @@ class BundleStore:
         Waits while another process of this host downloads it; look with `find` again before you do.
         """
         partial = self._partial_path(sha256)
-        try:
+        with self.reporting_write_errors():
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             lock = open_append(partial.with_suffix(".lock"))
-        except OSError as error:
-            raise self.write_error(error) from error
         with lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+            wait_for_lock(lock)
             yield partial
 
     def finish_download(self, sha256: str) -> Bundle:
         """Verify a finished download and give it its name; a wrong one is removed."""
         partial, path = self._partial_path(sha256), self._path(sha256)
-        try:
+        with self.reporting_write_errors():
             if (found := hash_file(partial)) != sha256:
                 partial.unlink()
                 raise BundleError(
                     f"the bundle arrived damaged: its hash is {found[:12]}..., not {sha256[:12]}...; try again"
                 )
             partial.replace(path)
-        except OSError as error:
-            raise self.write_error(error) from error
         return Bundle.open(path, sha256)
 
-    def write_error(self, error: OSError) -> BundleError:
-        """What to say where the folder takes nothing."""
-        return BundleError(
-            f"cannot write in {self._folder}: {error.strerror}; make room there, or point $DREAMFLEET_CACHE elsewhere"
+    def reporting_write_errors(self) -> AbstractContextManager[None]:
+        """Turn an `OSError` while writing in the cache into a `BundleError`."""
+        return reporting_unwritable_folder(
+            self._folder, "make room there, or point $DREAMFLEET_CACHE elsewhere", BundleError
         )
 
     def _path(self, sha256: str) -> Path:

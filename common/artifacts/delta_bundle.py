@@ -7,20 +7,18 @@ others. What is put together is the bundle as it was frozen, to the byte, for it
 from __future__ import annotations
 
 import json
-import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, open_archive
+from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import open_regular
 
 DELTA_SUFFIX = ".lean"
 DELTA_MANIFEST = "lean.json"
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 _MAX_ABOUT = 10_000  # bytes
 
 
@@ -33,19 +31,12 @@ class DeltaManifest:
     parts: tuple[str, ...]  # all members of the whole bundle, in order
 
 
-def write_stored(file: BinaryIO, members: Iterable[tuple[str, bytes]]) -> None:
-    """A zip of these members, uncompressed and without a date: equal members give equal bytes."""
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in members:
-            archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
-
-
 def write_delta(path: Path, lean: DeltaManifest, whole: Path, base: Path, limits: ArchiveLimits) -> None:
     """Write what of the bundle's file `whole` the file `base` does not hold."""
     members, theirs = _members(whole, limits), _members(base, limits)
     own = [(name, members[name]) for name in lean.parts if theirs.get(name) != members[name]]
     with atomic_write(path) as file:
-        write_stored(file, [(DELTA_MANIFEST, json.dumps(asdict(lean)).encode()), *own])
+        write_archive(file, [(DELTA_MANIFEST, json.dumps(asdict(lean)).encode()), *own])
 
 
 def read_delta_manifest(path: Path, limits: ArchiveLimits) -> DeltaManifest:
@@ -64,7 +55,7 @@ def rebuild_bundle(path: Path, base: Path, file: BinaryIO, limits: ArchiveLimits
     members: Mapping[str, bytes] = {**_members(base, limits), **_members(path, limits)}
     if missing := [name for name in lean.parts if name not in members]:
         raise _damage_error(path, f"{', '.join(missing)} is in neither it nor {base.name}")
-    write_stored(file, [(name, members[name]) for name in lean.parts])
+    write_archive(file, [(name, members[name]) for name in lean.parts])
 
 
 def _members(path: Path, limits: ArchiveLimits) -> dict[str, bytes]:

@@ -8,14 +8,13 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import zipfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 from dreamfleet.common.artifacts.onnx_checks import UnsafeModelError, check_model, has_finite_weights, is_empty_graph
 from dreamfleet.common.errors import ControllerError
-from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive
+from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.files.regular_files import open_regular, read_regular
 from dreamfleet.common.serialization.constraints import Between, Length, Word
@@ -26,7 +25,6 @@ MANIFEST, NETWORK = "agent.json", "network.onnx"
 MAX_BYTES = 256 << 20  # of the file, and of all that it holds
 _LIMITS = ArchiveLimits(MAX_BYTES, members=8)
 _MAX_MANIFEST = 1_000_000
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 MAX_FRAME_SKIP, MAX_STATE_SIZE = 10**6, 10**6
 
 Choice = Annotated[tuple[float, ...], Length(1, 1000)]
@@ -68,9 +66,8 @@ class TrainedAgent:
         """Write what `load` reads, whole or not at all; equal agents give equal files."""
         about = {**asdict(self.manifest), "format": FORMAT, "network": hashlib.sha256(self.network).hexdigest()}
         text = json.dumps(about, indent=1, sort_keys=True, allow_nan=False)
-        with open_output(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-            for name, data in ((MANIFEST, text.encode()), (NETWORK, self.network)):
-                archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+        with open_output(path) as file:
+            write_archive(file, [(MANIFEST, text.encode()), (NETWORK, self.network)])
 
     @classmethod
     def load(cls, path: Path) -> TrainedAgent:

@@ -28,6 +28,7 @@ NPY = ".npy"
 _END, _END_64, _END_BYTES = b"PK\5\6", b"PK\6\7", 22  # of the record that closes an archive, and of its locator
 _DIRECTORY_BYTES = 512  # of one member's entry at most, on average
 _ENCRYPTED = 1
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date of a zip
 _MAGIC = b"\x93NUMPY"
 _MAX_HEADER = 10_000
 _HEADER = re.compile(
@@ -148,6 +149,13 @@ def _check_text(data: bytes, kind: np.dtype[Any], name: str) -> None:
         data.decode("utf-32-be" if kind.byteorder == ">" else "utf-32-le")
     except UnicodeError as error:
         raise DamagedArchiveError(f"{name} is no text") from error
+
+
+def write_archive(file: BinaryIO | Path, members: Iterable[tuple[str, bytes]], compression: int = ZIP_STORED) -> None:
+    """Write a zip of these members without dates: equal members give equal bytes."""
+    with ZipFile(file, "w", compression) as archive:
+        for name, data in members:
+            archive.writestr(ZipInfo(name, _EPOCH), data, compression)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.errors import DatasetError, DreamfleetError, UsageError
 from dreamfleet.common.files.regular_files import check_replaceable, is_folder
 
 
@@ -37,11 +37,22 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def reporting_write_errors(path: Path, flag: str = "--out") -> Iterator[None]:
-    """What cannot be written at `path`, which `flag` names, is a `DreamfleetError`."""
+    """Turn an `OSError` while writing `path` into a `DreamfleetError`; `flag` names the path on the command line."""
     try:
         yield
     except OSError as error:
         raise DreamfleetError(f"cannot write {path}: {error.strerror}; make room or choose another {flag}") from error
+
+
+@contextmanager
+def reporting_unwritable_folder(
+    folder: Path, remedy: str, error_type: type[DreamfleetError] = DatasetError
+) -> Iterator[None]:
+    """Turn an `OSError` while writing in `folder` into an `error_type` that ends with the `remedy`."""
+    try:
+        yield
+    except OSError as error:
+        raise error_type(f"cannot write in {folder}: {error.strerror}; {remedy}") from error
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.cli.global_config import GlobalConfig
 from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
+from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import Intervals
 from dreamfleet.common.runs.records import RunSettings
@@ -67,12 +68,8 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
     if request.config is not None and request.name == ARCHIVE:
         raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
     settings, bundle = _resolve_settings(request, folder)
-    try:
+    with reporting_unwritable_folder(request.runs_dir, "choose another --runs-dir", JournalError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise JournalError(
-            f"cannot write in {request.runs_dir}: {error.strerror}; choose another --runs-dir"
-        ) from error
     with run_lock(folder), ExitStack() as stack:
         journal = stack.enter_context(closing(_open_journal(request, folder, settings, bundle)))
         served = stack.enter_context(closing(ServedBundle(folder / BUNDLE))) if bundle else None

@@ -11,6 +11,7 @@ from safetensors.numpy import load
 
 from dreamfleet.common.artifacts.bundle import DECODER, DREAM_GRAPH, ENCODER, WEIGHTS, Bundle
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
+from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.serialization.validation import MalformedError, from_plain
@@ -39,10 +40,8 @@ def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:
         vae, rnn = _rebuild_models(bundle)
     except (BundleError, MalformedError, UsageError, RuntimeError, ValueError, TypeError, SafetensorError) as error:
         raise BundleError(f"{bundle.path}: {one_line(str(error))}") from error
-    try:
+    with reporting_unwritable_folder(folder, "choose another --data"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
     try:
         _save(paths[0], vae)
         _save(paths[1], rnn, vae=encoder_hash(folder))

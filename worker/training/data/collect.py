@@ -14,8 +14,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.errors import DatasetError, DreamfleetError
-from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.common.host.parent_death import exit_with_parent, signals_blocked
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
@@ -56,10 +56,8 @@ def collect(folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pil
     for pilot in pilots:
         pilot.check(preprocessing_of_size(config.picture).name)
     numbers = missing_numbers(folder, config)
-    try:
+    with reporting_unwritable_folder(folder, "choose another --data"):
         (folder / "episodes").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
     if not numbers:
         return
     pin_thread_pools()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import read_text
 
 NAME = "preset.json"
@@ -22,11 +22,8 @@ def store_preset(folder: Path, preset: str, seed: int) -> None:
     """
     path = folder / NAME
     if not path.exists() and not any((folder / "episodes").glob("[0-9]*.npz")):
-        try:
-            with atomic_write(path) as file:
-                file.write(json.dumps({"preset": preset, "seed": seed}).encode())
-        except OSError as error:
-            raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
+        with reporting_unwritable_folder(folder, "choose another --data"), atomic_write(path) as file:
+            file.write(json.dumps({"preset": preset, "seed": seed}).encode())
 
 
 def load_preset(folder: Path) -> str | None:

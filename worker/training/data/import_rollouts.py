@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.worker.training.data.collect import episode_path, existing_episodes
 from dreamfleet.worker.training.data.dataset import load_arrays, load_pictures, load_steps, preprocessing_of
 
@@ -31,11 +31,12 @@ def import_rollouts(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
         if (identity := hash_file(path)) in known:
             continue
         known.add(identity)
-        try:
-            with path.open("rb") as source, atomic_write(episode_path(folder, number)) as target:
-                shutil.copyfileobj(source, target)
-        except OSError as error:
-            raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
+        with (
+            reporting_unwritable_folder(folder, "choose another --data"),
+            path.open("rb") as source,
+            atomic_write(episode_path(folder, number)) as target,
+        ):
+            shutil.copyfileobj(source, target)
         number += 1
         yield frames
 
