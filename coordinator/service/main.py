@@ -16,7 +16,9 @@ from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import Intervals
 from dreamfleet.common.runs.records import RunSettings
-from dreamfleet.common.runs.run_folder import ARCHIVE, BUNDLE, JOURNAL, open_run, run_lock
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_lock import run_lock
+from dreamfleet.common.runs.run_paths import ARCHIVE, BUNDLE, JOURNAL, resume_command
 from dreamfleet.common.security.certificate_ledger import RevocationWatcher
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.session import Network
@@ -24,7 +26,7 @@ from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.service.service import Service
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
-from dreamfleet.coordinator.settings.resume_settings import resume_command, serving_facts
+from dreamfleet.coordinator.settings.resume_settings import serving_facts
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, StartPoint
 from dreamfleet.coordinator.storage.file_watch import FileWatch
 from dreamfleet.coordinator.storage.journal import Journal
@@ -59,7 +61,8 @@ class RunRequest:
 
     def resume_command(self, folder: Path | None = None) -> str:
         """The command that continues the run, also in a `folder` that it was moved to."""
-        return resume_command(folder or self.folder, self.join, self.access_dir)
+        own_access_dir = None if self.access_dir == GlobalConfig.access_dir else self.access_dir
+        return resume_command(folder or self.folder, self.join, own_access_dir)
 
 
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:

@@ -16,7 +16,9 @@ from pathlib import Path
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.files.locks import try_lock
-from dreamfleet.common.runs.run_folder import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS, RunFolder, open_run, run_lock
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.runs.run_lock import run_lock
+from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS
 
 
 def back_up(source: RunFolder, target: Path) -> None:

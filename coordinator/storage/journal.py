@@ -26,15 +26,10 @@ from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS, LONGEST_EPISODE, max_steps, to_finite
 from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.journal_reader import class_counts_query, efforts_query
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.run_folder import (
-    BUNDLE,
-    ENDED_AT,
-    JOURNAL,
-    RunFolder,
-    class_counts_query,
-    efforts_query,
-)
+from dreamfleet.common.runs.run_folder import ENDED_AT, RunFolder
+from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL
 from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
