@@ -21,7 +21,7 @@ def test_where_no_file_can_be_is_said_before_the_work(tmp_path):
     with pytest.raises(UsageError, match="is a folder"):
         check_output_path(tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="cannot be made"):
+    with pytest.raises(UsageError, match="cannot be created"):
         check_output_path(tmp_path / "file" / "tiny.json")
 
 
@@ -41,7 +41,7 @@ def test_a_device_or_pipe_stays_what_it_is(tmp_path):
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_that_nobody_may_write_in_is_said_before_the_work(tmp_path):
     tmp_path.chmod(0o500)
-    with pytest.raises(UsageError, match="cannot be written in"):
+    with pytest.raises(UsageError, match="is not writable"):
         check_output_path(tmp_path / "tiny.json")
 
 
