@@ -22,7 +22,7 @@ def usable_cores(groups: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> int:
 
 
 def _cgroup_folders(groups: Path, own: Path) -> list[Path]:
-    """The folders of this process's cgroup and its parents; all their quotas apply. In a container the root is its own."""
+    """The folders of this process's cgroup and its parents: all their quotas apply."""
     found = [groups, groups / "cpu"]
     with suppress(OSError):
         for line in own.read_text().splitlines():

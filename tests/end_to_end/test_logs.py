@@ -18,7 +18,7 @@ def test_a_fleets_log_is_json_where_it_is_asked_for_and_tells_how_to_start_a_wor
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
         "--task", tasks.TOY, "--generations", 100000, "--log-format", "auto",
     )  # fmt: skip
-    told = json.loads(coordinator.wait_for("no worker is there"))
+    told = json.loads(coordinator.wait_for("no worker is present"))
     assert told["event"] == "no worker"
     program, *words = shlex.split(told["command"])
     assert program == "dreamfleet"
@@ -88,6 +88,6 @@ def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(proc
         session.declare_queryable(key, lambda query: query.reply(key, status))
         for run in ((), ("night",)):
             code, _, err = processes.call("story", *run, "--connect", processes.endpoint)
-            assert (code, "run night tells no story: a worker's join file may not" in err) == (1, True), err
+            assert (code, "run night sends no events: a worker's join file has no right" in err) == (1, True), err
     code, _, err = processes.call("story", "night", "--connect", processes.endpoint)
     assert (code, "nobody answers" in err) == (1, True), err

@@ -30,7 +30,7 @@ def test_a_device_or_pipe_stays_what_it_is(tmp_path):
     os.mkfifo(pipe)
     link.symlink_to(pipe)
     for path in (pipe, link):
-        with pytest.raises(UsageError, match="it is no regular file: name another"):
+        with pytest.raises(UsageError, match="it is not a regular file: choose another"):
             check_output_path(path)
         with pytest.raises(DreamfleetError, match="cannot write"), open_output(path):
             pass
