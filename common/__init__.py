@@ -1,1 +1,1 @@
-"""The words both sides speak: keys, messages, codec, configuration, bundle, controller, journal schema."""
+"""Code that the coordinator and the worker share: protocol, artifacts, run records, configuration, monitoring."""

@@ -1,26 +1,26 @@
-"""The errors that people see: each text says what happened and what to do about it."""
+"""The errors that users see. Each text says what happened and what to do about it."""
 
 from __future__ import annotations
 
 
 class DreamfleetError(Exception):
-    """An expected failure; the command line prints its text as one line and exits with `exit_code`."""
+    """Base of expected failures; the command line prints the text as one line and exits with `exit_code`."""
 
     exit_code = 1
 
 
 class UsageError(DreamfleetError):
-    """What the user asked for is not well formed: a flag, a configuration key, a name, a preset."""
+    """A flag, a configuration key, a name or a preset is invalid."""
 
     exit_code = 2
 
 
 class BundleError(DreamfleetError):
-    """A world-model bundle is missing, damaged, or not the one that was named."""
+    """A world-model bundle is missing, damaged, or not the expected one."""
 
 
 class DownloadError(BundleError):
-    """A world model did not come, or came as something else: later, or from somebody else, it may come."""
+    """The download of a world model failed or was damaged; a later try, or another source, may succeed."""
 
 
 class ControllerError(DreamfleetError):
@@ -28,42 +28,42 @@ class ControllerError(DreamfleetError):
 
 
 class DatasetError(DreamfleetError):
-    """A folder of recorded episodes is empty, damaged or of another shape."""
+    """A folder of recorded episodes is empty, damaged, not writable, or has another shape."""
 
 
 class JournalError(DreamfleetError):
-    """A run's journal is missing, foreign, damaged, locked or cannot be written."""
+    """A run's journal is missing, damaged, locked, not writable, or not a journal."""
 
 
 class InternalError(DreamfleetError):
-    """A fault of ours left in doubt what is in memory; what is on disk is whole."""
+    """A bug left the state in memory inconsistent; the files are intact."""
 
 
 class ConnectionFailedError(DreamfleetError):
-    """Nobody answered over Zenoh, or the address cannot be listened on."""
+    """Nobody answers over Zenoh, or the address cannot be listened on."""
 
 
 class HandshakeRejectedError(ConnectionFailedError):
-    """Somebody listens there and does not let this side in; the text says why."""
+    """The other side rejects the connection; the text says why."""
 
 
 class AccessError(DreamfleetError):
-    """A join file or an authority's folder is missing, damaged, expired, or of another role than is needed."""
+    """A join file or an authority's folder is missing, damaged, expired, or has the wrong role."""
 
 
 class RefusedError(DreamfleetError):
-    """The other side answered, and said no."""
+    """The other side answered and refused the request."""
 
 
 class MissingExtraError(DreamfleetError):
-    """A verb needs packages of an extra that is not installed."""
+    """A verb needs an extra that is not installed."""
 
 
 class StoppedError(DreamfleetError):
-    """Somebody asked a verb to stop; the text says what is kept and how to go on."""
+    """A verb was interrupted; the text says what is kept and how to continue."""
 
-    exit_code = 130  # as a shell says it of Ctrl-C
+    exit_code = 130  # the exit code of Ctrl-C in a shell
 
 
 class NoDisplayError(DreamfleetError):
-    """A verb opens a window, and there is no screen to open it on."""
+    """A verb needs to open a window, and there is no display."""

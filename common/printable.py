@@ -1,4 +1,4 @@
-"""Texts of others as a terminal may show them."""
+"""Untrusted text made safe for a terminal, and values formatted for people."""
 
 from __future__ import annotations
 
@@ -7,34 +7,34 @@ from collections.abc import Sequence
 
 
 def printable(text: str) -> str:
-    """The text with control characters, which a terminal would obey, as what they are written like."""
+    """The text with control characters, which a terminal would execute, as escape sequences."""
     return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
 
 
-def truncate(text: str, longest: int) -> str:
-    """The text, printable and cut to `longest` characters, whatever its length and content."""
-    text = printable(text[: longest + 1])  # what is cut off need not be looked at
-    return text if len(text) <= longest else text[: longest - 3] + "..."
+def truncate(text: str, max_chars: int) -> str:
+    """The text, printable and cut to `max_chars` characters."""
+    text = printable(text[: max_chars + 1])
+    return text if len(text) <= max_chars else text[: max_chars - 3] + "..."
 
 
 def one_line(text: str) -> str:
-    """The text on one line, and printable: what came over the wire cannot begin a line of its own."""
+    """The text on one line, printable: text from the network cannot start a line."""
     return printable(" ".join(text.split()))
 
 
 def plural(count: float, noun: str, nouns: str = "") -> str:
-    """A number with its noun, of which there may be one: 1 seed, 1,000 seeds, 1.5 minutes, 2 batches."""
+    """Format a number with its noun in singular or plural: 1 seed, 1,000 seeds, 1.5 minutes, 2 batches."""
     return f"{count:{',' if isinstance(count, int) else 'g'}} {noun if count == 1 else nouns or f'{noun}s'}"
 
 
-def join_some(names: Sequence[str], most: int) -> str:
-    """The first `most` of the names, and how many more there are: a, b and 3 more."""
-    more = f" and {len(names) - most:,} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+def join_some(names: Sequence[str], limit: int) -> str:
+    """The first `limit` names and the number of others: a, b and 3 more."""
+    more = f" and {len(names) - limit:,} more" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + more
 
 
 def format_setting(value: object) -> str:
-    """A setting's value as people write it: yes or no, a number in six digits, a list with commas."""
+    """Format a setting's value: yes or no, a number in six digits, a list with commas."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
@@ -43,13 +43,13 @@ def format_setting(value: object) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Each line printable, of a text whose lines are our own."""
+    """The text with each of its lines printable; its line breaks are trusted."""
     return "\n".join(map(printable, text.split("\n")))
 
 
 class PrintableFormatter(logging.Formatter):
-    """Log lines in which no text of others is obeyed by a terminal."""
+    """A log formatter that makes records printable."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The lines of one record."""
+        """Format one record."""
         return printable_lines(super().format(record))

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from dreamfleet.common.host.processes import VerbProcess, command
-from dreamfleet.common.runs.run_folder import default_runs_dir
+from dreamfleet.common.runs.run_paths import default_runs_dir
 
 
 def main() -> int:

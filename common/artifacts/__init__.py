@@ -1,1 +1,1 @@
-"""What a run makes and needs as files: bundles, controllers, agents, subspaces."""
+"""Files that a run reads and writes: bundles, controllers, agents, subspaces."""

@@ -1,4 +1,4 @@
-"""How a controller's outputs become a world's actions."""
+"""Conversions of a controller's outputs to an environment's actions."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Continuous:
-    """Outputs in [-1, 1], each scaled, shifted and bounded: `clip(scale * tanh(x) + shift, low, high)`.
+    """Continuous actions `clip(scale * tanh(x) + shift, low, high)` of outputs `x`.
 
-    Each action has its own output unless `output_indices` names one for each; several actions may share an output.
-    With `choices`, actions that are known, there is an output for each of them, and the one of the largest is done, of
-    equals the first; nothing is squashed then.
+    Action `i` reads output `i`, or `output_indices[i]` where these are given; several actions may share an output.
+    `choices` are a fixed set of actions with one output each: the action is the choice with the largest output (the
+    first of equal ones), and no output is squashed.
     """
 
     scale: tuple[float, ...]
@@ -30,7 +30,7 @@ class Continuous:
 
     @classmethod
     def between(cls, low: Any, high: Any) -> Continuous:
-        """The whole range from `low` to `high` `(actions,)`, its middle at an output of 0."""
+        """Map outputs to the range from `low` to `high`, both `(actions,)`; an output of 0 is its middle."""
         low, high = (np.asarray(each, dtype=np.float64).reshape(-1) for each in (low, high))
         ranges = ((high - low) / 2, (high + low) / 2, low, high)
         scale, shift, lowest, highest = (tuple(map(float, each)) for each in ranges)
@@ -38,42 +38,42 @@ class Continuous:
 
     @property
     def outputs(self) -> int:
-        """Outputs of a controller."""
+        """Number of outputs that a controller has."""
         if self.choices:
             return len(self.choices)
         return max(self.output_indices) + 1 if self.output_indices else self.actions
 
     @property
     def actions(self) -> int:
-        """Numbers of an action."""
+        """Number of components of an action."""
         return len(self.scale)
 
     def to_action(self, logits: Floats) -> Floats:
-        """The actions `(..., actions)` of what a controller's last layer adds up to `(..., outputs)`."""
+        """The actions `(..., actions)` of the sums in a controller's last layer `(..., outputs)`."""
         if self.choices:
-            done: Floats = self._choice_table[np.argmax(logits, axis=-1)]
-            return done
+            chosen: Floats = self._choice_table[np.argmax(logits, axis=-1)]
+            return chosen
         scale, shift, low, high = self._ranges
         outputs = np.tanh(logits)
-        taken = outputs[..., self.output_indices] if self.output_indices else outputs
-        action: Floats = np.clip(taken * scale + shift, low, high).astype(np.float32)
+        selected = outputs[..., self.output_indices] if self.output_indices else outputs
+        action: Floats = np.clip(selected * scale + shift, low, high).astype(np.float32)
         return action
 
     def to_outputs(self, action: Floats) -> Floats:
-        """Actions `(..., actions)` as a controller gives them `(..., outputs)`.
+        """The outputs `(..., outputs)` that represent actions `(..., actions)` as features.
 
-        Where several take one output they are added up, each with the sign of its scale: of one pedal gas less brake.
-        Of choices it is 1 for that which was done, and 0 for the others.
+        Actions that share an output are added, each with the sign of its scale: gas minus brake for a single pedal.
+        With `choices` the result is one-hot.
         """
         if self.choices:
             chosen: Floats = (action[..., None, :] == self._choice_table).all(axis=-1).astype(np.float32)
             return chosen
         if not self.output_indices:
             return action
-        back = np.zeros((*action.shape[:-1], self.outputs), np.float32)
-        for place, (output, scale) in enumerate(zip(self.output_indices, self.scale, strict=True)):
-            back[..., output] += np.copysign(np.float32(1), np.float32(scale)) * action[..., place]
-        return back
+        outputs = np.zeros((*action.shape[:-1], self.outputs), np.float32)
+        for index, (output, scale) in enumerate(zip(self.output_indices, self.scale, strict=True)):
+            outputs[..., output] += np.copysign(np.float32(1), np.float32(scale)) * action[..., index]
+        return outputs
 
     @cached_property
     def _choice_table(self) -> Floats:
@@ -86,10 +86,10 @@ class Continuous:
 
 @dataclass(frozen=True)
 class Discrete:
-    """One of `outputs` actions: the one with the largest output, of equals the first."""
+    """A choice among `outputs` numbered actions: the largest output wins, the first of equal ones."""
 
     outputs: int
-    first: int = 0  # the environment's number of the first one
+    first: int = 0  # the environment's number of the first action
 
     def to_action(self, logits: Floats) -> np.int64:
         """The action's number."""

@@ -1,6 +1,6 @@
-"""The frozen world model as one content-addressed file: a manifest and its parts in a stored zip.
+"""The frozen world model as one content-addressed file: a manifest and its parts in an uncompressed zip.
 
-The file's SHA-256 is its identity. Equal parts give equal files: entries are sorted, uncompressed, without a date.
+The file's SHA-256 is its identity. Equal parts give equal files: entries are sorted, uncompressed, without dates.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, DEFAULT_VARIANT, Variant
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
-from dreamfleet.common.artifacts.delta_bundle import write_stored
 from dreamfleet.common.artifacts.onnx_checks import (
     UnsafeModelError,
     check_model,
@@ -27,7 +26,7 @@ from dreamfleet.common.artifacts.onnx_checks import (
     read_float_array,
 )
 from dreamfleet.common.errors import BundleError, ControllerError
-from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive
+from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import open_regular, read_regular
 from dreamfleet.common.serialization.constraints import Between, Word
@@ -37,40 +36,38 @@ from dreamfleet.common.serialization.validation import MalformedError, from_plai
 FORMAT = 1
 MANIFEST = "manifest.json"
 ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART = "encoder.onnx", "decoder.onnx", "policy.onnx", "initial_latents.npy"
-DREAM_GRAPH = "dream.onnx"  # a step of the dream; bundles from before it have none
-RECORDED_STATES = "recorded_states.npy"  # where recorded drives were: only in bundles whose dreams may begin there
-LINEAR_CONTROLLER, LAYERED_CONTROLLER = (
-    "controller-linear.onnx",
-    "controller-hidden.onnx",
-)  # controllers of any size, a row each
-WEIGHTS = "weights.safetensors"  # only in bundles that training goes on from
+DREAM_GRAPH = "dream.onnx"  # one step of the dream; older bundles have none
+RECORDED_STATES = "recorded_states.npy"  # states of recorded drives; only in bundles whose dreams may begin there
+# Graphs for controllers of any size; their input holds a controller in each row.
+LINEAR_CONTROLLER, LAYERED_CONTROLLER = "controller-linear.onnx", "controller-hidden.onnx"
+WEIGHTS = "weights.safetensors"  # only in bundles from which training can continue
 REQUIRED = (ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART)
-MAX_BUNDLE = 256 << 20  # bytes, of the file and of all that it holds: the largest known is 16 MB
+MAX_BUNDLE = 256 << 20  # bytes, of the file and of its members together; the largest known bundle has 16 MB
 LIMITS = ArchiveLimits(MAX_BUNDLE)
 _MAX_MANIFEST = 1_000_000
-MAX_RECORDED_STATES = 16_384  # states: 19 MB of the default layers'
+MAX_RECORDED_STATES = 16_384  # states; 19 MB with the default layers
 
 
 @dataclass(frozen=True)
 class BundleManifest:
-    """What a bundle is: its shapes, task and preprocessing, the hash of each part, and where it comes from."""
+    """A bundle's manifest: its shapes, task and preprocessing, the hash of each part, and its provenance."""
 
     name: Word
     task: Word
     preprocessing: Word
-    picture: tuple[int, ...]  # height, width, channels of what the encoder takes, 8-bit
+    picture: tuple[int, ...]  # height, width, channels of the encoder's 8-bit input
     latent: Annotated[int, Between(1, 10_000)]
     hidden: Annotated[int, Between(1, 100_000)]
     actions: Annotated[int, Between(1, 1000)]
-    parts: dict[str, Any] = field(default_factory=dict)  # name -> SHA-256; filled in as the bundle is written
+    parts: dict[str, Any] = field(default_factory=dict)  # name -> SHA-256; `write_bundle` fills it in
     provenance: dict[str, Any] = field(default_factory=dict)
     format: int = FORMAT
-    # The configurations of `vae` and `mdnrnn`; empty in bundles from before they were kept: the paper's.
+    # The configurations of `vae` and `mdnrnn`; empty in older bundles, which have the paper's.
     models: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)
 
 
 class Bundle:
-    """A verified bundle, under the controllers that a run evolves."""
+    """A verified bundle, and the shape and variant of the controllers that drive by it."""
 
     def __init__(
         self, path: Path, sha256: str, manifest: BundleManifest, shape: ControllerShape | None = None,
@@ -84,12 +81,11 @@ class Bundle:
 
     @classmethod
     def open(cls, path: Path | str, sha256: str | None = None) -> Bundle:
-        """Verify a bundle whole: archive, manifest, each part's hash, and its own if `sha256` names one.
+        """Read and verify a bundle: archive, manifest, the hash of each part, and of the file if `sha256` is given.
 
-        What is verified is what was read: a file that is swapped meanwhile cannot pass. `BundleError` says what is
-        wrong.
+        The file is read once, so replacing it meanwhile cannot bypass the check. `BundleError` describes the fault.
         """
-        path = Path(path)  # a text is one too
+        path = Path(path)
         try:
             data = read_regular(path, MAX_BUNDLE)
         except FileNotFoundError:
@@ -100,12 +96,12 @@ class Bundle:
 
     @classmethod
     def from_bytes(cls, path: Path, data: bytes, wanted: str | None) -> Bundle:
-        """The bundle that these bytes of `path` are."""
+        """Verify the bytes of a bundle's file; `path` is where they were read."""
         found = hashlib.sha256(data).hexdigest()
         if wanted is not None and found != wanted:
             raise BundleError(
-                f"{path} is not the world model that is wanted: its hash is {found[:12]}..., not {wanted[:12]}...; "
-                "put the right one there; one in a cache may be deleted, and is fetched again"
+                f"{path} is another world model: its hash is {found[:12]}..., not {wanted[:12]}...; "
+                "put the right one there; a cached one may be deleted, and is fetched again"
             )
         try:
             with open_archive(io.BytesIO(data), LIMITS) as archive:
@@ -118,7 +114,7 @@ class Bundle:
 
     @property
     def default_shape(self) -> ControllerShape:
-        """A linear controller on latent and hidden state: what the policy's one graph holds."""
+        """The shape of a linear controller on latent and hidden state, which the policy graph contains."""
         return self.shape_of("zh")
 
     @property
@@ -127,18 +123,18 @@ class Bundle:
         return self._shape or self.default_shape
 
     def shape_of(self, features: str, hidden: int = 0, variant: Variant = DEFAULT_VARIANT) -> ControllerShape:
-        """Controllers that see `z` or `zh` (latent, or latent and hidden state), through `hidden` units; 0: linear.
+        """The shape of controllers on `features`, with `hidden` units between (0: linear).
 
-        A `variant` has outputs of its own, and may see more.
+        `features` is `z` (latent) or `zh` (latent and hidden state). A `variant` may add outputs and features.
         """
         width = self.manifest.latent + (self.manifest.hidden if features == "zh" else 0)
         outputs = self.manifest.actions if variant.is_default else variant.controls.outputs
         return ControllerShape(width + variant.extra_features, outputs, hidden)
 
     def with_controllers(self, shape: ControllerShape | None, variant: Variant = DEFAULT_VARIANT) -> Bundle:
-        """This bundle under controllers of another shape or variant; `None`: linear ones on all that they can see.
+        """This bundle for controllers of another shape or variant; `None`: linear ones on all features.
 
-        `ControllerError` if they do not fit it, `BundleError` if it is too old for them or of a world without variants.
+        `ControllerError` if they do not fit it; `BundleError` if it is too old for them, or its task has no variants.
         """
         if variant.is_default and shape in (None, self.default_shape):
             return Bundle(self.path, self.sha256, self.manifest)
@@ -161,9 +157,9 @@ class Bundle:
         return Bundle(self.path, self.sha256, self.manifest, shape, variant)
 
     def for_controller(self, controller: Controller) -> Bundle:
-        """This bundle with one controller's shape and variant; errors as of `with_controllers`.
+        """This bundle with the shape and variant of one controller; errors as in `with_controllers`.
 
-        `ControllerError` for a controller of another world model: its parameters mean nothing to this one.
+        `ControllerError` also for a controller that was evolved on another world model.
         """
         found = self.with_controllers(controller.shape, controller.variant)
         if self.sha256 != controller.bundle:
@@ -175,7 +171,7 @@ class Bundle:
 
     @property
     def recorded_count(self) -> int:
-        """How many recorded states its dreams may begin at."""
+        """Number of recorded states that its dreams may begin at."""
         return len(self.read_recorded()) if RECORDED_STATES in self.manifest.parts else 0
 
     def check_recorded(self) -> None:
@@ -187,18 +183,12 @@ class Bundle:
             )
 
     def read_recorded(self) -> NDArray[np.float32]:
-        """Recorded states `(N, 2 * latent + state)`: mu, logvar and the recurrent state before the action.
-
-        `BundleError` if it has none.
-        """
+        """Recorded states `(N, 2 * latent + state)`: mu, logvar and the recurrent state; `BundleError` if none."""
         self.check_recorded()
         return read_float_array(self.read(RECORDED_STATES))
 
     def read(self, name: str) -> bytes:
-        """One part's bytes; `BundleError` if the bundle has no such part.
-
-        They are of the hash that the verified manifest gives them, whatever lies at the path by now.
-        """
+        """One part's bytes, checked against its hash in the manifest; `BundleError` if there is no such part."""
         if name not in self.manifest.parts:
             raise BundleError(f"{self.path} holds no {name}")
         try:
@@ -209,24 +199,24 @@ class Bundle:
 
 
 def write_bundle(path: Path, manifest: BundleManifest, parts: Mapping[str, bytes]) -> Bundle:
-    """Write a bundle whole or not at all, and open it."""
+    """Write a bundle atomically, and open it."""
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(parts.items())}
     text = json.dumps({**to_dict(manifest), "parts": hashes}, indent=1, sort_keys=True)
     if len(text) > _MAX_MANIFEST:
-        raise BundleError(f"the manifest of {path} would have {len(text)} bytes, and {_MAX_MANIFEST} are read")
+        raise BundleError(f"the manifest of {path} would have {len(text)} bytes; at most {_MAX_MANIFEST} are read")
     with atomic_write(path) as file:
-        write_stored(file, [(MANIFEST, text.encode()), *sorted(parts.items())])
+        write_archive(file, [(MANIFEST, text.encode()), *sorted(parts.items())])
     return Bundle.open(path)
 
 
 def hash_file(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal; `OSError` for what is none."""
+    """SHA-256 of a file, hexadecimal; `OSError` if it is not a regular file."""
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _check_part(path: Path, manifest: BundleManifest, name: str, data: bytes) -> None:
-    """Refuse what would only show as nonsense while it is scored."""
+    """`BundleError` for a part that would fail, or give nonsense, only during scoring."""
     if name.endswith(".onnx"):
         try:
             check_model(data)
@@ -261,25 +251,25 @@ def _check_latents(path: Path, manifest: BundleManifest, data: bytes) -> None:
 
 
 def _check_recorded_states(path: Path, manifest: BundleManifest, data: bytes) -> None:
-    """How wide a state is exactly, the graph of the dream says to whoever dreams."""
+    """`BundleError` for unusable states; their exact width is in the dream's graph, which is not read here."""
     try:
         states = read_float_array(data)
     except ValueError as error:
         raise BundleError(
             f"{path}: {RECORDED_STATES} is no array of states ({error}); build the bundle again"
         ) from error
-    least = 2 * (manifest.latent + manifest.hidden)
-    if states.ndim != 2 or not 1 <= len(states) <= MAX_RECORDED_STATES or states.shape[1] < least:
+    min_width = 2 * (manifest.latent + manifest.hidden)
+    if states.ndim != 2 or not 1 <= len(states) <= MAX_RECORDED_STATES or states.shape[1] < min_width:
         raise BundleError(
-            f"{path}: {RECORDED_STATES} must be (N, W) with N from 1 to {MAX_RECORDED_STATES} and W at least {least}, "
-            f"not {states.shape}; build the bundle again"
+            f"{path}: {RECORDED_STATES} must be (N, W) with N from 1 to {MAX_RECORDED_STATES} and W at least "
+            f"{min_width}, not {states.shape}; build the bundle again"
         )
     if not np.isfinite(states).all():
         raise BundleError(f"{path}: {RECORDED_STATES} holds NaN or infinity; build the bundle again")
 
 
 def read_bytes_or_none(path: Path) -> bytes | None:
-    """What lies at a path; `None` if that is nothing, or nothing that can be read."""
+    """The bytes of a file; `None` if it does not exist or cannot be read."""
     try:
         return read_regular(path, MAX_BUNDLE)
     except OSError:
@@ -287,7 +277,7 @@ def read_bytes_or_none(path: Path) -> bytes | None:
 
 
 def _read_part(archive: Archive, path: Path, manifest: BundleManifest, name: str) -> bytes:
-    """One part, of the hash that the manifest says."""
+    """One part, checked against its hash in the manifest."""
     data = archive.read(name)
     if hashlib.sha256(data).hexdigest() != manifest.parts.get(name):
         raise BundleError(f"{path}: part {name} is damaged; fetch or build the bundle again")
@@ -310,5 +300,5 @@ def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
 
 
 def describe_bundle(sha256: str) -> str:
-    """A world model by its hash, in words; empty: none."""
+    """Name a world model by its hash for an error text; an empty hash is none."""
     return f"the world model {sha256[:12]}" if sha256 else "no world model"

@@ -1,13 +1,12 @@
-"""Where bundles lie: those that ship with the package, whole or lean, and the cache of this user."""
+"""Places of bundles: those that ship with the package, whole or as deltas, and the user's cache."""
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from importlib.resources import files
 from pathlib import Path
 
@@ -20,31 +19,33 @@ from dreamfleet.common.artifacts.delta_bundle import (
     write_delta,
 )
 from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
+from dreamfleet.common.files.locks import wait_for_lock
 from dreamfleet.common.files.regular_files import open_append, path_exists
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 def write_shipped_delta(bundle: Bundle, base: str, path: Path) -> None:
-    """Write the bundle as one that ships beside the one of the name `base`, without the parts that it has in common."""
-    lean = DeltaManifest(bundle.sha256, base, (MANIFEST, *sorted(bundle.manifest.parts)))
-    write_delta(path, lean, bundle.path, shipped_bundles()[base], LIMITS)
+    """Write the bundle as a delta to the shipped bundle `base`: without the parts that both hold."""
+    delta = DeltaManifest(bundle.sha256, base, (MANIFEST, *sorted(bundle.manifest.parts)))
+    write_delta(path, delta, bundle.path, shipped_bundles()[base], LIMITS)
 
 
 class BundleStore:
-    """Bundles by hash in a cache folder; what ships with the package is found too."""
+    """Bundles by hash: in a cache folder, or among those that ship with the package."""
 
     def __init__(self, root: Path) -> None:
         self._folder = root / "bundles"
 
     def find(self, sha256: str) -> Bundle | None:
-        """The verified bundle of this hash; a damaged cached copy is removed, so that it is fetched again."""
+        """The verified bundle of this hash, or `None`; a damaged copy in the cache is removed."""
         if (cached := self._find_cached(sha256)) is not None:
             return cached
         for path in shipped_bundles().values():
             if (data := read_bytes_or_none(path)) is not None and hashlib.sha256(data).hexdigest() == sha256:
                 return Bundle.from_bytes(path, data, sha256)
-        return next((self.rebuild(path) for path, lean in _shipped_deltas() if lean.sha256 == sha256), None)
+        return next((self.rebuild(path) for path, delta in _shipped_deltas() if delta.sha256 == sha256), None)
 
     def _find_cached(self, sha256: str) -> Bundle | None:
         path = self._path(sha256)
@@ -52,60 +53,53 @@ class BundleStore:
             return None
         if hashlib.sha256(data).hexdigest() == sha256:
             return Bundle.from_bytes(path, data, sha256)
-        with suppress(OSError):  # looked at, and wrong; one that another process completes meanwhile must stay
+        with suppress(OSError):
             path.unlink(missing_ok=True)
         return None
 
     def rebuild(self, path: Path) -> Bundle:
-        """The whole bundle of a lean file that ships; put together here once."""
-        lean = read_delta_manifest(path, LIMITS)
-        base = shipped_bundles().get(lean.base)
+        """The whole bundle of a shipped delta; it is assembled once, in the cache."""
+        delta = read_delta_manifest(path, LIMITS)
+        base = shipped_bundles().get(delta.base)
         if base is None:
-            raise BundleError(f"{path} needs the bundle {lean.base}, which does not ship: install dreamfleet again")
-        with self.lock_download(lean.sha256) as partial:
-            if (found := self._find_cached(lean.sha256)) is not None:
+            raise BundleError(f"{path} needs the bundle {delta.base}, which does not ship: install dreamfleet again")
+        with self.lock_download(delta.sha256) as partial:
+            if (found := self._find_cached(delta.sha256)) is not None:
                 return found
-            try:
-                with partial.open("wb") as file:
-                    rebuild_bundle(path, base, file, LIMITS)
-            except OSError as error:
-                raise self.write_error(error) from error
-            return self.finish_download(lean.sha256)
+            with self.reporting_write_errors(), partial.open("wb") as file:
+                rebuild_bundle(path, base, file, LIMITS)
+            return self.finish_download(delta.sha256)
 
     @contextmanager
     def lock_download(self, sha256: str) -> Iterator[Path]:
-        """Hold the right to download: where the bundle grows; what is there already is its beginning.
+        """Lock the download of a bundle; yields its partial file, which may hold the first bytes already.
 
-        Waits while another process of this host downloads it; look with `find` again before you do.
+        Blocks while another process of this host downloads it, so call `find` again inside.
         """
         partial = self._partial_path(sha256)
-        try:
+        with self.reporting_write_errors():
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             lock = open_append(partial.with_suffix(".lock"))
-        except OSError as error:
-            raise self.write_error(error) from error
         with lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+            wait_for_lock(lock)
             yield partial
 
     def finish_download(self, sha256: str) -> Bundle:
-        """Verify a finished download and give it its name; a wrong one is removed."""
+        """Verify a finished download and move it into the cache; `BundleError` and removal for a wrong one."""
         partial, path = self._partial_path(sha256), self._path(sha256)
-        try:
+        with self.reporting_write_errors():
             if (found := hash_file(partial)) != sha256:
                 partial.unlink()
                 raise BundleError(
                     f"the bundle arrived damaged: its hash is {found[:12]}..., not {sha256[:12]}...; try again"
                 )
             partial.replace(path)
-        except OSError as error:
-            raise self.write_error(error) from error
         return Bundle.open(path, sha256)
 
-    def write_error(self, error: OSError) -> BundleError:
-        """What to say where the folder takes nothing."""
-        return BundleError(
-            f"cannot write in {self._folder}: {error.strerror}; make room there, or point $DREAMFLEET_CACHE elsewhere"
+    def reporting_write_errors(self) -> AbstractContextManager[None]:
+        """Turn an `OSError` while writing in the cache into a `BundleError`."""
+        return reporting_unwritable_folder(
+            self._folder, "make room there, or point $DREAMFLEET_CACHE elsewhere", BundleError
         )
 
     def _path(self, sha256: str) -> Path:
@@ -116,7 +110,7 @@ class BundleStore:
 
 
 def _check_sha256(sha256: str) -> str:
-    """A hash that comes over the wire becomes part of a path: it must be one."""
+    """Return `sha256` if it is a hash, else raise `BundleError`: it comes from the network and names a file."""
     if not _SHA256.fullmatch(sha256):
         raise BundleError(f"{sha256!r} is no hash of a bundle: the run's specification is damaged")
     return sha256
@@ -144,7 +138,7 @@ def shipped_bundles() -> dict[str, Path]:
 
 
 def _shipped_deltas() -> Iterator[tuple[Path, DeltaManifest]]:
-    """The lean files that ship."""
+    """The deltas that ship, each with its manifest."""
     for path in sorted(pretrained_folder().glob(f"*{DELTA_SUFFIX}")):
         yield path, read_delta_manifest(path, LIMITS)
 
@@ -155,7 +149,7 @@ def shipped_names() -> tuple[str, ...]:
 
 
 def find_bundle(name: str) -> Bundle:
-    """A shipped bundle by name, or any by path."""
+    """A shipped bundle by name, or any bundle by path; `BundleError` if there is none."""
     shipped = shipped_bundles()
     if name in shipped:
         return Bundle.open(shipped[name])

@@ -1,7 +1,7 @@
-"""Variants of driving CarRacing: a controller's actions and features, and what a candidate pays for time and grass.
+"""Variants of CarRacing: a controller's actions and features, and penalties on time and on leaving the road.
 
-They are the task's own options. A run's specification names what differs from the plain way, which is named by nothing:
-so what is plain stays as it was before there were any.
+A variant is the task's options. A run's specification names only options that differ from their defaults, so the
+default variant has the same specification as runs from before there were variants.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Literal
 from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_AND_HALVES, STEERING_GAS_BRAKE, Continuous
 from dreamfleet.common.errors import UsageError
 
-CAR_RACING = "car-racing"  # whose options these are, and its dream's
+CAR_RACING = "car-racing"  # the task; its dream has the same options
 OPTION_HELP = {
     "actions": "continuous, or discrete with pedals=two",
     "pedals": "two, half or one",
@@ -29,21 +29,18 @@ OPTION_HELP = {
 
 @dataclass(frozen=True)
 class Variant:
-    """How a controller drives, and what its candidates pay; each default is the plain way.
-
-    `UsageError` for a value that is out of its range.
-    """
+    """How a controller drives, and the penalties of its candidates; `UsageError` for a value out of range."""
 
     actions: Literal["continuous", "discrete"] = "continuous"  # discrete: one of gymnasium's five
-    pedals: Literal["two", "half", "one"] = "two"  # half: at 0 both are half down; one: above 0 is gas, below it brake
+    pedals: Literal["two", "half", "one"] = "two"  # half: output 0 presses both halfway; one: > 0 is gas, < 0 brake
     pedal_shift: float = 0.0  # added to the one pedal
-    decide_every: int = 1  # steps for which a choice is held
-    feedback: Literal["none", "last"] = "none"  # last: the last choice and its change are features too
-    time_cost: float = 0.0  # what a candidate pays for each step before its lap is over
-    offroad_cost: float = 0.0  # what it pays for each step with a wheel off the road
+    decide_every: int = 1  # steps for which an action is repeated
+    feedback: Literal["none", "last"] = "none"  # last: the last action and its change are features too
+    time_cost: float = 0.0  # a candidate's penalty for each step before its lap is over
+    offroad_cost: float = 0.0  # a candidate's penalty for each step with a wheel off the road
 
     def __post_init__(self) -> None:
-        fits = {
+        valid = {
             "actions": self.actions == "continuous" or (self.actions == "discrete" and self.pedals == "two"),
             "pedals": self.pedals in ("two", "half", "one"),
             "pedal_shift": _within(self.pedal_shift, -1, 1) and (self.pedals == "one" or not self.pedal_shift),
@@ -52,18 +49,18 @@ class Variant:
             "time_cost": _within(self.time_cost, 0, 100),
             "offroad_cost": _within(self.offroad_cost, 0, 100),
         }
-        for name, fit in fits.items():
-            if not fit:
+        for name, is_valid in valid.items():
+            if not is_valid:
                 raise UsageError(f"{CAR_RACING}'s {name} must be {OPTION_HELP[name]}, not {getattr(self, name)!r}")
 
     @classmethod
     def from_json(cls, options: str) -> Variant:
-        """What a specification's options name, a JSON object or nothing; `UsageError` lists those that are known."""
+        """Parse a specification's options, a JSON object or an empty text; `UsageError` lists the known options."""
         return _parse_options(options)
 
     @classmethod
     def from_values(cls, names: Mapping[str, Any]) -> Variant:
-        """The variant of these names and values, each of its own type; `UsageError` as `of`."""
+        """The variant with these option values; `UsageError` for an unknown name or an invalid value."""
         if unknown := sorted(set(names) - set(OPTION_HELP)):
             raise UsageError(f"{CAR_RACING} knows no option {', '.join(unknown)}: known are {', '.join(OPTION_HELP)}")
         found = cls(**names)
@@ -72,34 +69,35 @@ class Variant:
 
     @property
     def options(self) -> str:
-        """As a specification has it: canonical JSON of what is not plain."""
+        """The options that differ from the defaults as canonical JSON; empty for the default variant."""
         return json.dumps(self._non_default, sort_keys=True) if self._non_default else ""
 
     @property
     def option_texts(self) -> tuple[str, ...]:
-        """As it is said where a run begins: NAME=VALUE of what is not plain."""
+        """The options that differ from the defaults, each as NAME=VALUE."""
         return tuple(f"{name}={value}" for name, value in self._non_default.items())
 
     @property
     def is_default(self) -> bool:
-        """Whether nothing differs."""
+        """Whether no option differs from its default."""
         return self == DEFAULT_VARIANT
 
     @property
     def version(self) -> int:
-        """Of the task: a worker that knows no variants must not score one as if it were plain."""
+        """Version of the task: a worker that does not know variants must not score one as the default."""
         if self.is_default:
             return 1
-        return 3 if self.without_costs.is_default else 2  # version 2 drove plain controllers that pay by other products
+        # In version 2 the default controls had other penalties.
+        return 3 if self.without_costs.is_default else 2
 
     @property
     def without_costs(self) -> Variant:
-        """What a controller's parameters depend on: all but what candidates pay."""
+        """This variant without penalties, on which a controller's parameters do not depend."""
         return replace(self, time_cost=0.0, offroad_cost=0.0)
 
     @property
     def controls(self) -> Continuous:
-        """How outputs become steering, gas and brake."""
+        """The conversion of outputs to steering, gas and brake."""
         if self.actions == "discrete":
             return FIVE_CHOICES
         if self.pedals == "two":
@@ -111,7 +109,7 @@ class Variant:
 
     @property
     def extra_features(self) -> int:
-        """Features beside those of the world model: each output's last choice and its change."""
+        """Number of features beside the world model's: each output's last value and its change."""
         return 2 * self.controls.outputs if self.feedback == "last" else 0
 
     @property

@@ -1,7 +1,7 @@
-"""The evolved controller: its shape, how a flat vector packs it, and the formula in NumPy.
+"""The evolved controller: its shape, its flat parameter vector, and its formula in NumPy.
 
-A single linear layer (Ha & Schmidhuber 2018, section 2.3): a = W [z; h] + b, which the task's world makes an action of;
-its ablations see z alone, or have a layer of tanh units between.
+A linear layer on the world model's latent z and hidden state h (Ha & Schmidhuber 2018, section 2.3): W [z; h] + b,
+which the task converts to an action. Variants see z alone, or have a layer of tanh units between.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 
 FORMAT = 1
-_LIMITS = ArchiveLimits(64 << 20, members=8)  # 16 million parameters: no search goes as far
-_TASK_DEFAULTS: dict[str, Any] = {"options": "", "version": 1}  # of tasks; written only where they differ
+_LIMITS = ArchiveLimits(64 << 20, members=8)  # 16 million parameters, more than any search has
+_TASK_DEFAULTS: dict[str, Any] = {"options": "", "version": 1}  # written only where a task's values differ
 
 
 @dataclass(frozen=True)
 class ControllerShape:
-    """What a flat parameter vector means: `features` inputs to `actions` outputs, with biases.
+    """The layout of a flat parameter vector: `features` inputs to `actions` outputs, with biases.
 
-    Linear, or through one layer of `hidden` tanh units (Ha & Schmidhuber 2018, table 2).
+    Linear, or with one layer of `hidden` tanh units (Ha & Schmidhuber 2018, table 2).
     """
 
     features: int
@@ -40,14 +40,14 @@ class ControllerShape:
 
     @property
     def layers(self) -> tuple[tuple[int, int], ...]:
-        """Outputs and inputs of each layer, first to last."""
+        """Numbers of outputs and inputs of each layer, first to last."""
         if self.hidden:
             return (self.hidden, self.features), (self.actions, self.hidden)
         return ((self.actions, self.features),)
 
     @property
     def size(self) -> int:
-        """Length of the flat vector: layer after layer its weights row by row, then its biases."""
+        """Length of the flat vector; it holds each layer's weights row by row, then its biases."""
         return sum(outputs * (inputs + 1) for outputs, inputs in self.layers)
 
     def check(self, parameters: NDArray[np.float32]) -> None:
@@ -73,25 +73,25 @@ class ControllerShape:
 def act(
     shape: ControllerShape, parameters: NDArray[np.float32], features: NDArray[np.float32], actions: Actions
 ) -> Any:
-    """The action of a controller `(size,)` on features `(features,)`; the reference for the ONNX graphs."""
+    """The action of a controller `(size,)` for features `(features,)`: the reference for the ONNX graphs."""
     *before, (weights, biases) = shape.unpack(parameters)
     value = features
-    for each, offsets in before:
-        value = np.tanh(each @ value + offsets)
+    for hidden_weights, hidden_biases in before:
+        value = np.tanh(hidden_weights @ value + hidden_biases)
     return actions.to_action(weights @ value + biases)
 
 
 @dataclass(frozen=True)
 class Controller:
-    """Parameters `(size,)` float32, and for which task and world model they were evolved."""
+    """Parameters `(size,)` float32, with the task and world model that they were evolved for."""
 
     shape: ControllerShape
     parameters: NDArray[np.float32] = field(repr=False)
     task: str
-    bundle: str  # SHA-256 of the bundle's file, hexadecimal; empty where the task needs none
+    bundle: str  # SHA-256 of the bundle's file, hexadecimal; empty if the task needs none
     provenance: dict[str, Any] = field(default_factory=dict, repr=False)
-    options: str = ""  # the task's own, as its specification has them
-    version: int = 1  # the task's
+    options: str = ""  # the task's options as in its specification
+    version: int = 1  # of the task
 
     def __post_init__(self) -> None:
         if self.parameters.shape != (self.shape.size,) or self.parameters.dtype != np.float32:
@@ -109,7 +109,7 @@ class Controller:
 
     @property
     def variant(self) -> Variant:
-        """How it drives, of one that was evolved on a world model; `UsageError` for options that are no variant's."""
+        """The variant in the options, of a controller for a world model; `UsageError` if they name none."""
         return Variant.from_json(self.options)
 
     @property
@@ -117,7 +117,7 @@ class Controller:
         return {"options": self.options, "version": self.version}
 
     def save(self, path: Path) -> None:
-        """Write an `.npz` that `load` reads; whole or not at all."""
+        """Write an `.npz` that `load` reads, atomically."""
         about = {"format": FORMAT, "shape": to_dict(self.shape), "task": self.task, "bundle": self.bundle}
         about |= {name: value for name, value in self._task_details.items() if value != _TASK_DEFAULTS[name]}
         text = json.dumps({**about, "provenance": self.provenance}, sort_keys=True)
@@ -126,7 +126,7 @@ class Controller:
 
     @classmethod
     def load(cls, path: Path) -> Controller:
-        """Read a controller file; `ControllerError` says what is wrong with it."""
+        """Read a controller file; `ControllerError` describes what is wrong with it."""
         try:
             arrays = read_arrays(path, _LIMITS, ("about", "parameters"))
             return cls._parse(arrays["parameters"], json.loads(str(arrays["about"])))
@@ -141,16 +141,16 @@ class Controller:
 
     @classmethod
     def _parse(cls, parameters: NDArray[Any], about: dict[str, Any]) -> Controller:
-        """What a file's two arrays tell; whatever they are, each field is of its own type."""
+        """Build a controller from a file's two arrays, of which nothing is trusted."""
         if about["format"] != FORMAT:
-            raise ControllerError(f"it is of controller format {about['format']!r:.20}; this version reads {FORMAT}")
+            raise ControllerError(f"it has controller format {about['format']!r:.20}; this version reads {FORMAT}")
         shape = ControllerShape(**about["shape"])
         details = {name: about.get(name, value) for name, value in _TASK_DEFAULTS.items()}
         numbers = (*vars(shape).values(), details["version"])
         if not all(type(each) is int and 0 <= each < 2**31 for each in numbers):
-            raise ValueError("its shape or version is no number of them")
+            raise ValueError("its shape or version is not a whole number")
         if not all(isinstance(each, str) for each in (about["task"], about["bundle"], details["options"])):
-            raise ValueError("its task, bundle or options are no text")
+            raise ValueError("its task, bundle or options are not text")
         if details["options"] and not isinstance(json.loads(details["options"]), dict):
-            raise ValueError("its task's options are no JSON object")
+            raise ValueError("its task's options are not a JSON object")
         return cls(shape, parameters, about["task"], about["bundle"], dict(about["provenance"]), **details)

@@ -1,74 +1,65 @@
-"""A bundle that ships beside another one: parts that both hold are kept once, in the other one's file.
+"""Delta bundles: a bundle without the parts that another shipped bundle, its base, holds too.
 
-A lean file is a stored zip, as a bundle is: the bundle's manifest, the parts that are its own, and which bundle has the
-others. What is put together is the bundle as it was frozen, to the byte, for its hash is told too.
+A delta is an uncompressed zip like a bundle: a delta manifest, the bundle's manifest, and its own parts. Rebuilding
+gives the original bundle to the byte; the delta manifest holds its hash.
 """
 
 from __future__ import annotations
 
 import json
-import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, open_archive
+from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import open_regular
 
 DELTA_SUFFIX = ".lean"
 DELTA_MANIFEST = "lean.json"
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-_MAX_ABOUT = 10_000  # bytes
+_MAX_DELTA_MANIFEST = 10_000  # bytes
 
 
 @dataclass(frozen=True)
 class DeltaManifest:
-    """What a lean file says of itself."""
+    """A delta's manifest."""
 
     sha256: str  # of the whole bundle's file, hexadecimal
-    base: str  # name of the bundle that ships whole and holds the other parts
+    base: str  # name of the shipped bundle that holds the other parts
     parts: tuple[str, ...]  # all members of the whole bundle, in order
 
 
-def write_stored(file: BinaryIO, members: Iterable[tuple[str, bytes]]) -> None:
-    """A zip of these members, uncompressed and without a date: equal members give equal bytes."""
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in members:
-            archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
-
-
-def write_delta(path: Path, lean: DeltaManifest, whole: Path, base: Path, limits: ArchiveLimits) -> None:
-    """Write what of the bundle's file `whole` the file `base` does not hold."""
-    members, theirs = _members(whole, limits), _members(base, limits)
-    own = [(name, members[name]) for name in lean.parts if theirs.get(name) != members[name]]
+def write_delta(path: Path, delta: DeltaManifest, whole: Path, base: Path, limits: ArchiveLimits) -> None:
+    """Write the parts of the bundle's file `whole` that the file `base` does not hold."""
+    members, base_members = _members(whole, limits), _members(base, limits)
+    own = [(name, members[name]) for name in delta.parts if base_members.get(name) != members[name]]
     with atomic_write(path) as file:
-        write_stored(file, [(DELTA_MANIFEST, json.dumps(asdict(lean)).encode()), *own])
+        write_archive(file, [(DELTA_MANIFEST, json.dumps(asdict(delta)).encode()), *own])
 
 
 def read_delta_manifest(path: Path, limits: ArchiveLimits) -> DeltaManifest:
-    """What a lean file says of itself; `BundleError` if it is damaged."""
+    """Read a delta's manifest; `BundleError` if it is damaged."""
     try:
         with open_regular(path, limits.size) as file, open_archive(file, limits) as archive:
-            plain = json.loads(archive.read(DELTA_MANIFEST, _MAX_ABOUT))
+            plain = json.loads(archive.read(DELTA_MANIFEST, _MAX_DELTA_MANIFEST))
         return DeltaManifest(str(plain["sha256"]), str(plain["base"]), tuple(map(str, plain["parts"])))
     except (OSError, DamagedArchiveError, ValueError, TypeError, KeyError) as error:
         raise _damage_error(path, error) from error
 
 
 def rebuild_bundle(path: Path, base: Path, file: BinaryIO, limits: ArchiveLimits) -> None:
-    """Write the whole bundle of a lean file; `BundleError` where a part is in neither."""
-    lean = read_delta_manifest(path, limits)
+    """Write the whole bundle of a delta to `file`; `BundleError` if a part is in neither of the two files."""
+    delta = read_delta_manifest(path, limits)
     members: Mapping[str, bytes] = {**_members(base, limits), **_members(path, limits)}
-    if missing := [name for name in lean.parts if name not in members]:
+    if missing := [name for name in delta.parts if name not in members]:
         raise _damage_error(path, f"{', '.join(missing)} is in neither it nor {base.name}")
-    write_stored(file, [(name, members[name]) for name in lean.parts])
+    write_archive(file, [(name, members[name]) for name in delta.parts])
 
 
 def _members(path: Path, limits: ArchiveLimits) -> dict[str, bytes]:
-    """Everything that a zip holds."""
+    """All members of a zip, by name."""
     try:
         with open_regular(path, limits.size) as file, open_archive(file, limits) as archive:
             return {name: archive.read(name) for name in archive.names}

@@ -1,4 +1,4 @@
-"""Looking at the arrays in a bundle's parts without the libraries that run them."""
+"""Checks of ONNX models and arrays from untrusted files, without the libraries that run them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.files.archives import parse_array
 
-_ORT_FORMAT = b"ORTM"  # its flat buffers' mark, which its reader takes for another format
-_MAX_DEPTH = 64  # graphs within nodes within graphs
-_MAX_FIELDS = 500_000  # of all messages of a model; ours have some hundreds
-_MAX_FIELD_NUMBER = 2**29  # of a field: the runtime's reader cuts longer ones short
-# Of onnx.proto: where messages of each kind hold messages that a tensor may stand in.
+_ORT_FORMAT = b"ORTM"  # the mark of ONNX Runtime's own flat-buffer format, at byte 4
+_MAX_DEPTH = 64  # of nested messages
+_MAX_FIELDS = 500_000  # of all messages of a model together; ours have some hundreds
+_MAX_FIELD_NUMBER = 2**29  # the runtime's reader truncates larger ones
+# Field numbers of onnx.proto: the fields of each kind of message whose own messages may contain a tensor.
 _NESTED = {
     "model": {7: "graph", 20: "training", 25: "function"},
     "training": {1: "graph", 2: "graph"},
@@ -37,9 +37,9 @@ _FLOATS: dict[int, np.dtype[Any]] = {
 
 
 def has_finite_weights(model: bytes) -> bool:
-    """Whether no weight of an ONNX model is NaN or infinite; what is no model has none.
+    """Whether all weights of an ONNX model are finite; True for bytes that are no model.
 
-    The runtime does not tell: a rectifier makes zero of NaN. Field numbers are those of onnx.proto: ModelProto.graph 7,
+    The runtime does not report NaN: a rectifier turns it into zero. Field numbers of onnx.proto: ModelProto.graph 7,
     GraphProto.initializer 5, TensorProto.data_type 2 and raw_data 9.
     """
     try:
@@ -54,13 +54,13 @@ def has_finite_weights(model: bytes) -> bool:
 
 
 class UnsafeModelError(ValueError):
-    """What no model may have, in words that follow its name."""
+    """An ONNX model is unsafe to load; the text follows the model's name."""
 
 
 def check_model(model: bytes) -> None:
-    """`UnsafeModelError` if an ONNX model reads other files, or is too much to look through.
+    """`UnsafeModelError` if an ONNX model refers to other files, or is too large to check.
 
-    What is no model at all is not judged here; `check_self_contained` is for those who run it.
+    Bytes that are no model pass; call `check_self_contained` before running one.
     """
     try:
         check_self_contained(model)
@@ -71,10 +71,9 @@ def check_model(model: bytes) -> None:
 
 
 def check_self_contained(model: bytes) -> None:
-    """`ValueError` unless an ONNX model is one whole message that names no other file.
+    """`ValueError` unless an ONNX model is one whole protobuf message that refers to no other file.
 
-    Stricter than the runtime's own reader, so that nothing passes here which means something else there: of messages
-    alone, without groups, in which no number is longer than it may be.
+    Stricter than the runtime's reader, so that both understand the same: no groups, no overlong varints.
     """
     if model[4:8] == _ORT_FORMAT:
         raise ValueError("it is in the runtime's own format, not in ONNX")
@@ -85,9 +84,9 @@ def check_self_contained(model: bytes) -> None:
 
 
 def is_empty_graph(model: bytes) -> bool:
-    """Whether an ONNX model computes nothing: it is no bytes at all, or a message without a node.
+    """Whether an ONNX model computes nothing: it is empty, or a graph without nodes.
 
-    What is no message at all is not judged here; the runtime refuses it. GraphProto.node is field 1.
+    False for bytes that are no message; the runtime refuses them. GraphProto.node is field 1.
     """
     try:
         return not any(True for graph in _messages(memoryview(model), 7) for _ in _messages(graph, 1))
@@ -96,7 +95,7 @@ def is_empty_graph(model: bytes) -> bool:
 
 
 def read_float_array(data: bytes) -> NDArray[np.float32]:
-    """A `.npy` of floats; `ValueError` if it is none."""
+    """Parse a `.npy` of floats as float32; `ValueError` if it is none."""
     array = parse_array(data)
     if array.dtype.kind != "f":
         raise ValueError("not an array of floats")
@@ -104,7 +103,7 @@ def read_float_array(data: bytes) -> NDArray[np.float32]:
 
 
 def _check_message(data: memoryview, kind: str, left: list[int], depth: int = 0) -> None:
-    """Look through one message; `left` holds how many fields may still come."""
+    """Check one message and those in it; `left[0]` counts down the fields that may still follow."""
     if depth > _MAX_DEPTH:
         raise UnsafeModelError("is nested too deeply")
     for number, value in _fields(data):

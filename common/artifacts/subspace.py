@@ -1,9 +1,8 @@
-"""Fewer features for a search: what a controller sees, seen through a fixed affine map.
+"""Subspaces: a search over few features, which a fixed affine map makes of a controller's inputs.
 
-A linear controller on [z, h] has hundreds of weights, and a search pays for each of them, whether it matters or not.
-Restricted to a subspace it moves W = W0 + C M and b = b0 + C m + c alone: M and m make a few features of what is seen,
-and the coordinates C, c are what the optimiser knows of. What is published, journalled and reported are whole
-parameters all the same.
+A linear controller on [z, h] has hundreds of weights, and each costs the search evaluations. In a subspace the search
+varies W = W0 + C M and b = b0 + C m + c only: M and m map the inputs to K features, and the coordinates C, c are the
+optimiser's variables. Published, journalled and reported are the full parameters.
 """
 
 from __future__ import annotations
@@ -27,25 +26,27 @@ from dreamfleet.common.printable import one_line
 
 FORMAT = 1
 _LIMITS = ArchiveLimits(16 << 20, members=8)
-_MAX_WEIGHTS = 1 << 18  # of its weights: a controller's receipt holds them as text
+_MAX_WEIGHTS = 1 << 18  # a controller's provenance holds the weights as text
 _MAX_NAME, _MAX_REASON = 100, 200
-_LARGEST = 1e6  # of a weight: features have a deviation of about 1
+_LARGEST = 1e6  # largest magnitude of a weight; features have a deviation of about 1
 
 
 @dataclass(frozen=True, eq=False)
 class Subspace:
-    """K features of what the controllers of one world model see: `weights` (K, inputs) and `offsets` (K,), float32."""
+    """K features of the inputs of one world model's controllers: `weights` (K, inputs), `offsets` (K,), float32.
+
+    `ValueError` for arrays and names that do not fit together.
+    """
 
     weights: NDArray[np.float32]
     offsets: NDArray[np.float32]
-    names: tuple[str, ...]  # of the features, for people
+    names: tuple[str, ...]  # of the features, for display
     bundle: str  # SHA-256 of the world model
 
     def __post_init__(self) -> None:
-        """`ValueError` for what no subspace can be."""
         features, inputs = self.weights.shape if self.weights.ndim == 2 else (0, 0)
         if not (features and inputs):
-            raise ValueError(f"weights of shape {self.weights.shape} are no features of what is seen")
+            raise ValueError(f"weights of shape {self.weights.shape} must have shape (features, inputs)")
         if self.weights.size > _MAX_WEIGHTS:
             raise ValueError(f"it has {self.weights.size} weights, {_MAX_WEIGHTS} at most")
         if self.offsets.shape != (features,) or len(self.names) != features:
@@ -59,44 +60,44 @@ class Subspace:
 
     @cached_property
     def text(self) -> str:
-        """As a journal and a receipt keep it."""
+        """The subspace as JSON, for journals and provenance; `from_text` reads it."""
         arrays = {name: base64.b64encode(getattr(self, name).astype("<f4").tobytes()).decode()
                   for name in ("weights", "offsets")}  # fmt: skip
         return json.dumps({**arrays, "names": self.names, "bundle": self.bundle}, sort_keys=True)
 
     @property
     def sha256(self) -> str:
-        """Hash of all that a search depends on, and of the features' names."""
+        """Hash of the whole subspace, names included."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     @classmethod
     def from_text(cls, text: str) -> Subspace:
-        """Read what `text` gave; `ValueError` if it is damaged."""
+        """Parse `text`; `ValueError` if it is damaged."""
         try:
-            told = json.loads(text)
-            weights, offsets = (np.frombuffer(base64.b64decode(told[name], validate=True), dtype="<f4")
+            plain = json.loads(text)
+            weights, offsets = (np.frombuffer(base64.b64decode(plain[name], validate=True), dtype="<f4")
                                 for name in ("weights", "offsets"))  # fmt: skip
             shaped = weights.reshape(len(offsets), -1).astype(np.float32)
-            return cls(shaped, offsets.astype(np.float32), _as_tuple(told["names"]), told["bundle"])
+            return cls(shaped, offsets.astype(np.float32), _as_tuple(plain["names"]), plain["bundle"])
         except (KeyError, TypeError, RecursionError) as error:
             raise ValueError(f"{type(error).__name__}: {error}") from error
 
     def save(self, path: Path, provenance: dict[str, Any]) -> None:
-        """Write an `.npz` that `load` reads; whole or not at all."""
+        """Write an `.npz` that `load` reads, atomically."""
         about = {"format": FORMAT, "names": self.names, "bundle": self.bundle, "provenance": provenance}
         with atomic_write(path) as file:
             np.savez(file, weights=self.weights, offsets=self.offsets, about=json.dumps(about))
 
     @classmethod
     def load(cls, path: Path) -> Subspace:
-        """Read what `save` wrote; `UsageError` if that is no subspace."""
+        """Read a file that `save` wrote; `UsageError` if it is no subspace."""
         try:
             arrays = read_arrays(path, _LIMITS)
             if missing := {"weights", "offsets", "about"} - arrays.keys():
                 raise ValueError(f"it has no {', '.join(sorted(missing))}")
             about = json.loads(str(arrays["about"]))
             if about["format"] is True or about["format"] != FORMAT:
-                raise ValueError(f"it is of another format than {FORMAT}")
+                raise ValueError(f"it has another format than {FORMAT}")
             return cls(arrays["weights"], arrays["offsets"], _as_tuple(about["names"]), about["bundle"])
         except OSError as error:
             why = f"{error.strerror or error}: name a file of `dreamfleet subspace`, or none"
@@ -108,27 +109,27 @@ class Subspace:
 
 def _as_tuple(names: Any) -> tuple[Any, ...]:
     if not isinstance(names, list):
-        raise TypeError("its names are no list")
+        raise TypeError("its names are not a list")
     return tuple(names)
 
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """Where a search in a subspace goes, for controllers of one shape."""
+    """The coordinates of a search in a subspace, for controllers of one shape."""
 
     subspace: Subspace
     shape: ControllerShape
 
     @property
     def dimension(self) -> int:
-        """Coordinates: an output's weight of each feature and its bias; of layers behind the first each parameter."""
+        """Number of coordinates: K weights and a bias for each output of the first layer, and all other parameters."""
         outputs, inputs = self.shape.layers[0]
         return outputs * (len(self.subspace.names) + 1) + self.shape.size - outputs * (inputs + 1)
 
     def lift(self, origin: NDArray[np.float64], coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The parameters `(..., size)` at coordinates `(..., dimension)` counted from `origin` `(size,)`.
+        """The parameters `(..., size)` at coordinates `(..., dimension)` relative to `origin` `(size,)`.
 
-        Sums go feature by feature, never through BLAS, so that every host has the same bits.
+        Sums run feature by feature, not through BLAS, so that every host computes the same bits.
         """
         outputs, inputs = self.shape.layers[0]
         features, before = len(self.subspace.names), coordinates.shape[:-1]

@@ -1,21 +1,17 @@
-"""An agent that was trained without a world model, as one file: its network, and all that is needed to drive by it.
-
-A stored zip of an ONNX graph and a manifest with its hash, as a bundle is one; it is read within the same bounds.
-"""
+"""An agent that was trained without a world model, as one file: an uncompressed zip of an ONNX graph and a manifest."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
-import zipfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 from dreamfleet.common.artifacts.onnx_checks import UnsafeModelError, check_model, has_finite_weights, is_empty_graph
 from dreamfleet.common.errors import ControllerError
-from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive
+from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.files.regular_files import open_regular, read_regular
 from dreamfleet.common.serialization.constraints import Between, Length, Word
@@ -23,10 +19,9 @@ from dreamfleet.common.serialization.validation import MalformedError, from_plai
 
 FORMAT = 1
 MANIFEST, NETWORK = "agent.json", "network.onnx"
-MAX_BYTES = 256 << 20  # of the file, and of all that it holds
+MAX_BYTES = 256 << 20  # of the file, and of its members together
 _LIMITS = ArchiveLimits(MAX_BYTES, members=8)
 _MAX_MANIFEST = 1_000_000
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 MAX_FRAME_SKIP, MAX_STATE_SIZE = 10**6, 10**6
 
 Choice = Annotated[tuple[float, ...], Length(1, 1000)]
@@ -34,47 +29,46 @@ Choice = Annotated[tuple[float, ...], Length(1, 1000)]
 
 @dataclass(frozen=True)
 class AgentManifest:
-    """What an agent drives in and how, and where it comes from."""
+    """An agent's task, preprocessing, actions and provenance."""
 
-    name: Word  # of the baseline that it was trained as
+    name: Word  # of its baseline
     task: Word
-    preprocessing: Word  # of the pictures that it sees
-    choices: Annotated[tuple[Choice, ...], Length(1, 1000)]  # an action each
-    frame_skip: Annotated[int, Between(1, MAX_FRAME_SKIP)]  # steps for which a choice is held
-    state: Annotated[int, Between(1, MAX_STATE_SIZE)]  # numbers that it remembers from one decision to the next
+    preprocessing: Word  # of its input pictures
+    choices: Annotated[tuple[Choice, ...], Length(1, 1000)]  # the actions to choose from
+    frame_skip: Annotated[int, Between(1, MAX_FRAME_SKIP)]  # steps for which an action is repeated
+    state: Annotated[int, Between(1, MAX_STATE_SIZE)]  # length of its recurrent state
     provenance: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class TrainedAgent:
-    """A network of `picture` and `state` to the `worth` of each choice and `next_state`, and how it drives."""
+    """A network and its manifest: inputs `picture` and `state`, outputs `worth` of each choice and `next_state`."""
 
     manifest: AgentManifest
     network: bytes = field(repr=False)  # ONNX
 
     @property
     def task(self) -> str:
-        """That it was trained in."""
+        """The task that it was trained in."""
         return self.manifest.task
 
     @property
     def sha256(self) -> str:
-        """Hash of all that its choices follow from: the network, and how it drives."""
+        """Hash of all that determines its actions; `name` and `provenance` are left out."""
         driving = {name: value for name, value in asdict(self.manifest).items() if name not in ("name", "provenance")}
         text = json.dumps({**driving, "network": hashlib.sha256(self.network).hexdigest()}, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
     def save(self, path: Path) -> None:
-        """Write what `load` reads, whole or not at all; equal agents give equal files."""
+        """Write a file that `load` reads, atomically; equal agents give equal files."""
         about = {**asdict(self.manifest), "format": FORMAT, "network": hashlib.sha256(self.network).hexdigest()}
         text = json.dumps(about, indent=1, sort_keys=True, allow_nan=False)
-        with open_output(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-            for name, data in ((MANIFEST, text.encode()), (NETWORK, self.network)):
-                archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+        with open_output(path) as file:
+            write_archive(file, [(MANIFEST, text.encode()), (NETWORK, self.network)])
 
     @classmethod
     def load(cls, path: Path) -> TrainedAgent:
-        """Read an agent's file; `ControllerError` says what is wrong with it. What runs the network looks further."""
+        """Read an agent's file; `ControllerError` describes what is wrong with it."""
         try:
             with open_archive(io.BytesIO(read_regular(path, MAX_BYTES)), _LIMITS) as archive:
                 return cls._parse(archive)
@@ -87,18 +81,18 @@ class TrainedAgent:
     def _parse(cls, archive: Archive) -> TrainedAgent:
         about = json.loads(archive.read(MANIFEST, _MAX_MANIFEST))
         if not isinstance(about, dict):
-            raise ValueError(f"{MANIFEST} is no JSON object")
+            raise ValueError(f"{MANIFEST} is not a JSON object")
         if (found := about.pop("format")) != FORMAT:
-            raise ValueError(f"it is of format {found!r:.20}; this version reads {FORMAT}")
+            raise ValueError(f"it has format {found!r:.20}; this version reads {FORMAT}")
         sha256, network = about.pop("network"), archive.read(NETWORK)
         if hashlib.sha256(network).hexdigest() != sha256:
-            raise ValueError(f"{NETWORK} is not the one that its manifest names")
+            raise ValueError(f"the hash of {NETWORK} is not the one in its manifest")
         _check_network(network)
         return cls(from_plain(AgentManifest, about), network)
 
 
 def is_agent(path: Path) -> bool:
-    """Whether a file holds an agent, as far as its names say."""
+    """Whether a file is an agent's, by the names of its members alone."""
     try:
         with open_regular(path, MAX_BYTES) as file, open_archive(file, _LIMITS) as archive:
             return MANIFEST in archive.names
@@ -107,7 +101,7 @@ def is_agent(path: Path) -> bool:
 
 
 def _check_network(network: bytes) -> None:
-    """`ValueError` for what would only show as nonsense on the track."""
+    """`ValueError` for a network that would give nonsense only while driving."""
     try:
         check_model(network)
     except UnsafeModelError as error:

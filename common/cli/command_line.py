@@ -1,8 +1,8 @@
-"""The command line: finds verbs through the entry-point group `dreamfleet.verbs`; each side registers its own.
+"""The command line: finds verbs in the entry-point group `dreamfleet.verbs` and runs one.
 
 A verb is a module with `SUMMARY`, `EXTRAS`, `configure(parser)` and `run(args)`. A dot in its name is a space on the
-command line: `train.vae` is `dreamfleet train vae`. Verbs import what is heavy when they run, and only the module of
-the verb that is asked for is loaded.
+command line: `train.vae` is `dreamfleet train vae`. Only the requested verb's module is loaded, and it imports heavy
+packages in `run`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dreamfleet.common.host.logs import configure_logging, report_failure
 
 GROUP = "dreamfleet.verbs"
 EXIT_INTERRUPTED = 130
-LAST_STREAM = 2  # the number of stderr
+LAST_STREAM = 2  # file descriptor of stderr
 DESCRIPTION = "Evolve World-Models controllers on whatever machines you have."
 EXIT_CODES = (
     "Exit codes: 0 done; 1 it failed, was refused, or the answer is no; 2 the command or a setting is wrong; 130 it "
@@ -31,7 +31,7 @@ EXIT_CODES = (
 
 
 class Configurable(Protocol):
-    """What a verb's parser is built from."""
+    """The part of a verb that builds its parser."""
 
     SUMMARY: str
 
@@ -40,19 +40,19 @@ class Configurable(Protocol):
 
 
 class Verb(Configurable, Protocol):
-    """What a verb's module offers."""
+    """The interface of a verb's module."""
 
-    EXTRAS: tuple[str, ...]  # of the distribution, without which it cannot run
+    EXTRAS: tuple[str, ...]  # extras of the distribution that it needs
 
     def run(self, args: argparse.Namespace) -> int:
-        """Do it; the exit code."""
+        """Run the verb; returns the exit code."""
 
 
 class Parser(argparse.ArgumentParser):
-    """A verb's parser: an unknown flag names the near one."""
+    """A verb's parser; the error for an unknown flag suggests the nearest one."""
 
     def parse_all(self, words: Sequence[str]) -> argparse.Namespace:
-        """Parse `words`, all of which must be known."""
+        """Parse `words`; exits with an error on an unknown one."""
         args, unknown = self.parse_known_args(words)
         if unknown:
             self._refuse(unknown)
@@ -66,7 +66,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb; an expected error is one line on stderr and an exit code that is not 0."""
+    """Run one verb; returns the exit code. An expected error becomes one line on stderr and a non-zero exit code."""
     _open_closed_streams()
     configure_logging()
     words = list(sys.argv[1:] if argv is None else argv)
@@ -87,28 +87,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise
         _discard_stdout()
-        report_failure("what this verb prints could not be written: no space left")
+        report_failure("cannot write to stdout: no space left")
         return 1
 
 
 def _open_closed_streams() -> None:
-    """What `>&-` closed leads to nowhere: else the next file, such as a journal, would get what is printed."""
+    """Open closed standard streams (`>&-`) on /dev/null; else the next opened file, such as a journal, gets output."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= LAST_STREAM:
         os.set_inheritable(number, True)
     os.close(number)
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115 - for good
+            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115 - never closed
 
 
 def _discard_stdout() -> None:
-    """What waits there cannot be written, and the interpreter would try again at its end."""
+    """Drop stdout's buffer, which cannot be written; else the interpreter would try again at exit."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:
-    """Find the verb that `words` begin with, parse the rest, run it; without a verb, `--help` lists them all."""
+    """Run the verb that `words` begin with, with the rest as its arguments; without a verb, show help and exit."""
     name = ".".join(words[:2]) if ".".join(words[:2]) in points else "".join(words[:1])
     if name not in points:
         _show_overview(points, words)
@@ -129,7 +129,7 @@ def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:
 
 
 def build_parser(name: str, verb: Configurable) -> Parser:
-    """The parser of one verb, with the flags that every verb has."""
+    """Build the parser of one verb, with the flags that every verb has."""
     from dreamfleet.common.cli.global_config import add_common_flags
 
     spoken = name.replace(".", " ")
@@ -152,7 +152,7 @@ def _load_verb(point: EntryPoint) -> Verb:
 
 
 def _show_overview(points: Mapping[str, EntryPoint], words: Sequence[str]) -> NoReturn:
-    """Answer words that name no verb: help, the version, or what is wrong with them."""
+    """Show help or the version, or report why `words` name no verb; never returns."""
     first = words[0] if words else ""
     group = [name for name in points if name.startswith(f"{first}.")] if first else []
     spoken = list(words[: 2 if group else 1])
@@ -173,7 +173,7 @@ def _top_level_names(points: Iterable[str]) -> list[str]:
 
 
 def _help_parser(prog: str, names: Iterable[str], points: Mapping[str, EntryPoint]) -> argparse.ArgumentParser:
-    """A parser whose help lists verbs and groups of verbs; a verb that cannot be loaded is listed as such."""
+    """A parser whose help lists verbs and groups of verbs; one that cannot be loaded is marked as broken."""
     parser = argparse.ArgumentParser(prog=prog, description=DESCRIPTION, epilog=EXIT_CODES)
     verbs = parser.add_subparsers(metavar="VERB")
     for name in sorted(names):
@@ -182,7 +182,7 @@ def _help_parser(prog: str, names: Iterable[str], points: Mapping[str, EntryPoin
             verbs.add_parser(spoken, help=_summary(points[name]).replace("%", "%%"))
         else:
             within = sorted(each.partition(".")[2] for each in points if each.startswith(f"{spoken}."))
-            verbs.add_parser(spoken, help=f"{', '.join(within)}: `dreamfleet {spoken} --help` tells each")
+            verbs.add_parser(spoken, help=f"{', '.join(within)}: see `dreamfleet {spoken} --help`")
     return parser
 
 

@@ -1,8 +1,8 @@
-"""Configuration: frozen dataclasses from defaults, a preset, a TOML file, environment and flags, in this order.
+"""Configuration: frozen dataclasses filled from defaults, a preset, a TOML file, the environment and flags.
 
-A section is one dataclass: `[run]` in TOML, `DREAMFLEET_RUN_...` in the environment, its field names as flags. The
-section without a name is the top of the file and `DREAMFLEET_...`. A key that no section knows is refused, with the
-nearest one named. The field `preset` of a section, where it has one, names the preset.
+Later sources in this list override earlier ones. A section is one dataclass: `[run]` in TOML, `DREAMFLEET_RUN_...` in
+the environment, its field names as flags. The unnamed section is the top of the file and `DREAMFLEET_...`. An unknown
+key is an error that suggests the nearest one. A section's field `preset`, if it has one, names the preset.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_BYTES = 1_000_000  # of a configuration file
 
 
 def option(default: Any, text: str) -> Any:
-    """A field with its default and the text that `--help` shows."""
+    """A dataclass field with its default and the text that `--help` shows."""
     return field(default=default, metadata={"help": text})
 
 
@@ -36,10 +36,10 @@ def add_flags(
     texts: Mapping[str, str] | None = None,
     default: str | None = None,
 ) -> None:
-    """A flag for each field of the sections, or for those named in `only`; absent flags leave no trace.
+    """Add a flag for each field of the sections that has a help text, or for those named in `only`.
 
-    A field without a help text has none.
-    `texts` replaces a field's help; `default` is shown instead of the defaults, where these are not what counts.
+    A flag that is not given sets nothing. `texts` replaces help texts by field name; `default` is shown in place of the
+    fields' defaults.
     """
     wanted = None if only is None else frozenset(only)
     for section in sections:
@@ -47,14 +47,14 @@ def add_flags(
         hints = get_type_hints(section)
         for each in _configurable_fields(section):
             if wanted is None or each.name in wanted:
-                text = (texts or {}).get(each.name) or each.metadata["help"] + _shown_default(each, default)
+                text = (texts or {}).get(each.name) or each.metadata["help"] + _default_text(each, default)
                 group.add_argument(_flag(each), **_flag_options(each, hints[each.name], text))
 
 
 def _group(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:
-    """The group of that title, which an earlier call may have made."""
-    made = next((each for each in parser._action_groups if each.title == title), None)
-    return made or parser.add_argument_group(title)
+    """The argument group of this title; created unless an earlier call did."""
+    existing = next((each for each in parser._action_groups if each.title == title), None)
+    return existing or parser.add_argument_group(title)
 
 
 def load(
@@ -67,10 +67,10 @@ def load(
     base: Table | None = None,
     preset: Callable[[str], Table] | None = None,
 ) -> T:
-    """The section `name`, each key from the strongest source that has it; `UsageError` for an unknown key or value.
+    """Load the section `name`; `UsageError` for an unknown key or an invalid value.
 
-    Weaker than every other source is what `preset` finds under the name that the key of that name has; weaker still
-    is `base`.
+    Precedence, highest first: flags, environment, file, `preset` (called with the value of the key `preset`), `base`,
+    the dataclass's defaults.
     """
     known = _field_types(section)
     chosen = given(section, name, file, environment)
@@ -80,7 +80,7 @@ def load(
 
 
 def given(section: type[Any], name: str, file: Table | None, environment: Mapping[str, str] | None) -> dict[str, Any]:
-    """What the file and the environment say of the section `name`, checked."""
+    """The checked values of the section `name` in the file and the environment."""
     known = _field_types(section)
     table = (file or {}).get(name, {}) if name else {key: (file or {})[key] for key in known if key in (file or {})}
     return {
@@ -90,7 +90,7 @@ def given(section: type[Any], name: str, file: Table | None, environment: Mappin
 
 
 def read_table(section: type[Any], where: str, table: Table) -> dict[str, Any]:
-    """The values of a table, each of its field's type; `UsageError` for what does not fit, saying `where`."""
+    """The values of a TOML table, converted to its fields' types; `UsageError` names `where` a value is wrong."""
     known = _field_types(section)
     return _from_table(known, where, table)
 
@@ -98,14 +98,14 @@ def read_table(section: type[Any], where: str, table: Table) -> dict[str, Any]:
 def read_toml(
     path: Path | None, tables: Iterable[str], top: Iterable[str] = (), arrays: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """A configuration file: its tables, arrays of tables, and the keys before the first of them; others are refused."""
+    """Read a configuration file with these tables, arrays of tables and top-level keys; `UsageError` for others."""
     if path is None:
         return {}
     try:
         table = tomllib.loads(read_text(path, MAX_BYTES))
     except FileNotFoundError:
         raise UsageError(f"no configuration file at {path}") from None
-    except (OSError, ValueError, RecursionError) as error:  # a number of 5,000 digits is no `TOMLDecodeError`
+    except (OSError, ValueError, RecursionError) as error:  # a number of 5,000 digits is a plain ValueError
         raise UsageError(f"{path} cannot be read as TOML: {error}") from error
     known, keys, repeated = sorted(tables), sorted(top), sorted(arrays)
     for name, value in table.items():
@@ -138,7 +138,7 @@ def _from_environment(known: Mapping[str, Any], section: str, environment: Mappi
         if not variable.startswith(prefix):
             continue
         if not section and variable.removeprefix(prefix).lower() not in known:
-            continue  # of another section
+            continue  # belongs to another section
         key = variable.removeprefix(prefix).lower()
         if key not in known:
             names = [prefix + each.upper() for each in known]
@@ -148,7 +148,7 @@ def _from_environment(known: Mapping[str, Any], section: str, environment: Mappi
 
 
 def _convert_toml_value(hint: Any, value: Any, where: str) -> Any:
-    """A TOML value as the field's type."""
+    """Convert a TOML value to the field's type."""
     base = _without_none(hint)
     if get_origin(base) is tuple and isinstance(value, list) and all(isinstance(item, str) for item in value):
         return tuple(value)
@@ -164,10 +164,10 @@ def _convert_toml_value(hint: Any, value: Any, where: str) -> Any:
 
 
 def _parse_text(hint: Any, text: str, where: str) -> Any:
-    """Text of an environment variable or a flag as the field's type."""
+    """Convert the text of an environment variable to the field's type."""
     base = _without_none(hint)
     if base is Path and base is not hint and not text:
-        return None  # as where nothing is said: an empty path would be the folder that one is in
+        return None  # as if unset: an empty path would be the current folder
     if get_origin(base) is tuple:
         return tuple(part for part in text.split(",") if part)
     if base is bool and text in ("true", "false"):
@@ -183,7 +183,7 @@ def _parse_text(hint: Any, text: str, where: str) -> Any:
 
 
 def _without_none(hint: Any) -> Any:
-    """The type without its `| None`."""
+    """The type without `| None`."""
     if get_origin(hint) in (Union, types.UnionType):
         return next(option for option in get_args(hint) if option is not type(None))
     return hint
@@ -202,10 +202,10 @@ def _flag(each: Field[Any]) -> str:
     return "--" + each.name.replace("_", "-")
 
 
-def _shown_default(each: Field[Any], instead: str | None) -> str:
+def _default_text(each: Field[Any], replacement: str | None) -> str:
     default = each.default if each.default is not MISSING else None
     shown = "" if default in (None, (), False, "") else str(default)
-    return f" (default {instead or shown})" if instead or shown else ""
+    return f" (default {replacement or shown})" if replacement or shown else ""
 
 
 def _flag_options(each: Field[Any], hint: Any, text: str) -> dict[str, Any]:
@@ -221,25 +221,25 @@ def _flag_options(each: Field[Any], hint: Any, text: str) -> dict[str, Any]:
 
 
 class _TupleAction(argparse.Action):
-    """Stores what was given as a tuple, as the dataclass wants it."""
+    """Stores the values as a tuple, the type of the dataclass's field."""
 
     def __call__(self, _parser: Any, namespace: argparse.Namespace, values: Any, _flag: str | None = None) -> None:
         setattr(namespace, self.dest, tuple(values))
 
 
 def _field_types(section: type[Any]) -> dict[str, Any]:
-    """The type of each field that can be said."""
+    """The type of each configurable field, by name."""
     hints = get_type_hints(section)
     return {each.name: hints[each.name] for each in _configurable_fields(section)}
 
 
 def _configurable_fields(section: type[Any]) -> list[Field[Any]]:
-    """The fields that have a help text: others are a caller's alone."""
+    """The fields with a help text; only the code sets the others."""
     return [each for each in fields(section) if "help" in each.metadata]
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """The end of a sentence about an unknown name: the near one, or all of them."""
+    """The end of an error text about an unknown name: the nearest known name, or all of them."""
     names = list(known)
     near = difflib.get_close_matches(name, names, n=1)
     return f": did you mean {near[0]!r}?" if near else f"; known are {', '.join(names)}"

@@ -1,7 +1,6 @@
-"""The surroundings of every verb: where the fleet is reached, where runs live, how much is said.
+"""Settings that all verbs share: addresses of the fleet, the folder of runs, logging.
 
-In a TOML file these keys stand at the top, before any table; in the environment they are `DREAMFLEET_CONNECT` and the
-like.
+In a TOML file these keys come first, before any table; in the environment they are `DREAMFLEET_CONNECT` and so on.
 """
 
 from __future__ import annotations
@@ -23,27 +22,29 @@ from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, 
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, Network, check_endpoint
 
 log = logging.getLogger(__name__)
-ARRAYS = ("stage", "host")  # tables that a file may hold several of
-# Of every verb: one file serves all of them.
+ARRAYS = ("stage", "host")  # arrays of tables
+# The tables of every verb: all verbs may share one file.
 TABLES = ("run", "limits", "network", "worker", "dashboard", "demo", "iterate", "router", "spawn")
 OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG")
 PREFIX = "DREAMFLEET_"
-SIMILARITY_CUTOFF = 0.75  # how near a name must be to a known one to be taken for a slip of the hand
+SIMILARITY_CUTOFF = 0.75  # similarity to a known name from which an unknown variable counts as a typing error
 
 
 @dataclass(frozen=True)
 class GlobalConfig:
-    """What every verb may need; a verb offers as flags what it uses."""
+    """The shared settings; each verb has flags for those that it uses."""
 
     connect: tuple[str, ...] = option((), f"the run's router, or several to try (default {DEFAULT_ENDPOINT})")
     listen: tuple[str, ...] = option((), f"listen here (default {DEFAULT_ENDPOINT}, unless --connect is given)")
     join: Path | None = option(  # noqa: RUF009 - as below
-        None, "join file of `dreamfleet access issue`: where the fleet is, and as whom this joins it, over TLS"
+        None, "join file of `dreamfleet access issue`: the fleet's address and this program's credentials for TLS"
     )
-    access_dir: Path = option(Path("access"), "where the fleet's own authority lies, and what it revoked")  # noqa: RUF009
+    access_dir: Path = option(  # noqa: RUF009 - as below
+        Path("access"), "folder of the fleet's certificate authority and its list of revoked files"
+    )
     runs_dir: Path = option(Path("runs"), "where runs live")  # noqa: RUF009 - a field, and paths do not change
-    log_level: Literal["debug", "info", "warning", "error"] = option("info", "the least that is logged on stderr")
-    log_format: Literal["text", "json", "auto"] = option("text", "as lines, as JSON, or auto: JSON but in a terminal")
+    log_level: Literal["debug", "info", "warning", "error"] = option("info", "lowest level that is logged on stderr")
+    log_format: Literal["text", "json", "auto"] = option("text", "text, json, or auto: text in a terminal, else JSON")
 
     def __post_init__(self) -> None:
         for endpoint in (*self.connect, *self.listen):
@@ -51,40 +52,37 @@ class GlobalConfig:
 
 
 def add_global_flags(parser: argparse.ArgumentParser, *names: str, texts: Mapping[str, str] | None = None) -> None:
-    """Flags for some of the site's settings; `texts` says what is meant here where the common text does not fit.
-
-    Whatever connects may do so with a join file.
-    """
+    """Add flags for these shared settings, and `--join` with `connect`; `texts` replaces help texts by name."""
     add_flags(parser, GlobalConfig, only=(*names, *(("join",) if "connect" in names else ())), texts=texts)
 
 
 def add_run_argument(parser: argparse.ArgumentParser) -> None:
-    """The live run that a verb is about, `args.run_name`: by its name alone, or behind `--run`."""
-    told = "name of the run (default: the only live one)"
-    parser.add_argument("run_name", nargs="?", metavar="RUN", default=argparse.SUPPRESS, help=told)
+    """Add `args.run_name`, the live run that a verb acts on: as `RUN` or as `--run RUN`."""
+    text = "name of the run (default: the only live one)"
+    parser.add_argument("run_name", nargs="?", metavar="RUN", default=argparse.SUPPRESS, help=text)
     parser.add_argument("--run", dest="run_name", metavar="RUN", help="the same")
 
 
 def add_common_flags(parser: argparse.ArgumentParser) -> None:
-    """The flags that each verb has."""
+    """Add the flags that every verb has."""
     parser.add_argument("--config", type=Path, help="TOML file with settings (default $DREAMFLEET_CONFIG, else none)")
     add_global_flags(parser, "log_level", "log_format")
     parser.add_argument(
         "-q", "--quiet", dest="log_level", action="store_const", const="warning", default=argparse.SUPPRESS,
-        help="log warnings and errors alone, and draw no progress bar",
+        help="log only warnings and errors, and draw no progress bar",
     )  # fmt: skip
 
 
 def read_config_file(path: Path | None) -> dict[str, Any]:
-    """A configuration file of any verb."""
+    """Read a configuration file; it may hold the settings of any verb."""
     return read_toml(path, TABLES, top=[each.name for each in fields(GlobalConfig)], arrays=ARRAYS)
 
 
 def complete_arguments(args: argparse.Namespace, environment: Mapping[str, str] = os.environ) -> None:
-    """Complete parsed arguments from the file and the environment, and set how much is logged.
+    """Complete parsed arguments from the file and the environment, and configure logging.
 
-    Afterwards `args` has `global_config` (`resolve_network` fills in the default addresses of the fleet), `sources` for
-    `config.load` of a verb's own sections, and `given`: the names of the flags that were given.
+    Sets `args.global_config` (`resolve_network` adds default addresses), `args.sources` for `config.load` of the verb's
+    own sections, and `args.given`, the names of the flags on the command line.
     """
     given = frozenset(vars(args))
     path = args.config or (Path(environment[f"{PREFIX}CONFIG"]) if environment.get(f"{PREFIX}CONFIG") else None)
@@ -99,14 +97,14 @@ def complete_arguments(args: argparse.Namespace, environment: Mapping[str, str] 
 
 
 def load_credentials(args: argparse.Namespace, roles: Collection[str] = ()) -> Credentials | None:
-    """What the join file holds, if there is one; `AccessError` if it is of none of the `roles` that this verb needs."""
+    """Read the join file, if one is set; `AccessError` if its role is not among `roles` (empty: any role)."""
     path: Path | None = args.global_config.join
     if path is None:
         return None
     credentials = read_join_file(path)
     if roles and credentials.role not in roles:
         raise AccessError(
-            f"{path} is a {credentials.role}'s, and this needs one whose role is {' or '.join(roles)}: have it issued "
+            f"{path} is for the role {credentials.role}, and this needs {' or '.join(roles)}: have it issued "
             f"with `dreamfleet access issue {next(iter(roles))} NAME --out FILE`"
         )
     left = credentials.time_left(datetime.now(UTC))
@@ -117,14 +115,14 @@ def load_credentials(args: argparse.Namespace, roles: Collection[str] = ()) -> C
 
 
 def resolve_network(args: argparse.Namespace, *roles: str) -> Network:
-    """Where the fleet is found, and as whom: where flags, environment or file say, else where the join file does."""
+    """The fleet's address and this program's credentials; the join file's address if none is configured."""
     credentials = load_credentials(args, roles)
     found = credentials.connect if credentials is not None else ()
     return Network(connect=args.global_config.connect or found or (DEFAULT_ENDPOINT,), credentials=credentials)
 
 
 def _check_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Our own variables; one that resembles a known one is refused, for it would be overlooked."""
+    """The variables that begin with `PREFIX`; `UsageError` for an unknown one that resembles a known one."""
     known = [PREFIX + each.name.upper() for each in fields(GlobalConfig)]
     found = {name: text for name, text in environment.items() if name.startswith(PREFIX)}
     for name in found:

@@ -18,7 +18,7 @@ from dreamfleet.common.host.packages import PACKAGES, install_command, package_v
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left, read_join_file
 
 GROUP = "dreamfleet.checks"
-# What a role stands on, as findings name it; but for the coordinator's, the extra of that name installs the last part.
+# The `Finding.role`s that each role needs. The extra of the last one's name installs it, except for the coordinator.
 ROLES = {
     "coordinator": ("everything", "coordinator"),
     "worker": ("everything", "worker"),
@@ -32,10 +32,7 @@ MIN_FREE_BYTES = 200_000_000
 
 @dataclass(frozen=True)
 class Finding:
-    """One check: what was found, what it is for, whether that cannot do without it, and what to do if it lacks.
-
-    `role` is `everything` or one of `ROLES`.
-    """
+    """The result of one check; `role` is `everything` or one of `ROLES`, `needed` whether that role requires it."""
 
     name: str
     ok: bool
@@ -46,7 +43,7 @@ class Finding:
 
 
 def run_checks(runs_dir: Path, join: Path | None = None) -> list[Finding]:
-    """Every check, ours, of a join file that is used, and those that the sides register under `dreamfleet.checks`."""
+    """Run all checks: those of this module, of the join file if any, and those in the entry points `GROUP`."""
     registered = [finding for point in entry_points(group=GROUP) for finding in point.load()()]
     folders = [
         _check_writable("cache", default_cache(), "everything"),
@@ -57,7 +54,7 @@ def run_checks(runs_dir: Path, join: Path | None = None) -> list[Finding]:
 
 
 def _check_join_file(path: Path) -> Finding:
-    """Whether it lets anybody in, and for how long; a week before its end it is no more as it should be."""
+    """Whether a join file is valid; not ok within `EXPIRY_WARNING` of its end."""
     try:
         credentials = read_join_file(path)
     except AccessError as error:
@@ -69,7 +66,7 @@ def _check_join_file(path: Path) -> Finding:
 
 
 def missing_for_role(role: str, findings: list[Finding]) -> list[Finding]:
-    """What keeps this installation from a role; empty if it can be played."""
+    """The failed checks that a role requires; empty if this installation can take the role."""
     return [each for each in findings if each.role in ROLES[role] and each.needed and not each.ok]
 
 
@@ -99,7 +96,7 @@ def _check_bundles() -> Iterator[Finding]:
 
 
 def _check_writable(name: str, path: Path, role: str) -> Finding:
-    """Whether a folder, or the nearest parent that exists, can be written and has room."""
+    """Whether a folder, or its nearest existing parent, is writable and has room."""
     where = next(each for each in (path, *path.absolute().parents) if each.exists())
     remedy = f"make {where} writable, or point $DREAMFLEET_{'CACHE' if name == 'cache' else 'RUNS_DIR'} elsewhere"
     try:

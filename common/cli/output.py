@@ -1,4 +1,4 @@
-"""What a verb answers: tables for people, tab-separated lines for pipes, JSON where it is asked for."""
+"""Output of verbs on stdout: tables in a terminal, tab-separated lines in a pipe, JSON with `--json`."""
 
 from __future__ import annotations
 
@@ -13,31 +13,28 @@ from dreamfleet.common.printable import one_line, printable_lines
 if TYPE_CHECKING:
     from rich.table import Table
 
-WIDEST = 10_000  # columns: where nothing is cut any more
-PREFERRED_LAST_WIDTH, MIN_LAST_WIDTH = (
-    24,
-    12,
-)  # columns that a last one of long texts has before others are left out for it, and at least
+UNLIMITED_WIDTH = 10_000  # columns: a console on which nothing is truncated
+PREFERRED_LAST_WIDTH = 24  # columns of the last column of a table; other columns are dropped to make room for them
+MIN_LAST_WIDTH = 12
 
 
 def add_json_flag(parser: argparse.ArgumentParser) -> None:
-    """The flag `--json` of a verb that answers."""
+    """Add the flag `--json`."""
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
 def print_answer(args: argparse.Namespace, text: str, **facts: object) -> None:
-    """Print `text`, or with `--json` the facts as one line."""
-    print(json.dumps(facts, default=str) if args.json else printable_lines(text), flush=True)  # noqa: T201 - what a verb answers
+    """Print `text`, or with `--json` the facts as one line of JSON."""
+    print(json.dumps(facts, default=str) if args.json else printable_lines(text), flush=True)  # noqa: T201 - a verb's output
 
 
 def print_rows(
     rows: Sequence[Mapping[str, object]], right: Collection[str] = (), drop_order: Sequence[str] = ()
 ) -> None:
-    """Print rows of the same keys under their names: nothing is cut, in a terminal or in a pipe.
+    """Print rows that have the same keys, under a heading of the keys. No cell is truncated.
 
-    In a terminal a table, the columns in `right` aligned so. Where it is too narrow the columns in `drop_order` are
-    left out one by one, which is said below; then texts of the last column go on in further lines. In a pipe,
-    tab-separated lines.
+    In a terminal, a table with the columns in `right` right-aligned. If it is too wide, columns are left out in
+    `drop_order`, with a note below; then the last column wraps. In a pipe, tab-separated lines.
     """
     if not rows:
         return
@@ -71,7 +68,7 @@ def _print_table(rows: Sequence[Mapping[str, object]], right: Collection[str], d
 def _build_table(
     rows: Sequence[Mapping[str, object]], right: Collection[str], left_out: Collection[str], last: int | None = None
 ) -> Table:
-    """All but some columns; `last` is the most that the last one takes."""
+    """The table without the columns `left_out`; `last` is the last column's maximum width."""
     from rich.table import Table
     from rich.text import Text
 
@@ -80,17 +77,16 @@ def _build_table(
     for name in names:
         justify: Literal["right", "left"] = "right" if name in right else "left"
         ends = name == names[-1]
-        most = last if ends else None
-        table.add_column(name, justify=justify, no_wrap=not ends, overflow="fold", max_width=most)
+        table.add_column(name, justify=justify, no_wrap=not ends, overflow="fold", max_width=last if ends else None)
     for row in rows:
-        table.add_row(*(Text(_format_cell(row[name])) for name in names))  # no markup: they may come from outside
+        table.add_row(*(Text(_format_cell(row[name])) for name in names))  # `Text`: untrusted text is no markup
     return table
 
 
 def _table_width(table: Table) -> int:
-    """Columns that it takes."""
+    """The width of a table at which nothing is truncated."""
     from rich.console import Console
     from rich.measure import Measurement
 
-    console = Console(width=WIDEST)
+    console = Console(width=UNLIMITED_WIDTH)
     return Measurement.get(console, console.options, table).maximum

@@ -1,6 +1,7 @@
-"""The names of all kinds of presets: settings of a run, amounts and layers of training, and learning baselines.
+"""Names of presets: of a run's settings, of a training's settings, and of learning baselines.
 
-Each side holds its own settings; the names stand here, so that either can say that a name is the other's.
+The coordinator and the worker define their own presets. The names are here so that an error can say which verb knows a
+preset of that name.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ VERBS: dict[Kind, str] = {
 
 
 def check_preset(kind: Kind, name: str) -> str:
-    """Return `name` if such a preset exists, else raise `UsageError`; it says if the name is one of the other kind."""
+    """Return `name` if a preset of this kind has it, else raise `UsageError`, with a hint if another kind has it."""
     if name in NAMES[kind]:
         return name
     others = [other for other in NAMES if name in NAMES[other]]
@@ -30,7 +31,7 @@ def check_preset(kind: Kind, name: str) -> str:
 
 
 def preset_help_text(kind: Kind) -> str:
-    """What `--help` says of the presets of one kind."""
-    told = f"{kind} preset to begin with: {', '.join(NAMES[kind])}"
-    kept = "; a data set keeps the one that it was begun with, and each verb must name it unless it is tiny"
-    return f"{told} (default tiny{kept})" if kind == "training" else told
+    """The `--help` text for the presets of one kind."""
+    text = f"{kind} preset to begin with: {', '.join(NAMES[kind])}"
+    note = "; a data set stores its preset, and each verb must name that one unless it is tiny"
+    return f"{text} (default tiny{note})" if kind == "training" else text

@@ -1,1 +1,1 @@
-"""Files: atomic writes, bounded archives, folder locks, event files."""
+"""Files: atomic writes, bounded archives, locks, TensorBoard event files."""

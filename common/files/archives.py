@@ -1,7 +1,7 @@
-"""Zip archives and `.npz` files that people pass around, read within bounds: none asks for more than it may have.
+"""Reading zip archives and `.npz` files from untrusted sources within bounds, and writing reproducible zips.
 
-Every reader of a bundle, a controller, a rollout or an optimiser's state goes through here. What an archive declares is
-bounded before it is read, and what is read is what was declared. No pickle, no code, no file beside it.
+Every reader of a bundle, a controller, a rollout or an optimiser's state uses this module. Declared sizes are checked
+before anything is unpacked, and unpacked sizes against the declared ones. Pickle is never loaded.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from dreamfleet.common.files.regular_files import open_regular
 
 Arrays = dict[str, NDArray[Any]]
 NPY = ".npy"
-_END, _END_64, _END_BYTES = b"PK\5\6", b"PK\6\7", 22  # of the record that closes an archive, and of its locator
-_DIRECTORY_BYTES = 512  # of one member's entry at most, on average
-_ENCRYPTED = 1
+_END, _END_64, _END_BYTES = b"PK\5\6", b"PK\6\7", 22  # end-of-archive record: mark, its zip64 locator's mark, length
+_DIRECTORY_BYTES = 512  # maximum average length of a directory entry
+_ENCRYPTED = 1  # bit of a member's flags
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date of a zip
 _MAGIC = b"\x93NUMPY"
 _MAX_HEADER = 10_000
 _HEADER = re.compile(
@@ -40,59 +41,59 @@ _ZIP_ERRORS = (BadZipFile, zlib.error, struct.error, EOFError, KeyError, NotImpl
 
 
 class DamagedArchiveError(ValueError):
-    """What is wrong with an archive, in a few words; its reader says which file it is, and the remedy."""
+    """An archive is damaged or out of bounds; the reader adds the file's name and the remedy."""
 
 
 @dataclass(frozen=True)
 class ArchiveLimits:
-    """How much an archive may hold: members, and bytes of them all when unpacked."""
+    """The maximum number of members of an archive, and of their unpacked bytes together."""
 
     size: int
     members: int = 64
 
 
 class Archive:
-    """An archive whose directory has been looked at."""
+    """An open archive whose directory is within its limits."""
 
     def __init__(self, archive: ZipFile, limits: ArchiveLimits) -> None:
         self._archive = archive
         self._members = {each.filename: each for each in archive.infolist()}
         if len(self._members) < len(archive.infolist()):
-            raise DamagedArchiveError("two of its members have one name")
+            raise DamagedArchiveError("two of its members have the same name")
         if len(self._members) > limits.members:
-            raise DamagedArchiveError(f"it has {len(self._members)} members, {limits.members} at most are read")
+            raise DamagedArchiveError(f"it has {len(self._members)} members, and at most {limits.members} are read")
         if (size := sum(each.file_size for each in self._members.values())) > limits.size:
-            raise DamagedArchiveError(f"it unpacks to {size >> 20} MiB, {limits.size >> 20} at most are read")
+            raise DamagedArchiveError(f"it unpacks to {size >> 20} MiB, and at most {limits.size >> 20} are read")
 
     @property
     def names(self) -> frozenset[str]:
-        """Names of its members."""
+        """The names of its members."""
         return frozenset(self._members)
 
-    def read(self, name: str, most: int | None = None) -> bytes:
-        """The bytes of one member, no more than were declared and no more than `most`."""
-        member = self._find_member(name, most)
+    def read(self, name: str, max_bytes: int | None = None) -> bytes:
+        """Read one member; `DamagedArchiveError` if it has more than `max_bytes` or not its declared size."""
+        member = self._find_member(name, max_bytes)
         with self._archive.open(member) as file:
-            data = file.read(member.file_size + 1)  # to its end, where its checksum is looked at
+            data = file.read(member.file_size + 1)  # past its end: zipfile checks the checksum there
         if len(data) != member.file_size:
             raise DamagedArchiveError(f"{name} is not as long as it says")
         return data
 
-    def _find_member(self, name: str, most: int | None) -> ZipInfo:
+    def _find_member(self, name: str, max_bytes: int | None) -> ZipInfo:
         if (member := self._members.get(name)) is None:
             raise DamagedArchiveError(f"it holds no {name}")
         if member.flag_bits & _ENCRYPTED:
             raise DamagedArchiveError(f"{name} is encrypted")
         if member.compress_type not in (ZIP_STORED, ZIP_DEFLATED):
-            raise DamagedArchiveError(f"{name} is packed in an unknown way")
-        if most is not None and member.file_size > most:
-            raise DamagedArchiveError(f"{name} unpacks to {member.file_size} bytes, {most} at most are read")
+            raise DamagedArchiveError(f"{name} has an unknown compression method")
+        if max_bytes is not None and member.file_size > max_bytes:
+            raise DamagedArchiveError(f"{name} unpacks to {member.file_size} bytes, and at most {max_bytes} are read")
         return member
 
 
 @contextmanager
 def open_archive(file: BinaryIO, limits: ArchiveLimits) -> Iterator[Archive]:
-    """An archive in an open file; `DamagedArchiveError` for whatever is wrong with it, also while it is read."""
+    """Open the archive in an open file; every fault of it, also inside the context, is a `DamagedArchiveError`."""
     try:
         _check_end(file, limits)
         with ZipFile(file) as archive:
@@ -104,36 +105,36 @@ def open_archive(file: BinaryIO, limits: ArchiveLimits) -> Iterator[Archive]:
 
 
 def read_arrays(source: Path | bytes, limits: ArchiveLimits, names: Iterable[str] | None = None) -> Arrays:
-    """The arrays of an `.npz`, or those of these `names`; `OSError` or `DamagedArchiveError` says why not."""
+    """Read the arrays of an `.npz`, or only those of these `names`; `OSError` or `DamagedArchiveError` on failure."""
     with _open_source(source, limits) as file, open_archive(file, limits) as archive:
         wanted = [each.removesuffix(NPY) for each in archive.names] if names is None else names
         return {each: parse_array(archive.read(each + NPY), each) for each in wanted}
 
 
 def parse_array(data: bytes, name: str = "it") -> NDArray[Any]:
-    """The array in the bytes of an `.npy`: of numbers or texts, exactly as long as its header says."""
+    """Parse an `.npy` of numbers or text; `DamagedArchiveError` unless its length fits its header."""
     start, text = _header(data, name)
     found = _HEADER.fullmatch(text)
     if found is None:
-        raise DamagedArchiveError(f"{name} is no array of numbers or texts")
+        raise DamagedArchiveError(f"{name} is not an array of numbers or texts")
     shape = tuple(int(each) for each in found[3].split(",") if each.strip())
     try:
-        kind = np.dtype(found[1])
-        if not kind.itemsize or math.prod(shape) * kind.itemsize != len(data) - start:
+        dtype = np.dtype(found[1])
+        if not dtype.itemsize or math.prod(shape) * dtype.itemsize != len(data) - start:
             raise DamagedArchiveError(f"{name} is not as long as its header says")
-        flat = np.frombuffer(data, kind, offset=start)
+        flat = np.frombuffer(data, dtype, offset=start)
         array = flat.reshape(shape[::-1]).T if found[2] == "True" else flat.reshape(shape)
     except (TypeError, ValueError) as error:
-        raise DamagedArchiveError(f"{name} is no array of numbers or texts ({_describe_error(error)})") from error
-    if kind.kind == "U":
-        _check_text(data[start:], kind, name)
-    return array.copy(order="K")  # of its own memory, in the order in which it was kept
+        raise DamagedArchiveError(f"{name} is not an array of numbers or texts ({_describe_error(error)})") from error
+    if dtype.kind == "U":
+        _check_text(data[start:], dtype, name)
+    return array.copy(order="K")  # own memory in the stored order
 
 
 def _header(data: bytes, name: str) -> tuple[int, str]:
-    """Where the numbers begin, and the text that says what they are."""
+    """The offset of the data in an `.npy`, and the text of its header."""
     if data[:6] != _MAGIC or len(data) < 12:
-        raise DamagedArchiveError(f"{name} is no array")
+        raise DamagedArchiveError(f"{name} is not an array")
     field = "<H" if data[6] == 1 else "<I"
     start = 8 + struct.calcsize(field)
     (length,) = struct.unpack_from(field, data, 8)
@@ -142,12 +143,19 @@ def _header(data: bytes, name: str) -> tuple[int, str]:
     return start + length, data[start : start + length].decode("latin-1")
 
 
-def _check_text(data: bytes, kind: np.dtype[Any], name: str) -> None:
-    """NumPy itself looks at a text's characters only once it is asked for."""
+def _check_text(data: bytes, dtype: np.dtype[Any], name: str) -> None:
+    """`DamagedArchiveError` for invalid characters, which NumPy would report only on access."""
     try:
-        data.decode("utf-32-be" if kind.byteorder == ">" else "utf-32-le")
+        data.decode("utf-32-be" if dtype.byteorder == ">" else "utf-32-le")
     except UnicodeError as error:
-        raise DamagedArchiveError(f"{name} is no text") from error
+        raise DamagedArchiveError(f"{name} is not text") from error
+
+
+def write_archive(file: BinaryIO | Path, members: Iterable[tuple[str, bytes]], compression: int = ZIP_STORED) -> None:
+    """Write a zip of these members without dates: equal members give equal bytes."""
+    with ZipFile(file, "w", compression) as archive:
+        for name, data in members:
+            archive.writestr(ZipInfo(name, _EPOCH), data, compression)
 
 
 @contextmanager
@@ -160,7 +168,7 @@ def _open_source(source: Path | bytes, limits: ArchiveLimits) -> Iterator[Binary
 
 
 def _check_end(file: BinaryIO, limits: ArchiveLimits) -> None:
-    """Bound the directory, which `zipfile` reads whole: an archive of ours has no comment and is no `zip64`."""
+    """Bound the directory before `zipfile` reads it whole. Only archives without comment and zip64 pass."""
     size = file.seek(0, io.SEEK_END)
     file.seek(max(0, size - _END_BYTES - 20))
     tail = file.read(_END_BYTES + 20)
@@ -175,5 +183,5 @@ def _check_end(file: BinaryIO, limits: ArchiveLimits) -> None:
 
 
 def _describe_error(error: Exception) -> str:
-    """What an exception says, or what it is."""
+    """An exception's text in one line, or the name of its type."""
     return " ".join(str(error.args[0]).split()) if error.args else type(error).__name__

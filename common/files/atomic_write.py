@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and the `--out` of verbs: checked before minutes of work."""
+"""Atomic writes, and checks of a verb's `--out` before it works for minutes."""
 
 from __future__ import annotations
 
@@ -8,36 +8,36 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.errors import DatasetError, DreamfleetError, UsageError
 from dreamfleet.common.files.regular_files import check_replaceable, is_folder
 
 
 def check_output_path(path: Path) -> None:
-    """`UsageError` where no file can be written; its folder is made."""
+    """Create the folder of `path`; `UsageError` if no file can be written there."""
     if is_folder(path):
         raise UsageError(f"--out {path} is a folder: name a file in it")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
-        raise UsageError(f"--out {path}: its folder cannot be made ({error}): choose another") from error
+        raise UsageError(f"--out {path}: its folder cannot be created ({error}): choose another") from error
     if not os.access(path.parent, os.W_OK):
-        raise UsageError(f"--out {path}: its folder cannot be written in: choose another")
+        raise UsageError(f"--out {path}: its folder is not writable: choose another")
     try:
         check_replaceable(path)
     except OSError as error:
-        raise UsageError(f"--out {path}: {error.strerror}: name another") from error
+        raise UsageError(f"--out {path}: {error.strerror}: choose another") from error
 
 
 @contextmanager
 def open_output(path: Path) -> Iterator[BinaryIO]:
-    """Open what `--out` names for writing; it is whole or not there."""
+    """Open the file that `--out` names for an atomic write; `DreamfleetError` on failure."""
     with reporting_write_errors(path), atomic_write(path) as file:
         yield file
 
 
 @contextmanager
 def reporting_write_errors(path: Path, flag: str = "--out") -> Iterator[None]:
-    """What cannot be written at `path`, which `flag` names, is a `DreamfleetError`."""
+    """Turn an `OSError` while writing `path` into a `DreamfleetError`; `flag` names the path on the command line."""
     try:
         yield
     except OSError as error:
@@ -45,13 +45,22 @@ def reporting_write_errors(path: Path, flag: str = "--out") -> Iterator[None]:
 
 
 @contextmanager
+def reporting_unwritable_folder(
+    folder: Path, remedy: str, error_type: type[DreamfleetError] = DatasetError
+) -> Iterator[None]:
+    """Turn an `OSError` while writing in `folder` into an `error_type` that ends with the `remedy`."""
+    try:
+        yield
+    except OSError as error:
+        raise error_type(f"cannot write in {folder}: {error.strerror}; {remedy}") from error
+
+
+@contextmanager
 def atomic_write(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
-    """Open a neighbour of `path` for writing; on success it is synced and takes the name, on failure it vanishes.
+    """Open a temporary file beside `path`; on success it is synced and replaces `path`, on failure it is deleted.
 
-    A `private` file is its owner's alone (mode 600), from the first byte on.
-
-    The folder is synced too: a name that a power cut takes back would be no file at all. `OSError` where there is
-    something that is no file: a device would become one.
+    A `private` file has mode 600 from the first byte on. The folder is synced too, so that the new name survives a
+    power cut. `OSError` if `path` exists and is not a regular file: a device would be replaced by a file.
     """
     check_replaceable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,17 +79,17 @@ def atomic_write(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
 def _open_for_writing(path: Path, private: bool) -> BinaryIO:
     if not private:
         return path.open("wb")
-    path.unlink(missing_ok=True)  # one of another mode
+    path.unlink(missing_ok=True)  # a leftover may have another mode
     return open_new(path)
 
 
 def open_new(path: Path) -> BinaryIO:
-    """Open a file that is its owner's alone (mode 600) for writing; `FileExistsError` if there is any."""
+    """Create a file with mode 600 and open it for writing; `FileExistsError` if it exists."""
     return open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "wb")  # noqa: PTH123
 
 
 def fsync_path(path: Path) -> None:
-    """Make a file's bytes, or the names in a folder, durable."""
+    """Sync a file's bytes, or the names in a folder, to disk."""
     number = os.open(path, os.O_RDONLY)
     try:
         os.fsync(number)

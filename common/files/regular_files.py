@@ -1,4 +1,4 @@
-"""Files of others, which may be anything: only regular files are opened, within bounds."""
+"""Opening untrusted paths: only regular files, up to a maximum size."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from typing import BinaryIO
 
 
 @contextmanager
-def open_regular(path: Path, most: int = sys.maxsize) -> Iterator[BufferedReader]:
-    """Open a file of at most so many bytes for reading; `OSError` for what is none.
+def open_regular(path: Path, max_bytes: int = sys.maxsize) -> Iterator[BufferedReader]:
+    """Open a regular file of at most `max_bytes` for reading; `OSError` for anything else and for invalid names.
 
-    A pipe or a device is none: to read it might never end. A name that no file can have is an `OSError` too.
+    Reading a pipe or a device might never end.
     """
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except ValueError as error:  # a NUL, or half a surrogate pair
         raise OSError(errno.EINVAL, "no file can have this name") from error
-    with open(number, "rb") as file:  # noqa: PTH123 - it is open
-        _check_regular_size(os.fstat(number), most)
+    with open(number, "rb") as file:  # noqa: PTH123 - a descriptor
+        _check_regular_size(os.fstat(number), max_bytes)
         yield file
 
 
 def open_append(path: Path) -> BinaryIO:
-    """Open a file to append to it, which is made if it is not there; `OSError` for what is none.
+    """Open or create a regular file for appending; `OSError` for anything else.
 
-    No link is followed: in a folder that others may write in, it would lead to a file of the user's own.
+    Symbolic links are not followed: in a folder that others can write, one could point to another file of the user.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-    file = open(os.open(path, flags, 0o666), "ab")  # noqa: SIM115, PTH123 - it is open, and the caller's
+    file = open(os.open(path, flags, 0o666), "ab")  # noqa: SIM115, PTH123 - the caller closes it
     try:
         _check_regular_size(os.fstat(file.fileno()), sys.maxsize)
     except OSError:
@@ -44,9 +44,9 @@ def open_append(path: Path) -> BinaryIO:
 
 
 def check_regular(path: Path) -> None:
-    """`OSError` for what is no file that can be read to its end; it is looked at, and not opened.
+    """`OSError` unless `path` is a regular file. Does not open it.
 
-    Where SQLite has a file open, closing another descriptor of it would end SQLite's locks.
+    Closing a second descriptor of a file that SQLite has open would release SQLite's locks.
     """
     try:
         _check_regular_size(path.stat(), sys.maxsize)
@@ -55,47 +55,47 @@ def check_regular(path: Path) -> None:
 
 
 def check_replaceable(path: Path) -> None:
-    """`OSError` where there is something that is no file."""
+    """`OSError` if `path` exists and is not a regular file."""
     with suppress(FileNotFoundError):
         check_regular(path)
 
 
-def read_regular(path: Path, most: int) -> bytes:
-    """All bytes of a file of at most so many; `OSError` for what is none."""
-    with open_regular(path, most) as file:
-        data = file.read(most + 1)
-    if len(data) > most:  # it grew meanwhile
-        raise OSError(errno.EFBIG, f"it is larger than {most} bytes")
+def read_regular(path: Path, max_bytes: int) -> bytes:
+    """Read a regular file of at most `max_bytes`; `OSError` for anything else."""
+    with open_regular(path, max_bytes) as file:
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:  # it has grown since
+        raise OSError(errno.EFBIG, f"it is larger than {max_bytes} bytes")
     return data
 
 
-def read_text(path: Path, most: int) -> str:
-    """A text file of at most so many bytes; `OSError` for what is none, also if it is not UTF-8."""
+def read_text(path: Path, max_bytes: int) -> str:
+    """Read a UTF-8 text file of at most `max_bytes`; `OSError` for anything else."""
     try:
-        return read_regular(path, most).decode()
+        return read_regular(path, max_bytes).decode()
     except UnicodeDecodeError as error:
-        raise OSError(errno.EILSEQ, "it is no text in UTF-8") from error
+        raise OSError(errno.EILSEQ, "it is not UTF-8 text") from error
 
 
 def path_exists(path: Path) -> bool:
-    """Whether there is anything; a name that no file can have is no error."""
+    """Whether `path` exists, dangling links included; False for an invalid name."""
     return os.path.lexists(path)
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file, or what one might be read from; a name that no file can have is no error."""
+    """Whether `path` exists and is no folder; False for an invalid name."""
     return os.path.exists(path) and not os.path.isdir(path)  # noqa: PTH110, PTH112 - `Path` raises for some names
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder; a name that no folder can have is no error."""
+    """Whether `path` is a folder; False for an invalid name."""
     return os.path.isdir(path)  # noqa: PTH112 - as above
 
 
-def _check_regular_size(found: os.stat_result, most: int) -> None:
+def _check_regular_size(found: os.stat_result, max_bytes: int) -> None:
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, "it is a folder")
     if not stat.S_ISREG(found.st_mode):
-        raise OSError(errno.EINVAL, "it is no regular file")
-    if found.st_size > most:
-        raise OSError(errno.EFBIG, f"it is larger than {most} bytes")
+        raise OSError(errno.EINVAL, "it is not a regular file")
+    if found.st_size > max_bytes:
+        raise OSError(errno.EFBIG, f"it is larger than {max_bytes} bytes")

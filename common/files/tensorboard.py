@@ -1,4 +1,4 @@
-"""TensorBoard's event files: scalars over steps. Written by tensorboardX, so that no host needs torch for it."""
+"""TensorBoard event files: scalars over steps. tensorboardX writes them, so torch is not needed."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from dreamfleet.common.files.atomic_write import reporting_write_errors
 if TYPE_CHECKING:
     from tensorboardX.event_file_writer import EventsWriter
 
-FILE_VERSION = "brain.Event:2"  # of the format
+FILE_VERSION = "brain.Event:2"
 EXTRA = "pip install 'dreamfleet[export]'"
 
 
 class EventFileWriter:
-    """One event file.
+    """One event file, written in the caller's thread.
 
-    It is written in the caller's thread: the library's own ends on a full disk, and would be waited for for ever.
+    The library's own writer thread dies on a full disk, and closing it then blocks for ever.
     """
 
     def __init__(self, writer: EventsWriter) -> None:
         self._writer = writer
 
     def begin(self, step: int) -> None:
-        """Points of earlier files from `step` on count no more."""
+        """Start a session at `step`: TensorBoard discards points of earlier files from there on."""
         from tensorboardX.proto.event_pb2 import Event, SessionLog
 
         self._write(Event(step=step, file_version=FILE_VERSION))
         self._write(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
 
     def add(self, step: int, **values: float) -> None:
-        """Scalars of one step by their names, in which `__` stands for TensorBoard's `/`."""
+        """Add scalars of one step by name; `__` in a name becomes TensorBoard's `/`."""
         from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.summary import scalar
 
         for name, value in values.items():
             self._write(Event(step=step, summary=scalar(name.replace("__", "/"), value)))
-        self._writer.flush()  # so that they are seen while a training goes on
+        self._writer.flush()  # visible while the training runs
 
     def add_text(self, name: str, text: str) -> None:
-        """Text that stands beside the curves."""
+        """Add a text, shown beside the curves."""
         from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.summary import text as summary_of
 
@@ -57,9 +57,9 @@ class EventFileWriter:
 
 @contextmanager
 def open_event_file(folder: Path, since: int | None = None) -> Iterator[EventFileWriter]:
-    """An event file in `folder`; points of earlier files from step `since` on count no more.
+    """Open a new event file in `folder`; TensorBoard discards points of earlier files from step `since` on.
 
-    `MissingExtraError` where tensorboardX is not installed, `DreamfleetError` where there is no room.
+    `MissingExtraError` if tensorboardX is not installed, `DreamfleetError` if the file cannot be written.
     """
     try:
         from tensorboardX.event_file_writer import EventsWriter
@@ -67,8 +67,8 @@ def open_event_file(folder: Path, since: int | None = None) -> Iterator[EventFil
         raise MissingExtraError(f"TensorBoard's events need the package {error.name!r}: {EXTRA}") from error
     with reporting_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        own = f".{time.time_ns()}"  # the library's own name is equal for two writers within a second
-        writer = EventsWriter(str(folder / "events"), own)
+        suffix = f".{time.time_ns()}"  # without it two writers within a second have the same name
+        writer = EventsWriter(str(folder / "events"), suffix)
         try:
             events = EventFileWriter(writer)
             if since is not None:
@@ -76,5 +76,5 @@ def open_event_file(folder: Path, since: int | None = None) -> Iterator[EventFil
             yield events
             writer.flush()
         finally:
-            with suppress(OSError):  # what could not be written was told
+            with suppress(OSError):  # the write error was reported already
                 writer.close()

@@ -1,1 +1,1 @@
-"""The host and its processes: limits, signals, logs, streams, parent death."""
+"""The host and its processes: resource limits, signals, logs, streams, child processes."""

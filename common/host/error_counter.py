@@ -1,7 +1,7 @@
-"""What went wrong while one message was handled: counted and told, so that a drop is never silent.
+"""Counting and logging errors in message handlers.
 
-No message of a peer may end a loop. What raises while one is handled costs that message alone, which its sender
-repeats where it matters; an endless row of such drops shows in the count and, ever more rarely, in the log.
+No message of a peer may end a loop: a message whose handler raises is dropped, and its sender repeats it if it
+matters. Every drop is counted; the log gets the first of a kind, then ever fewer.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from collections import Counter
 
 from dreamfleet.common.printable import truncate
 
-LONGEST = 200  # characters of a message, and of an error, that are told
+MAX_LOGGED_CHARS = 200  # of a message, and of an error
 
 
 class ErrorCounter:
-    """Counts by reason; safe in any thread."""
+    """Counts errors by reason; thread-safe."""
 
     def __init__(self, log: logging.Logger) -> None:
         self._log = log
@@ -26,20 +26,20 @@ class ErrorCounter:
 
     @property
     def counts(self) -> Counter[str]:
-        """How often, by reason."""
+        """The number of errors by reason."""
         with self._lock:
             return Counter(self._counts)
 
     def record(self, kind: str, error: Exception, event: object) -> None:
-        """One event of this kind raised: told the first time, the second, the fourth, the eighth."""
+        """Count the error that handling `event` raised; log the first, second, fourth, eighth and so on of a reason."""
         reason = f"{kind} that raised {type(error).__name__}"
         with self._lock:
             self._counts[reason] += 1
             count = self._counts[reason]
         if count & (count - 1) == 0:
             self._log.error(
-                "dropped a %s (%d so far): %s at %s; it was: %s", reason, count, truncate(str(error), LONGEST),
-                _describe_place(error), truncate(_describe_event(event), LONGEST),
+                "dropped a %s (%d so far): %s at %s; it was: %s", reason, count, truncate(str(error), MAX_LOGGED_CHARS),
+                _describe_place(error), truncate(_describe_event(event), MAX_LOGGED_CHARS),
             )  # fmt: skip
 
 
@@ -49,9 +49,9 @@ def _describe_place(error: Exception) -> str:
 
 
 def _describe_event(event: object) -> str:
-    """A Zenoh sample or query as its key and the beginning of its payload; anything else as it writes itself."""
+    """A Zenoh sample or query as its key and the beginning of its payload; anything else as its `repr`."""
     key, payload = getattr(event, "key_expr", None), getattr(event, "payload", None)
     if key is None:
         return repr(event)
-    head = b"" if payload is None else payload.to_bytes()[:LONGEST]
+    head = b"" if payload is None else payload.to_bytes()[:MAX_LOGGED_CHARS]
     return f"{key} {head!r}"

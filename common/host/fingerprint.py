@@ -1,6 +1,6 @@
-"""What a host is, in one line: CPU features, libc, and the versions of the packages that compute a fitness.
+"""A host's fingerprint: CPU features, libc, and the versions of the packages that compute a fitness.
 
-Nothing guarantees equal bits across instruction sets or versions; whether two hosts have them is what their classes say
+Equal fingerprints do not guarantee equal bits; host classes compare the results themselves
 (`common/protocol/host_classes.py`).
 """
 
@@ -12,15 +12,15 @@ from pathlib import Path
 
 from dreamfleet.common.host.packages import package_version
 
-# Of CarRacing and its dream, and of runs from before tasks said which.
+# The packages of CarRacing and its dream, and of older runs, whose tasks do not name theirs.
 NUMERIC_PACKAGES = ("numpy", "onnxruntime", "gymnasium", "pygame-ce", "box2d", "box2d-py")
-# The instruction sets that the inference kernels choose between at run time.
+# Instruction sets between which the inference kernels choose at run time.
 CPU_FEATURES = ("sse4_1", "avx", "avx2", "fma", "f16c", "avx512f", "avx512bw", "avx512vl", "avx512_vnni", "avx512_bf16",
                 "avx_vnni", "amx_tile", "asimd", "asimddp", "sve", "i8mm", "bf16")  # fmt: skip
 
 
 def cpu_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:
-    """The features of `CPU_FEATURES` that this processor announces; empty where it does not say."""
+    """The `CPU_FEATURES` of this processor; empty if it does not report any."""
     try:
         text = cpuinfo.read_text()
     except OSError:
@@ -32,9 +32,9 @@ def cpu_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:
 
 @cache
 def fingerprint(packages: tuple[str, ...] = NUMERIC_PACKAGES) -> str:
-    """One line that is equal on hosts that are expected to compute equal bits; it costs 5 ms to find out, once.
+    """One line that is equal on hosts that are expected to compute equal bits. Takes 5 ms, and is cached.
 
-    `packages` are those that a fitness of the run's task may depend on: what else is installed splits no fleet.
+    `packages` are those that a fitness of the run's task depends on; other packages do not matter.
     """
     libc, libc_version = platform.libc_ver()
     versions = [f"{name}-{found}" for name in packages if (found := package_version(name))]

@@ -1,8 +1,8 @@
-"""Streams that never wait for whoever reads them: a full pipe must not freeze what is said along the way.
+"""Output streams that never block on a slow reader.
 
-A terminal that is stopped, a pager, a log collector that hangs: once their pipe is full, a write to stderr waits
-without end, and with it a loop, its signals and every thread that logs. Here a thread of its own writes. What it
-cannot get rid of waits up to a bound; lines beyond it are dropped, and their number is said once the reader is back.
+When a stopped terminal, a pager or a hanging log collector leaves its pipe full, a write to stderr blocks, and with it
+a loop, its signal handlers and every thread that logs. Here a background thread writes. Its queue is bounded; further
+lines are dropped, and their number is written once the reader is back.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import sys
 import threading
 from typing import TextIO
 
-MAX_WAITING_CHARS = 1 << 20  # characters: thousands of lines
-EXIT_WAIT = 1.0  # seconds that a process which ends waits for its reader
+MAX_WAITING_CHARS = 1 << 20  # thousands of lines
+EXIT_WAIT = 1.0  # seconds that an ending process waits for its reader
 
 
 class NonblockingStream(io.TextIOBase):
-    """A text stream in the place of `stream`; whole lines reach its descriptor, in order, or are dropped and counted.
+    """A replacement for `stream`: writes whole lines to its descriptor, in order, or drops and counts them.
 
-    The thread writes to the descriptor itself: the lock of Python's own stream, held by a thread that waits, would
-    abort the interpreter at its end.
+    The thread writes to the descriptor, not to the stream: a blocked thread that holds a stream's lock aborts the
+    interpreter at exit.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -41,7 +41,7 @@ class NonblockingStream(io.TextIOBase):
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
-        """As the stream's."""
+        """The original stream's encoding."""
         return self._stream.encoding
 
     def fileno(self) -> int:
@@ -49,15 +49,15 @@ class NonblockingStream(io.TextIOBase):
         return self._stream.fileno()
 
     def isatty(self) -> bool:
-        """Whether a person reads."""
+        """Whether it is a terminal."""
         return self._stream.isatty()
 
     def writable(self) -> bool:
-        """It is."""
+        """Always True."""
         return True
 
     def write(self, text: str) -> int:
-        """Take text; its whole lines are written soon."""
+        """Queue text; its whole lines are written soon."""
         with self._lock:
             whole, end, self._partial_line = (self._partial_line + text).rpartition("\n")
             if end:
@@ -67,14 +67,14 @@ class NonblockingStream(io.TextIOBase):
         return len(text)
 
     def flush(self) -> None:
-        """Let what has no line's end be written too; waits for nothing."""
+        """Queue an unfinished line too; does not block."""
         with self._lock:
-            begun, self._partial_line = self._partial_line, ""
-            if begun:
-                self._put(begun)
+            partial_line, self._partial_line = self._partial_line, ""
+            if partial_line:
+                self._put(partial_line)
 
     def finish(self, limit: float = EXIT_WAIT) -> None:
-        """Wait until everything is written, for `limit` seconds at most."""
+        """Wait until everything is written, at most `limit` seconds."""
         self.flush()
         self._written.wait(limit)
 
@@ -101,36 +101,36 @@ class NonblockingStream(io.TextIOBase):
 
 
 def make_stderr_nonblocking() -> None:
-    """From now on nothing that this process says on stderr waits for a reader: logs, errors, tracebacks."""
+    """Replace stderr, also in log handlers, by a stream that never blocks."""
     before = sys.stderr
-    made = _make_nonblocking(before)
-    if made is not None:
-        sys.stderr = made
+    replacement = _make_nonblocking(before)
+    if replacement is not None:
+        sys.stderr = replacement
         for handler in logging.getLogger().handlers:
             if isinstance(handler, logging.StreamHandler) and handler.stream is before:
-                handler.setStream(made)
+                handler.setStream(replacement)
 
 
 def make_stdout_nonblocking() -> None:
-    """The same for stdout: of a process whose prints are a task's chatter, not an answer."""
+    """Replace stdout by a stream that never blocks, in a process whose prints are not a verb's output."""
     sys.stdout = _make_nonblocking(sys.stdout) or sys.stdout
 
 
 def _make_nonblocking(stream: TextIO | None) -> NonblockingStream | None:
-    """The stream's replacement; `None` where there is nothing to replace: it is closed, or no thread can be had."""
+    """The stream's replacement; `None` if it is closed or replaced already, or no thread can start."""
     try:
         if stream is None or isinstance(stream, NonblockingStream):
             return None
         stream.fileno()
-        made = NonblockingStream(stream)
+        replacement = NonblockingStream(stream)
     except (OSError, ValueError, RuntimeError):
         return None
-    atexit.register(made.finish)
-    return made
+    atexit.register(replacement.finish)
+    return replacement
 
 
 def _write(descriptor: int, data: bytes) -> None:
-    """All of it, however long that takes; a reader that is gone has nothing to miss."""
+    """Write all data, however long that blocks; returns early if the reader is gone."""
     left = memoryview(data)
     try:
         while left:

@@ -1,10 +1,10 @@
-"""The packages that this distribution and its extras bring, and the command that installs them."""
+"""The packages of this distribution and its extras, and the command that installs them."""
 
 from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
 
-# distribution -> (module, extra); the empty extra is what every role needs
+# distribution -> (module, extra); the empty extra is required by every role
 PACKAGES = {
     "eclipse-zenoh": ("zenoh", ""),
     "msgpack": ("msgpack", ""),
@@ -28,12 +28,12 @@ PACKAGES = {
 
 
 def install_command(extra: str) -> str:
-    """The command that installs an extra; the empty one is the distribution alone."""
+    """The command that installs an extra; an empty extra is the distribution alone."""
     return f"pip install 'dreamfleet[{extra}]'" if extra else "pip install dreamfleet"
 
 
 def install_command_for(module: str | None) -> str | None:
-    """The command that installs a module which is missing; `None` where it is none of ours."""
+    """The command that installs a missing module; `None` if no extra contains it."""
     top = (module or "").partition(".")[0]
     return next((install_command(extra) for each, extra in PACKAGES.values() if each == top), None)
 

@@ -1,6 +1,6 @@
-"""Child processes that end with their parent, also when it is killed; Ctrl-C is left to the parent.
+"""Child processes that end with their parent, also on SIGKILL, and leave Ctrl-C to the parent.
 
-`python -m dreamfleet.common.host.parent_death PARENT COMMAND` runs a command that ends so.
+`python -m dreamfleet.common.host.parent_death PARENT_PID COMMAND` runs a command that ends with the parent.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ _PR_SET_PDEATHSIG = 1
 
 @contextmanager
 def signals_blocked() -> Iterator[None]:
-    """A child started here inherits the mask: Ctrl-C, which reaches the whole group, cannot end it while it imports."""
-    resource_tracker.ensure_running()  # as it starts it would lift the mask
+    """Block SIGINT and SIGTERM; children started inside inherit this, so Ctrl-C cannot end them during imports."""
+    resource_tracker.ensure_running()  # its start would unblock the signals
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     try:
         yield
@@ -28,7 +28,7 @@ def signals_blocked() -> Iterator[None]:
 
 
 def exit_with_parent(parent: int) -> None:
-    """Ask Linux to end this process with its parent; elsewhere it ends when it next looks at its pipe."""
+    """Make Linux kill this process when its parent ends; on other systems, it ends when it next reads its pipe."""
     try:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     except (OSError, AttributeError):
@@ -38,9 +38,9 @@ def exit_with_parent(parent: int) -> None:
 
 
 def main() -> None:
-    """Become the command."""
+    """Replace this process by the command."""
     exit_with_parent(int(sys.argv[1]))
-    os.execv(sys.argv[2], sys.argv[2:])  # noqa: S606 - our own interpreter and verb
+    os.execv(sys.argv[2], sys.argv[2:])  # noqa: S606 - dreamfleet's interpreter and verb
 
 
 if __name__ == "__main__":

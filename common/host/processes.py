@@ -1,4 +1,4 @@
-"""Our own verbs as processes: started, listened to, ended. The demonstration, the benchmarks and the tests use it."""
+"""Dreamfleet's verbs as child processes, for the demonstration, the benchmarks, experiments and tests."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from typing import IO, Any
 
 from dreamfleet.common.errors import DreamfleetError
 
-KEPT_LINES = 10_000  # of each stream that are kept at least
-PATIENCE = 3.0  # seconds after each request to leave
+KEPT_LINES = 10_000  # the last lines of each stream that are kept, at least
+PATIENCE = 3.0  # seconds to wait after each SIGTERM
 
 
 def command(*words: object) -> list[str]:
-    """The command line of a verb in this interpreter. `-P`: a module in the current folder is never taken for ours."""
+    """The command line of a verb in this interpreter. `-P`: never import modules from the current folder."""
     return [sys.executable, "-P", "-m", "dreamfleet", *map(str, words)]
 
 
 def shell_command(*words: object) -> str:
-    """The same verb as a person writes it into this shell, the way that this program was started."""
+    """A verb's command line for display and copying, with this program's name as it was started."""
     started = Path(sys.argv[0])
     known = shutil.which("dreamfleet")
     if started.name == "__main__.py":
@@ -43,18 +43,18 @@ def shell_command(*words: object) -> str:
 
 
 def parent_death_command() -> tuple[str, ...]:
-    """What a command runs `inside` so that it ends with this process, however this one ends; of Linux."""
+    """The prefix of a command that makes it end with this process, also on SIGKILL; Linux only."""
     return (sys.executable, "-P", "-m", "dreamfleet.common.host.parent_death", str(os.getpid()))
 
 
 def run_verb_to_end(*words: object) -> None:
-    """Run a verb to its end in this terminal; `DreamfleetError` if it fails."""
+    """Run a verb in this terminal and wait; `DreamfleetError` if it fails."""
     if subprocess.run(command(*words), check=False).returncode != 0:  # noqa: S603 - our own interpreter and verb
         raise DreamfleetError(f"dreamfleet {words[0]} failed")
 
 
 def run_verb_for_json(*words: object) -> Any:
-    """Run a verb to its end, its progress in this terminal, and read the JSON that it prints."""
+    """Run a verb and return the JSON that it prints; `DreamfleetError` if it fails. Its stderr is this terminal."""
     done = subprocess.run(command(*words), check=False, stdout=subprocess.PIPE)  # noqa: S603 - our own interpreter
     if done.returncode != 0:
         raise DreamfleetError(f"dreamfleet {words[0]} failed")
@@ -62,9 +62,9 @@ def run_verb_for_json(*words: object) -> Any:
 
 
 class VerbProcess:
-    """A verb that runs. What it says is read at once, or goes to `log`: it never waits for a reader.
+    """A running verb. Threads read its output, or it goes to the file `log`, so that it never blocks on a reader.
 
-    Use it in a `with`, or call `end`. It leads a session of its own, so that Ctrl-C reaches the parent alone.
+    Use it in a `with`, or call `end`. It leads a new process session, so that Ctrl-C reaches only the parent.
     """
 
     def __init__(
@@ -75,8 +75,8 @@ class VerbProcess:
         inside: Sequence[str] = (),
         read: Callable[[IO[bytes]], None] | None = None,
     ) -> None:
-        """`read` takes its stdout, in a thread of its own, where that is no text; it ends with the stream."""
-        self.lines: list[str] = []  # of stderr, the last of them
+        """`inside` is a prefix of the command; `read` consumes a binary stdout in a thread, until its end."""
+        self.lines: list[str] = []  # the last lines of stderr
         self._log = log
         self._out: deque[str] = deque(maxlen=KEPT_LINES)
         self._new_lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
@@ -104,20 +104,20 @@ class VerbProcess:
         self.end()
 
     def wait_for(self, text: str, times: int = 1, timeout: float = 60.0) -> str:
-        """Block until `text` was said on stderr so many times since the last wait; the line that said it."""
+        """Block until stderr contained `text` in `times` new lines since the last wait; returns the last of them."""
         deadline, line = time.monotonic() + timeout, None
         while times:
             try:
                 line = self._new_lines.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
-                raise DreamfleetError(f"{text!r} was not said within {timeout:g} s; {self.last_line()}") from None
+                raise DreamfleetError(f"{text!r} was not printed within {timeout:g} s; {self.last_line()}") from None
             if line is None:
-                raise DreamfleetError(f"ended before saying {text!r}:\n{''.join(self.lines)}")
+                raise DreamfleetError(f"ended before printing {text!r}:\n{''.join(self.lines)}")
             times -= text in line
         return line or ""
 
     def new_lines(self) -> list[str]:
-        """Lines that were said on stderr and that nobody has waited for or taken yet."""
+        """The lines of stderr that neither `wait_for` nor an earlier call consumed."""
         lines: list[str] = []
         with suppress(queue.Empty):
             while (line := self._new_lines.get_nowait()) is not None:
@@ -125,7 +125,7 @@ class VerbProcess:
         return lines
 
     def finish(self, timeout: float | None = None) -> tuple[int, str]:
-        """Wait for the end: exit code and stdout."""
+        """Wait for the end; returns the exit code and stdout."""
         code = self.popen.wait(timeout)
         self._join()
         return code, "".join(self._out)
@@ -133,11 +133,11 @@ class VerbProcess:
     def last_line(self) -> str:
         """The last line of its log, or of stderr."""
         lines: Iterable[str] = self.lines if self._log is None else self._log.read_text(errors="replace").splitlines()
-        said = [line.strip() for line in lines if line.strip()]
-        return said[-1].removeprefix("dreamfleet: ") if said else "it ended without a word"
+        printed = [line.strip() for line in lines if line.strip()]
+        return printed[-1].removeprefix("dreamfleet: ") if printed else "it printed nothing"
 
     def end(self, patience: float = PATIENCE) -> None:
-        """Ask it to leave, and again; then end it and all that it started."""
+        """Send SIGTERM, twice if needed, then SIGKILL to its whole process group."""
         for _ in range(2 if patience else 0):
             if self.popen.poll() is None:
                 self.popen.send_signal(signal.SIGTERM)

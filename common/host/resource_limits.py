@@ -1,4 +1,4 @@
-"""What this process may use: cores, open files, and one thread for each numeric pool."""
+"""Resource limits of this process: cores, open files, and the threads of numeric libraries."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import resource
 from contextlib import suppress
 from pathlib import Path
 
-_GROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+_CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
-def usable_cores(groups: Path = _GROUPS, own: Path = _OWN) -> int:
-    """At least 1: those that the scheduler lets it run on, and no more than its control groups give it the time of.
+def usable_cores(groups: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> int:
+    """The number of cores in the scheduler's affinity mask, bounded by cgroup CPU quotas (rounded up); at least 1.
 
-    Half a core's time counts as a core. `groups` is where Linux shows control groups, `own` which ones are ours.
+    `groups` is the cgroup file system, `own` the file that lists this process's cgroups.
     """
-    may = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quotas = [quota for folder in _cgroup_folders(groups, own) if (quota := _cpu_quota(folder)) is not None]
-    return max(1, min([may, *(math.ceil(quota) for quota in quotas)]))
+    return max(1, min([allowed, *(math.ceil(quota) for quota in quotas)]))
 
 
 def _cgroup_folders(groups: Path, own: Path) -> list[Path]:
-    """Those of our control group and all above it: the smallest quota holds. A container sees its own as the root."""
+    """The folders of this process's cgroup and its parents: all their quotas apply."""
     found = [groups, groups / "cpu"]
     with suppress(OSError):
         for line in own.read_text().splitlines():
@@ -35,22 +35,22 @@ def _cgroup_folders(groups: Path, own: Path) -> list[Path]:
 
 
 def _cpu_quota(folder: Path) -> float | None:
-    """Cores' worth of time that a control group has; `None`: as much as there is."""
+    """A cgroup's CPU quota in cores; `None` if unlimited."""
     with suppress(OSError, ValueError, ZeroDivisionError):  # version 2: "max 100000", or "150000 100000"
         quota, period = (folder / "cpu.max").read_text().split()
         return None if quota == "max" else int(quota) / int(period)
     with suppress(OSError, ValueError, ZeroDivisionError):  # version 1: -1, or microseconds
-        given, each = (int((folder / f"cpu.cfs_{name}_us").read_text()) for name in ("quota", "period"))
-        return given / each if given > 0 else None
+        quota_us, period_us = (int((folder / f"cpu.cfs_{name}_us").read_text()) for name in ("quota", "period"))
+        return quota_us / period_us if quota_us > 0 else None
     return None
 
 
 WANTED_FILES = 65_536
-RESERVED_FILES = 64  # for ourselves: journal, world model, controller, Zenoh's own
+RESERVED_FILES = 64  # for everything but connections: journal, world model, controller, Zenoh's own
 
 
 def raise_open_file_limit() -> None:
-    """As many as the host allows without asking: the usual 1024 is a habit for programs that use `select`."""
+    """Raise the soft limit of open files to the hard one, at most `WANTED_FILES`; the usual 1024 is for `select`."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = WANTED_FILES if hard == resource.RLIM_INFINITY else min(hard, WANTED_FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -59,7 +59,7 @@ def raise_open_file_limit() -> None:
 
 
 def connection_budget() -> int:
-    """How many connections leave enough for ourselves."""
+    """The number of connections that leaves `RESERVED_FILES` under the limit of open files."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return max((WANTED_FILES if soft == resource.RLIM_INFINITY else soft) - RESERVED_FILES, 8)
 
@@ -69,15 +69,15 @@ POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_
 
 
 def pin_thread_pools() -> None:
-    """Tell the numeric libraries of child processes, which read this as they load, to use one thread."""
+    """Make the numeric libraries of child processes use one thread; they read the environment as they load."""
     for name in POOLS:
         os.environ[name] = "1"
 
 
 def clear_library_settings() -> None:
-    """Let the numeric libraries of child processes choose for this processor, whatever the environment told them.
+    """Remove settings of numeric libraries from the environment, so that child processes use the defaults.
 
-    A measurement needs it: `OPENBLAS_CORETYPE` alone can halve the rate that a step is held against.
+    For measurements: `OPENBLAS_CORETYPE` alone can halve the speed of a matrix product.
     """
     for name in [each for each in os.environ if each.startswith(_SETTINGS)]:
         del os.environ[name]

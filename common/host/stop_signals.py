@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM in a verb that works for long: the first ends it at a good place, the second at once."""
+"""Handling Ctrl-C and SIGTERM in long-running verbs: a clean stop, an interrupt, or a short delay."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Stop = Callable[[], bool]
-"""Whether to end at the next good place."""
+"""Returns whether to stop at the next point where that is safe."""
 
 
 def never_stop() -> bool:
-    """Nobody asks to stop."""
+    """A `Stop` that is always False."""
     return False
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[Stop]:
-    """Inside, a first Ctrl-C or SIGTERM only makes what is yielded true; a second one raises `KeyboardInterrupt`.
+    """Yield a `Stop` that is True after a first Ctrl-C or SIGTERM; a second one raises `KeyboardInterrupt`.
 
-    For the main thread, which alone may handle signals.
+    Main thread only: other threads cannot handle signals.
     """
-    told = False
+    stopped = False
 
     def handle(_number: int, _frame: Any) -> None:
-        nonlocal told
-        if told:
+        nonlocal stopped
+        if stopped:
             raise KeyboardInterrupt
-        told = True
+        stopped = True
 
     before = {number: signal.signal(number, handle) for number in SIGNALS}
     try:
-        yield lambda: told
+        yield lambda: stopped
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -42,10 +42,10 @@ def stop_on_signals() -> Iterator[Stop]:
 
 @contextmanager
 def interrupted_by_signals() -> Iterator[None]:
-    """Inside, Ctrl-C and SIGTERM raise `KeyboardInterrupt`, so that what was begun is ended on the way out.
+    """Make both Ctrl-C and SIGTERM raise `KeyboardInterrupt`, so that `finally` blocks run.
 
-    Python raises it only on Ctrl-C, and not where the process was started to ignore that, as a shell starts the
-    background jobs of a script. For the main thread, which alone may handle signals.
+    By default only Ctrl-C raises, and not in a script's background jobs, which shells start with SIGINT ignored. Main
+    thread only.
     """
     before = {number: signal.signal(number, signal.default_int_handler) for number in SIGNALS}
     try:
@@ -57,16 +57,16 @@ def interrupted_by_signals() -> Iterator[None]:
 
 @contextmanager
 def signals_deferred() -> Iterator[None]:
-    """Inside, Ctrl-C and SIGTERM wait: for what is short, and worth more whole than a moment earlier."""
-    if threading.current_thread() is not threading.main_thread():  # where no signal is handled
+    """Delay Ctrl-C and SIGTERM until the end of a short operation that must not be torn."""
+    if threading.current_thread() is not threading.main_thread():  # other threads receive no signals
         yield
         return
     waiting: list[int] = []
-    before = {number: signal.signal(number, lambda told, _frame: waiting.append(told)) for number in SIGNALS}
+    before = {number: signal.signal(number, lambda number, _frame: waiting.append(number)) for number in SIGNALS}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-    for told in waiting:
-        signal.raise_signal(told)
+    for number in waiting:
+        signal.raise_signal(number)

@@ -1,4 +1,4 @@
-"""Asking a run over Zenoh how it is, watching it, and fetching its controller. Read-only but for `control`."""
+"""A client of live runs over Zenoh: status, watching, controllers, control. Only `control` changes anything."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from dreamfleet.common.transport.query import query_all
 from dreamfleet.common.transport.session import Network, enqueue_into, open_session
 
 QUERY_TIMEOUT = 3.0
-PATIENCE = 1.0  # seconds without an answer after which a watched run counts as left
-MAX_PARAMETERS = 16 << 20  # of a controller, as its file may have them
-MAX_CHANGES = 5  # controllers that may replace one another while one is fetched in parts
+PATIENCE = 1.0  # seconds without an answer after which a watched run counts as gone
+MAX_PARAMETERS = 16 << 20  # of a controller; the same as in a controller file
+MAX_RESTARTS = 5  # of fetching a controller in parts while new controllers replace it
 
 
 class Client:
@@ -46,16 +46,16 @@ class Client:
     """
 
     def __init__(self, connect: Network | tuple[str, ...] | str) -> None:
-        """`connect` are addresses, or with them a join file's credentials: `site.reached`."""
+        """`connect` is one or more addresses, or a `Network` with credentials."""
         connect = (connect,) if isinstance(connect, str) else connect
         network = connect if isinstance(connect, Network) else Network(connect=connect)
         if not network.connect:
             raise UsageError("a client needs an address: tcp/HOST:PORT")
         self._where = ", ".join(network.connect)
         self._secured = network.credentials is not None
-        #: with which flags a worker is started that joins a run here; in a fleet with join files it brings its own
+        #: the flags with which a worker joins a run here; in a secured fleet each worker has its own join file
         self.worker_flags = "--join FILE" if network.credentials else f"--connect {' '.join(network.connect)}"
-        self.session = open_session(network)  # also for what asks in other words, as for a bundle
+        self.session = open_session(network)  # public: for other queries, such as for a bundle
 
     def __enter__(self) -> Client:
         return self
@@ -70,15 +70,15 @@ class Client:
         return sorted(str(document["run"]) for document in self.statuses() if "run" in document)
 
     def status(self, run: str | None = None) -> Status:
-        """How `run` is, or the only live run; `MalformedError` if its version is not understood."""
+        """The status of `run`, or of the only live run; `MalformedError` if its version is not understood."""
         return read_status(self.document(run))
 
     def statuses(self, timeout: float = QUERY_TIMEOUT) -> list[dict[str, Any]]:
-        """How every live run is, as the wire has it, in no order: what answers within `timeout` seconds."""
+        """The raw statuses of all live runs that answer within `timeout` seconds, unordered."""
         return [read_document(payload) for payload in query_all(self.session, [keys.status("*")], timeout)]
 
     def document(self, run: str | None = None, part: str = "", parameters: str = "") -> dict[str, Any]:
-        """What answers for `run`, or for the only live run, as the wire has it; `part` is one of `status.PARTS`."""
+        """The raw status of `run`, or of the only live run; `part` is one of `status.PARTS`."""
         key = keys.status(keys.check_run_name(run) if run else "*", part)
         documents = self._query(f"{key}?{parameters}" if parameters else key)
         if len(documents) > 1:
@@ -89,19 +89,19 @@ class Client:
         return documents[0]
 
     def watch(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[Status]:
-        """How `run` is every `pause` seconds, and at last how its coordinator left it.
+        """Yield the status of `run` every `pause` seconds, and finally the one in which its coordinator leaves.
 
-        `ConnectionFailedError` if for `patience` seconds nobody answers: the coordinator vanished without a word, or
-        never came. Give more to wait for one that is being started, or started again.
+        `ConnectionFailedError` if nobody answers for `patience` seconds: the coordinator was killed, or never started.
+        Use a longer patience to wait for a coordinator that is being started.
         """
         return map(read_status, self.watch_documents(run, pause, patience))
 
     def watch_documents(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[dict[str, Any]]:
-        """As `watch`, but as the wire has it."""
+        """Like `watch`, but yields raw statuses."""
         last_statuses: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        enqueue = enqueue_into(last_statuses, "status", most=1)
+        enqueue = enqueue_into(last_statuses, "status", max_waiting=1)
         subscriber: Any = self.session.declare_subscriber(keys.event_status(keys.check_run_name(run)), enqueue)
-        lost_at: float | None = None  # when it counts as left, while nobody answers
+        lost_at: float | None = None  # while nobody answers: when the run counts as gone
         try:
             while True:
                 try:
@@ -124,41 +124,41 @@ class Client:
             subscriber.undeclare()
 
     def workers(self, run: str) -> list[WorkerStatus]:
-        """All workers that the coordinator of `run` knows."""
+        """All workers that the coordinator of `run` knows, lost ones included."""
         return [from_plain(WorkerStatus, known(WorkerStatus, row)) for row in self.fetch_rows("workers", run)]
 
     def history(self, run: str, offset: int = 0) -> list[StoredGeneration]:
-        """All closed generations of `run` but the first `offset`, oldest first."""
+        """The closed generations of `run` after the first `offset`, oldest first."""
         rows = self.fetch_rows("history", run, offset)
         return [from_plain(StoredGeneration, known(StoredGeneration, row)) for row in rows]
 
     def events(
         self, run: str | None = None, worker: str = "", job: str = "", kinds: Collection[str] = ()
     ) -> tuple[list[Event], int]:
-        """What happened of late, oldest first, and how many such events are kept: more than one answer may hold.
+        """Recent events, oldest first, and the number of matching events that the coordinator keeps.
 
-        `worker` is a worker, or the host's name in its name; `job` a candidate as generation/index; `kinds` are words
-        of `status.What`; else all.
+        An answer may hold fewer than that number. `worker` is a worker, or the host's name in its name; `job` is a
+        candidate as generation/index; `kinds` are words of `status.EventKind`. Empty filters match all.
         """
         try:
             document = self.document(run, "story", f"worker={worker};job={job};what={','.join(kinds)}")
         except ConnectionFailedError:
-            document = self.document(run)  # one from before this part answers for its status alone
+            document = self.document(run)  # older coordinators answer for the whole status only
         rows = document.get("story")
         if not isinstance(rows, list):
             raise MalformedError(
-                f"the coordinator of run {document.get('run')} tells no story: a worker's join file may not ask for "
-                "it, or its dreamfleet is older than this verb; take a viewer's, or install a newer one there"
+                f"the coordinator of run {document.get('run')} sends no events: a worker's join file has no right to "
+                "them, or its dreamfleet is older than this verb; use a viewer's, or install a newer one there"
             )
         return [from_plain(Event, known(Event, row)) for row in rows], int(document.get("total", len(rows)))
 
     def evaluations(self, run: str) -> list[StoredEvaluation]:
-        """All finished evaluations of `run`, oldest first; a coordinator from before this part does not answer."""
+        """All finished evaluations of `run`, oldest first; `ConnectionFailedError` from older coordinators."""
         rows = self.fetch_rows("evaluations", run)
         return [from_plain(StoredEvaluation, known(StoredEvaluation, row)) for row in rows]
 
     def candidates(self, run: str, generation: int) -> list[Population]:
-        """All candidates of the open generation of `run`, or of the one before it, in parts; the open one otherwise."""
+        """All candidates of a generation, in parts: the open one, or the one before it; for others, the open one's."""
         parts: list[Population] = []
         seen = 0
         while not parts or seen < parts[0].total:
@@ -170,8 +170,11 @@ class Client:
         return parts
 
     def controller(self, run: str) -> Controller:
-        """What `run` reports now: its best evaluated mean, else its last one; `ControllerError` before the first."""
-        for _ in range(MAX_CHANGES):
+        """The controller that `run` reports now: its best evaluated mean, else the last mean.
+
+        `ControllerError` before the first generation is closed.
+        """
+        for _ in range(MAX_RESTARTS):
             data, about = b"", self._fetch_controller_part(run, 0)
             sha256, total = about["sha256"], 4 * _check_total(about)
             while about["sha256"] == sha256:
@@ -183,7 +186,7 @@ class Client:
         raise ControllerError(f"the controller of run {run} changes faster than it can be fetched; ask again")
 
     def fetch_rows(self, part: str, run: str, offset: int = 0) -> Iterator[dict[str, Any]]:
-        """All rows from `offset` on of a paged part as the wire has them: `workers`, `history` or `evaluations`."""
+        """All raw rows from `offset` on of a paged part: `workers`, `history` or `evaluations`."""
         while True:
             document = self.document(run, part, f"offset={offset}")
             yield from document[part]
@@ -192,9 +195,9 @@ class Client:
                 return
 
     def control(self, run: str, verb: str) -> str:
-        """Ask the coordinator to `pause`, `resume`, `drain` or `stop`; `RefusedError` says why it does not.
+        """Ask the coordinator to `pause`, `resume`, `drain` or `stop`; `RefusedError` with its reason if it refuses.
 
-        The command that continues the run on its host, if it is left now and its coordinator says so.
+        Returns the command that resumes the run on the coordinator's host, if it leaves and sends one; else empty.
         """
         for reply in self.session.get(keys.control(keys.check_run_name(run), verb), timeout=QUERY_TIMEOUT):
             if reply.ok is not None:
@@ -202,8 +205,8 @@ class Client:
                     answer = decode_json(ControlReply, reply.ok.payload.to_bytes())
                 except MalformedError as error:
                     raise MalformedError(
-                        f"what answers for run {run} is no coordinator of this version ({error}): install the same "
-                        "dreamfleet on both sides"
+                        f"the coordinator of run {run} has another version ({error}): install the same dreamfleet on "
+                        "both sides"
                     ) from error
                 if not answer.accepted:
                     raise RefusedError(answer.why)
@@ -215,14 +218,14 @@ class Client:
         if about is None:
             raise ControllerError(f"run {run} reports no controller yet: wait until its first generation is closed")
         if not isinstance(about, dict) or not about.keys() >= {"sha256", "total", "parameters", "shape", "task"}:
-            raise MalformedError(f"run {run} gives a controller that this version cannot read: update dreamfleet")
+            raise MalformedError(f"run {run} sends a controller that this version cannot read: update dreamfleet")
         return about
 
     def _no_answer_error(self, run: str | None) -> ConnectionFailedError:
         whose, again = "any run", "--run NAME` begins one"
         if run:
-            whose, again = f"run {run!r}", f"--resume {run}` goes on with one that was stopped or killed"
-        right = ", or the join file lacks the right to ask" if self._secured else ""
+            whose, again = f"run {run!r}", f"--resume {run}` continues one that was stopped or killed"
+        right = ", or the join file gives no right to ask" if self._secured else ""
         return ConnectionFailedError(
             f"no coordinator of {whose} answers through {self._where}: it is not running{right}; "
             f"`dreamfleet coordinator {again}"
@@ -233,15 +236,15 @@ class Client:
 
 
 def _check_total(about: dict[str, Any]) -> int:
-    """How many parameters there are; `ControllerError` before more is fetched than a controller may have."""
+    """The number of parameters in a reply; `ControllerError` if no controller may have as many."""
     total = about["total"]
     if type(total) is not int or not 0 < total <= MAX_PARAMETERS:
-        raise ControllerError("the run says that its controller has no such number of parameters as one may have")
+        raise ControllerError(f"the run's controller has {total!r:.20} parameters: at most {MAX_PARAMETERS} are read")
     return total
 
 
 def _decode_part(about: dict[str, Any]) -> bytes:
-    """The parameters of one answer."""
+    """The parameters in one reply, as bytes."""
     try:
         return base64.b64decode(about["parameters"], validate=True)
     except (ValueError, TypeError) as error:

@@ -1,4 +1,4 @@
-"""How a run stands in a sentence, and how long it yet takes as far as its limits tell. Pure."""
+"""A run's state in a sentence, and its estimated time to the end, computed from a status. No input or output."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.effort import format_steps
 from dreamfleet.common.runs.records import describe_score, format_mean
 
-PACE_WINDOW = 10  # closed generations whose median is the pace: one that was paused for hours tells nothing
-WORKING = ("running", "evaluating")
+PACE_WINDOW = 10  # closed generations whose median is the pace; the median ignores one that was paused for hours
+ACTIVE_STATES = ("running", "evaluating")
 
 
 @dataclass(frozen=True)
 class LimitProgress:
-    """One limit of a run: how far it is."""
+    """The progress of a run towards one of its limits."""
 
     name: str  # generations, steps, minutes
     done: float
     wanted: float
-    seconds: float | None  # until it is reached at the present pace; `None` where there is no pace yet
+    seconds: float | None  # until it is reached at the present pace; `None` if that is not known yet
     description: str  # "18 of 30 minutes"
 
     @property
     def share(self) -> float:
-        """From 0 to 1."""
+        """The done share, from 0 to 1."""
         return min(max(self.done / self.wanted, 0.0), 1.0)
 
 
 @dataclass(frozen=True)
 class Eta:
-    """What is known of a run's end: its limits, and the last evaluations and the confirmation that come after them."""
+    """The estimated end of a run: its limits, then the last evaluations and the confirmation."""
 
-    bounds: tuple[LimitProgress, ...]  # limits that are counted, the nearest first
-    others: tuple[str, ...]  # limits that nobody can foretell, in words
+    bounds: tuple[LimitProgress, ...]  # countable limits, the nearest first
+    others: tuple[str, ...]  # limits whose time cannot be estimated, in words
     pace: float | None  # seconds a generation; `None` before the first is closed
-    limit: float | None  # seconds until the first limit; `None` while nobody works, or where nothing tells
-    seconds: float | None  # until the run's end; `None` too where nothing tells how long evaluations take
-    closing: int = 0  # episodes of evaluations that the end takes
+    limit: float | None  # seconds until the first limit; `None` if unknown, or while nobody scores
+    seconds: float | None  # until the run's end; `None` also if the speed of evaluations is unknown
+    closing: int = 0  # episodes of evaluations between the limit and the run's end
 
     @property
     def description(self) -> str:
-        """In words, such as "18 of 30 minutes, 4.6 s a generation, about 12 min to go"."""
+        """A text such as "18 of 30 minutes, 4.6 s a generation, about 12 min to go"."""
         parts = [each.description for each in self.bounds] + list(self.others)
         parts = parts or ["no limit: it runs until it is stopped"]
         if self.pace is not None:
@@ -60,28 +60,28 @@ class Eta:
 
 
 def estimate_eta(status: Status) -> Eta:
-    """From the limits, what was done, the pace of the last generations, and the speed of the workers that are there."""
+    """Estimate a run's end from its limits, its progress, the last generations' pace and the present workers' speed."""
     recent = status.recent[-PACE_WINDOW:]
     pace = median(each.seconds for each in recent) if recent else None
-    coming = _next_generation_seconds(status, pace)
-    bounds = tuple(_counted_limits(status, pace, coming))
-    if coming is not None:
+    next_seconds = _next_generation_seconds(status, pace)
+    bounds = tuple(_counted_limits(status, pace, next_seconds))
+    if next_seconds is not None:
         bounds = tuple(sorted(bounds, key=lambda each: math.inf if each.seconds is None else each.seconds))
     known = [0.0] if _is_limit_reached(status) else [each.seconds for each in bounds if each.seconds is not None]
-    limit = min(known) if known and status.state in WORKING else None
+    limit = min(known) if known and status.state in ACTIVE_STATES else None
     closing = _closing_seconds(status)
     seconds = None if limit is None or closing is None else limit + closing
     return Eta(bounds, tuple(_uncounted_limits(status)), pace, limit, seconds, _closing_episodes(status))
 
 
 def describe_state(status: Status) -> str:
-    """What the run does now, and what it waits for; without its name."""
-    tell = STATE_DESCRIPTIONS.get(status.state)
-    return status.state if tell is None else tell(status)
+    """Describe what the run does now, or waits for; without its name."""
+    describe = STATE_DESCRIPTIONS.get(status.state)
+    return status.state if describe is None else describe(status)
 
 
 def summarise_status(status: Status) -> str:
-    """How the run is in one line, for a log; without its name."""
+    """Summarise a status in one line, for a log; without the run's name."""
     if status.is_over:
         return describe_state(status)
     opened, best = status.generation, status.confirmed or status.best
@@ -96,7 +96,7 @@ def summarise_status(status: Status) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """A time as it is said: 0.25 s, 4.6 s, 48 s, 12 min, 3 h 20 min, 5 d 2 h."""
+    """Format a duration: 0.25 s, 4.6 s, 48 s, 12 min, 3 h 20 min, 5 d 2 h."""
     if not math.isfinite(seconds):
         return "very long"
     if seconds < 59.5:
@@ -112,14 +112,14 @@ def format_duration(seconds: float) -> str:
 
 
 def _next_generation_seconds(status: Status, pace: float | None) -> float | None:
-    """Seconds that a generation to come takes: as the last ones, or longer where fewer workers are there."""
+    """Seconds of a future generation: those of the last ones, or more if fewer workers are present now."""
     rate = status.throughput.episodes_per_second
     needed = status.generation.episodes / rate if rate else None
     return max((each for each in (pace, needed) if each is not None), default=None)
 
 
 def _open_generation_seconds(status: Status, pace: float | None) -> float | None:
-    """Seconds that the open generation yet takes, likewise."""
+    """Seconds until the open generation closes, estimated likewise."""
     opened, rate = status.generation, status.throughput.episodes_per_second
     left = None if pace is None else max(pace - opened.seconds, 0.0)
     needed = max(opened.episodes - opened.episodes_done, 0) / rate if rate else None
@@ -127,61 +127,63 @@ def _open_generation_seconds(status: Status, pace: float | None) -> float | None
 
 
 def _closing_episodes(status: Status) -> int:
-    """Episodes of evaluations that the end takes; of a coordinator that does not say it, those that are in progress."""
+    """Episodes of evaluations until the run's end; from older coordinators, those in progress."""
     parts = (status.evaluating, status.confirming) if _is_limit_reached(status) else ()
     return max(status.closing, sum(each.episodes - each.episodes_done for each in parts))
 
 
 def _closing_seconds(status: Status) -> float | None:
-    """Seconds of the evaluations and the confirmation that end the run; `None` before one shows how long they take."""
+    """Seconds of the last evaluations and the confirmation; `None` if the speed of evaluations is unknown."""
     rate = status.throughput.evaluation_episodes_per_second
     closing = _closing_episodes(status)
     return closing / rate if rate else None if closing else 0.0
 
 
-def _counted_limits(status: Status, pace: float | None, coming: float | None) -> Iterator[LimitProgress]:
-    """Each counted limit. A run ends as a generation closes: so the open one is waited for at least."""
+def _counted_limits(status: Status, pace: float | None, next_seconds: float | None) -> Iterator[LimitProgress]:
+    """Each countable limit. A run ends when a generation closes, so never before the open one does."""
     limits, spent, reached = status.limits, status.throughput, _is_limit_reached(status)
-    gone = 0.0 if reached else status.generation.seconds
-    rest = 0.0 if reached else _open_generation_seconds(status, pace)
+    elapsed = 0.0 if reached else status.generation.seconds
+    open_seconds = 0.0 if reached else _open_generation_seconds(status, pace)
     seconds: float | None
     if generations := _limit(limits, "generations"):
         closed = status.generations
         left = max(generations - closed, 0)
-        seconds = None if coming is None or rest is None else (left - 1) * coming + rest if left else 0.0
+        seconds = None
+        if next_seconds is not None and open_seconds is not None:
+            seconds = (left - 1) * next_seconds + open_seconds if left else 0.0
         yield LimitProgress(
             "generations", closed, generations, seconds, f"{closed:,} of {plural(int(generations), 'generation')}"
         )
     if steps := _limit(limits, "steps"):
-        done, rate = (
-            spent.environment_steps,
-            _closed_steps_per_second(status) * (pace / coming if pace and coming else 1.0),
-        )
-        seconds = None if not rate or rest is None else max((steps - done) / rate, rest) if done < steps else rest
+        done = spent.environment_steps
+        rate = _closed_steps_per_second(status) * (pace / next_seconds if pace and next_seconds else 1.0)
+        seconds = None
+        if rate and open_seconds is not None:
+            seconds = max((steps - done) / rate, open_seconds) if done < steps else open_seconds
         yield LimitProgress("steps", done, steps, seconds, f"{format_steps(done)} of {format_steps(int(steps))} steps")
     if (minutes := _limit(limits, "minutes")) and spent.seconds is not None:
-        gone += spent.seconds
-        told_minutes = f"{_format_minutes(gone / 60)} of {_format_minutes(minutes)} minute{'' if minutes == 1 else 's'}"
-        yield LimitProgress("minutes", gone / 60, minutes, max(60 * minutes - gone, rest or 0.0), told_minutes)
+        elapsed += spent.seconds
+        text = f"{_format_minutes(elapsed / 60)} of {_format_minutes(minutes)} minute{'' if minutes == 1 else 's'}"
+        yield LimitProgress("minutes", elapsed / 60, minutes, max(60 * minutes - elapsed, open_seconds or 0.0), text)
 
 
 def _is_limit_reached(status: Status) -> bool:
-    """Whether nobody scores the open generation, which is there for a later life with wider limits."""
+    """Whether a limit is reached: the open generation is scored only if the run is resumed with higher limits."""
     generations, minutes = _limit(status.limits, "generations"), _limit(status.limits, "minutes")
     by_time = bool(minutes) and (status.throughput.seconds or 0.0) >= 60 * minutes
     by_number = 0 < generations <= status.generations
-    return status.ending or by_time or by_number or status.confirming.episodes > 0  # `ending`: not of earlier versions
+    return status.ending or by_time or by_number or status.confirming.episodes > 0  # older versions send no `ending`
 
 
 def _closed_steps_per_second(status: Status) -> float:
-    """Environment steps a second of the generations that were closed last."""
+    """Environment steps a second in the last closed generations."""
     recent = status.recent[-PACE_WINDOW:]
     seconds = sum(each.seconds for each in recent)
     return sum(each.steps for each in recent) / seconds if seconds else 0.0
 
 
 def _uncounted_limits(status: Status) -> Iterator[str]:
-    """The limits that hang on what evaluations will find."""
+    """Describe the limits that depend on the results of evaluations."""
     target, parted = status.limits.get("target"), status.limits.get("parted")
     if isinstance(target, (int, float)):
         best = "" if status.best is None else f" (best {status.best.mean:.0f})"
@@ -191,13 +193,13 @@ def _uncounted_limits(status: Status) -> Iterator[str]:
 
 
 def _limit(limits: Mapping[str, Any], name: str) -> float:
-    """A limit's value; 0 where there is none, or none that this version understands."""
+    """A limit's value; 0 if it is not set, or not a number that this version understands."""
     found = limits.get(name)
     return found if isinstance(found, (int, float)) and 0 < found < math.inf else 0
 
 
 def _format_minutes(value: float) -> str:
-    """Of minutes: whole ones from ten on, else with one decimal."""
+    """Format minutes: without decimals from ten on, else with one."""
     return f"{value:,.0f}" if value >= 10 or value == int(value) else f"{value:.1f}"
 
 
@@ -208,7 +210,7 @@ def _describe_running(status: Status) -> str:
 
 def _describe_evaluating(status: Status) -> str:
     if status.confirming.episodes:
-        return f"confirming what it will report: {_format_episodes(status.confirming)}"
+        return f"confirming its result: {_format_episodes(status.confirming)}"
     if status.evaluating.episodes:
         return f"waiting for an evaluation: {_format_episodes(status.evaluating)}"
     return "evaluating"
@@ -220,8 +222,8 @@ def _describe_waiting(status: Status) -> str:
         return f"waiting for workers; {name} cannot join: {why}"
     known = status.workers.known
     if not known and not status.throughput.environment_steps:
-        return "waiting for workers: none has come yet"
-    return f"waiting for workers: none{f' of {known}' if known else ''} is there"
+        return "waiting for workers: none has joined yet"
+    return f"waiting for workers: none{f' of {known}' if known else ''} is present"
 
 
 def _format_episodes(part: EpisodeProgress) -> str:
@@ -237,9 +239,7 @@ def _describe_ended(status: Status) -> str:
 
 
 def _describe_left(status: Status) -> str:
-    return (
-        f"its coordinator left; `dreamfleet coordinator --resume {status.run}` goes on (its log has the whole command)"
-    )
+    return f"its coordinator left; `dreamfleet coordinator --resume {status.run}` continues it (its log has the whole command)"
 
 
 STATE_DESCRIPTIONS: dict[str, Callable[[Status], str]] = {

@@ -1,4 +1,4 @@
-"""What pictures of runs and trainings have in common: colours, and a run's fitness over its generations."""
+"""Parts of charts that runs and trainings share: colours, and a run's fitness by generation."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ PLOT_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", 
 
 
 def draw_fitness(axes: Any, run: RunFolder) -> list[Any]:
-    """Draw each generation's mean, spread and best; evaluations and the confirmed mean where there are any.
+    """Draw each generation's mean, spread and best fitness, the evaluations and the confirmed score.
 
-    Those have a scale of their own where the run dreams alone, for fitness and score are not of one kind. What comes
-    back is for a legend.
+    Evaluations have a second axis if candidates only dream: dreamed fitness and real score are not comparable. Returns
+    the handles for a legend.
     """
     history, evaluations, settings = run.history(), run.evaluations(), run.settings
     number, mean, std, best = np.array([(each.number, each.mean, each.std, each.best) for each in history]).T
@@ -33,8 +33,8 @@ def draw_fitness(axes: Any, run: RunFolder) -> list[Any]:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     dreamt = settings.task.task == DREAM
-    alone = dreamt and not any(each.stage.driven for each in stages)
-    real = axes.twinx() if alone and evaluations else axes
+    dreams_only = dreamt and not any(each.stage.driven for each in stages)
+    real = axes.twinx() if dreams_only and evaluations else axes
     if evaluations:
         episodes = f"{settings.evaluation_episodes} whole episodes"
         real.errorbar(
@@ -50,7 +50,7 @@ def draw_fitness(axes: Any, run: RunFolder) -> list[Any]:
 
 
 def _draw_confirmed(axes: Any, run: RunFolder) -> None:
-    """The score that the run reports, which lies below its best evaluation where that was lucky."""
+    """Draw the run's confirmed score; it is often below the best evaluation, which is partly luck."""
     if (confirmed := run.confirmation()) is not None:
         axes.errorbar(
             confirmed.generation, confirmed.mean, confirmed.error, fmt="*", color="tab:red", capsize=3, markersize=10,

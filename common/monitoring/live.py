@@ -1,8 +1,8 @@
-"""Looking on while a worker scores: its live frames, the newest one alone, whoever else watches.
+"""Watching a worker while it scores: a stream of its newest live frames.
 
 >>> with Client(("tcp/127.0.0.1:7447",)) as client, LiveView(client, "night") as view:  # doctest: +SKIP
-...     for sight in view:
-...         print(sight.worker, sight.frame.generation, sight.frame.candidate, sight.frame.step)
+...     for live in view:
+...         print(live.worker, live.frame.generation, live.frame.candidate, live.frame.step)
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from dreamfleet.common.protocol.messages import ViewFrame
 from dreamfleet.common.serialization.validation import MalformedError
 from dreamfleet.common.transport.session import enqueue_into
 
-RETRY_SECONDS = 1.0  # seconds between looks for a worker, where there is none
-SILENCE_SECONDS = 2.0  # seconds without a frame after which the run is asked whether the worker is still there
-PRESENT = "present"  # a worker's state
+RETRY_SECONDS = 1.0  # between two searches for a worker while there is none
+SILENCE_SECONDS = 2.0  # without a frame, after which the run's status is queried
+PRESENT = "present"  # `WorkerStatus.state`
 Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """A frame that was looked at: of whom it is, and what is in it, as arrays; `None` is what it does not hold."""
+    """A decoded frame: its worker, and its contents as arrays; `None` for contents that it lacks."""
 
     worker: str  # name/life
     frame: ViewFrame
@@ -50,7 +50,7 @@ class LiveFrame:
 
     @classmethod
     def of(cls, worker: str, frame: ViewFrame) -> LiveFrame:
-        """`MalformedError` for a frame whose contents are not what it says."""
+        """Decode a frame; `MalformedError` if its contents do not fit its description."""
         numbers = (_decode_floats(each) for each in (frame.latent, frame.state, frame.parameters))
         return cls(worker, frame, unpack_picture(frame), *numbers)
 
@@ -58,28 +58,29 @@ class LiveFrame:
 class LiveView:
     """The newest frame of one worker of a run; use it in a `with`.
 
-    Each worker that somebody subscribes to publishes, so a view subscribes to one, and to another where that one goes.
+    A worker publishes frames while somebody subscribes to it. So a view subscribes to a single worker, and to another
+    one when that leaves.
     """
 
     def __init__(self, client: Client, run: str | None = None, worker: str | None = None) -> None:
-        """`run` may be left out where only one is live; `worker` is its name, or `name/life`, or whoever works.
+        """`run` may be omitted if only one is live. `worker` is a name or `name/life`; by default the busiest worker.
 
-        `UsageError` names the workers where there is none of this name.
+        `UsageError` for an unknown worker lists those of the run.
         """
-        self.status = client.status(run)  # as it was asked last
+        self.status = client.status(run)  # the last one received
         self.dropped = CountingDecoder()
         self._client, self._wanted = client, worker
         self._newest = _LatestSample()
         self._last_statuses: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._subscriber: Any = None
         self._subscribed_worker = ""
-        self._quiet_since = self._look_at = monotonic()
+        self._quiet_since = self._search_at = monotonic()
         if worker is not None and self._choose_worker() is None:
             known = ", ".join(each.worker for each in self._present_workers()) or "none yet"
             raise UsageError(f"run {self.run} has no worker {worker!r}: it has {known}")
 
     def __enter__(self) -> LiveView:
-        enqueue = enqueue_into(self._last_statuses, "status", most=1)
+        enqueue = enqueue_into(self._last_statuses, "status", max_waiting=1)
         self._status_subscriber: Any = self._client.session.declare_subscriber(keys.event_status(self.run), enqueue)
         return self
 
@@ -90,10 +91,10 @@ class LiveView:
         self._unsubscribe()
 
     def __iter__(self) -> Iterator[LiveFrame]:
-        """Every sight that there is time for, until the run is over."""
+        """Yield frames, skipping those that come too fast, until the run is over."""
         while not self.is_over:
-            if (sight := self.next(SILENCE_SECONDS)) is not None:
-                yield sight
+            if (live := self.next(SILENCE_SECONDS)) is not None:
+                yield live
 
     @property
     def run(self) -> str:
@@ -102,16 +103,16 @@ class LiveView:
 
     @property
     def is_over(self) -> bool:
-        """Whether the run ended or was left, as far as is known."""
+        """Whether the run ended or was left, by the last received status."""
         return self.status.is_over
 
     def next(self, timeout: float) -> LiveFrame | None:
-        """The newest frame that was not taken yet, waited for until `timeout`; `None` if there is none, or none yet.
+        """Wait up to `timeout` seconds for the newest frame not returned yet; `None` if there is none.
 
-        Of frames that come faster than they are taken only the newest is kept. After a silence the run is asked:
-        `ConnectionFailedError` where its coordinator is gone, where the named worker is, or where it is another run.
+        Older frames that were not fetched in time are dropped. After a silence the run's status is queried:
+        `ConnectionFailedError` if the coordinator or the named worker is gone, or another run has this name now.
         """
-        if self._subscriber is None and monotonic() >= self._look_at:
+        if self._subscriber is None and monotonic() >= self._search_at:
             self._subscribe()
         sample = self._newest.take(timeout)
         now = monotonic()
@@ -120,12 +121,12 @@ class LiveView:
             if not self.is_over and now - self._quiet_since > SILENCE_SECONDS:
                 self._refresh_status()
             return None
-        sight = self._decode_frame(sample)
-        if sight is not None:
+        live = self._decode_frame(sample)
+        if live is not None:
             self._quiet_since = now
-        elif now - self._quiet_since > SILENCE_SECONDS:  # what comes is of another run, or nobody's
+        elif now - self._quiet_since > SILENCE_SECONDS:  # only frames of another run, or damaged ones
             self._refresh_status()
-        return sight
+        return live
 
     def _decode_frame(self, sample: zenoh.Sample) -> LiveFrame | None:
         frame = self.dropped.decode(ViewFrame, sample.payload.to_bytes())
@@ -141,13 +142,13 @@ class LiveView:
             return None
 
     def _receive_last_status(self) -> None:
-        """As the coordinator leaves it says how the run is; nobody answers for it afterwards."""
+        """Take the final status, which a coordinator publishes as it leaves; afterwards nobody answers queries."""
         with suppress(queue.Empty):
             _, sample = self._last_statuses.get_nowait()
             self.status = read_status(read_document(sample.payload.to_bytes()))
 
     def _refresh_status(self) -> None:
-        """After a silence: is the run still the same, and is the worker still there."""
+        """Query the status after a silence: the run may be another one, or the worker may have left."""
         self._quiet_since = monotonic()
         status = self._client.status(self.run)
         if status.run_uid != self.status.run_uid:
@@ -162,13 +163,13 @@ class LiveView:
 
     def _subscribe(self) -> None:
         """Subscribe to a worker, if there is one."""
-        self._look_at = monotonic() + RETRY_SECONDS
+        self._search_at = monotonic() + RETRY_SECONDS
         chosen = self._choose_worker()
         if chosen is None:
             return
         self._subscribed_worker, self._quiet_since = chosen, monotonic()
-        take = zenoh.handlers.Callback(self._newest.put, indirect=False)
-        self._subscriber = self._client.session.declare_subscriber(keys.view(self.run, chosen), take)
+        callback = zenoh.handlers.Callback(self._newest.put, indirect=False)
+        self._subscriber = self._client.session.declare_subscriber(keys.view(self.run, chosen), callback)
 
     def _unsubscribe(self) -> None:
         if self._subscriber is not None:
@@ -176,7 +177,7 @@ class LiveView:
             self._subscriber, self._subscribed_worker = None, ""
 
     def _choose_worker(self) -> str | None:
-        """The wanted worker, or the busiest."""
+        """The wanted worker, or the busiest one; `None` if there is none."""
         name = self._wanted
         found = [
             each for each in self._present_workers() if name is None or name in (each.worker, each.worker.split("/")[0])
@@ -189,20 +190,20 @@ class LiveView:
 
 
 class _LatestSample:
-    """One place: what is put replaces what was not taken."""
+    """A buffer for one sample; a new one replaces one that was not taken."""
 
     def __init__(self) -> None:
-        self._kept: deque[zenoh.Sample] = deque(maxlen=1)
-        self._there = threading.Event()
+        self._samples: deque[zenoh.Sample] = deque(maxlen=1)
+        self._available = threading.Event()
 
     def put(self, sample: zenoh.Sample) -> None:
-        self._kept.append(sample)
-        self._there.set()
+        self._samples.append(sample)
+        self._available.set()
 
     def take(self, timeout: float) -> zenoh.Sample | None:
-        self._there.wait(timeout)
-        self._there.clear()
-        return self._kept.popleft() if self._kept else None
+        self._available.wait(timeout)
+        self._available.clear()
+        return self._samples.popleft() if self._samples else None
 
 
 def _decode_floats(data: bytes) -> Floats | None:

@@ -1,7 +1,6 @@
-"""A stream of pictures: parts of `multipart/x-mixed-replace`, each with its facts in a header.
+"""A stream of JPEGs as `multipart/x-mixed-replace`, each part with metadata in a header.
 
-`dreamfleet live --out -` writes it. Whoever serves pictures to people, and has no simulator, runs that verb as a
-process and reads what it writes.
+`dreamfleet live --out -` writes it, and the dashboard, which has no simulator, runs that verb and reads its output.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ MAX_HEADER_LINE = 64 << 10  # of a header
 
 
 def write_part(out: BinaryIO, picture: bytes, facts: dict[str, Any]) -> None:
-    """One more JPEG, and what it shows."""
+    """Write one JPEG with its metadata."""
     about = f"Content-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n{FACTS}: {json.dumps(facts)}"
     out.write(f"--{BOUNDARY}\r\n{about}\r\n\r\n".encode("ascii") + picture + b"\r\n")
     out.flush()
 
 
 def read_parts(stream: IO[bytes]) -> Iterator[tuple[bytes, dict[str, Any]]]:
-    """Each JPEG with its facts, until the stream ends, or is no such stream any more."""
+    """Yield each JPEG with its metadata, until the stream ends or is damaged."""
     while (head := _read_head(stream)) is not None:
         try:
             length, facts = int(head["content-length"]), json.loads(head.get(FACTS.lower(), "{}"))
@@ -38,9 +37,9 @@ def read_parts(stream: IO[bytes]) -> Iterator[tuple[bytes, dict[str, Any]]]:
 
 
 def _read_head(stream: IO[bytes]) -> dict[str, str] | None:
-    """The headers of the next part, by names in lower case; `None` at the end."""
+    """The headers of the next part by lower-case name; `None` at the end of the stream."""
     line = b"\r\n"
-    while line == b"\r\n":  # after the last picture
+    while line == b"\r\n":  # the empty line after the previous picture
         line = stream.readline(MAX_HEADER_LINE)
     if line.strip() != f"--{BOUNDARY}".encode():
         return None

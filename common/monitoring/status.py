@@ -1,7 +1,7 @@
-"""How a run is, as one document: what a coordinator answers under `status`, and what every view reads.
+"""The status of a run as one document: a coordinator's reply under `status`, which every view reads.
 
-It is one consistent moment. What may be long comes as its head, with the total beside it, so that the answer stays
-under the message limit; the parts `workers`, `history`, `evaluations` and `candidates` give the rest page by page.
+It is a consistent snapshot. Long lists are truncated, with their total beside them, so that the reply stays under the
+message limit; the parts `workers`, `history`, `evaluations` and `candidates` return them page by page.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dreamfleet.common.serialization.validation import MalformedError, from_plai
 
 STATUS_SCHEMA_VERSION = 2
 PARTS = ("", "generation", "workers", "history", "evaluations", "candidates", "best", "story")
-FINAL_STATES = ("ended", "left")  # the states in which a coordinator leaves
+FINAL_STATES = ("ended", "left")  # the coordinator leaves in these states
 LongText = Annotated[str, Length(0, 10_000)]
 
 
@@ -33,7 +33,7 @@ class EpisodeProgress:
 
 @dataclass(frozen=True)
 class StageStatus:
-    """Where a run is in its schedule, and what counts there."""
+    """The current stage of a run's schedule, and its settings."""
 
     number: Count  # from 1
     total: Count
@@ -52,18 +52,18 @@ class GenerationStatus:
 
     number: Count
     episodes_done: Count
-    episodes: Count  # as far as that is known: racing decides on half of them later
+    episodes: Count  # known so far: with racing, half of them are decided later
     seconds: Seconds  # since it was opened
-    sigma: float  # the strategy's step size
-    temperature: float | None  # at which it dreams; `None` where a task has none
+    sigma: float  # the optimiser's step size
+    temperature: float | None  # of the dream; `None` if the task has none
     stage: StageStatus | None = field(default=None, metadata=OPTIONAL)  # `None` without a schedule
-    # The longest axis of the strategy's distribution by the shortest; `None` where the optimiser does not say.
+    # Ratio of the longest to the shortest axis of the search distribution; `None` if the optimiser does not report it.
     axis_ratio: float | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One candidate of a generation: its fitness so far is the mean of the episodes that are done."""
+    """One candidate of a generation; its fitness is the mean over its finished episodes."""
 
     generation: int
     index: int
@@ -74,30 +74,30 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Population:
-    """Candidates of one generation from index `offset` on, of `total`: a column for each property."""
+    """The candidates of one generation from index `offset` on, of `total`, column by column."""
 
     generation: Count
     offset: Count
     total: Count
-    done: tuple[Count, ...]  # episodes
-    wanted: tuple[Count, ...]  # episodes, as far as that is known
+    done: tuple[Count, ...]  # finished episodes
+    wanted: tuple[Count, ...]  # episodes known so far
     fitness: tuple[float | None, ...]
 
     @property
     def has_equal_columns(self) -> bool:
-        """Whether its columns are equally long."""
+        """Whether its columns have equal lengths."""
         return len(self.done) == len(self.wanted) == len(self.fitness)
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
-        """The same, a row for each candidate."""
+        """The candidates as rows."""
         columns = zip(self.done, self.wanted, self.fitness, strict=True)
         return tuple(Candidate(self.generation, index, *row) for index, row in enumerate(columns, self.offset))
 
 
 @dataclass(frozen=True)
 class WorkerStatus:
-    """What the coordinator believes of one worker."""
+    """A worker as the coordinator knows it."""
 
     worker: Word
     state: Word  # present, silent or lost
@@ -107,15 +107,15 @@ class WorkerStatus:
     steps_per_second: float
     load: float
     drawn_by: Word
-    heard: float  # seconds ago
+    heard: float  # seconds since its last message
     fingerprint: Text
-    # Seconds that a candidate's job took a slot of late; `None` before the first.
+    # Recent seconds of a candidate's job in a slot; `None` before the first.
     job_seconds: float | None = field(default=None, metadata=OPTIONAL)
-    # The least of late until it was known that a batch had arrived, in seconds: beats tell it, so that the network's
-    # own round trip is shorter. `None` before the first.
+    # Recent minimum of the seconds until a heartbeat acknowledged a batch: an upper bound of the network's round trip.
+    # `None` before the first.
     round_trip: float | None = field(default=None, metadata=OPTIONAL)
-    resent: Count = field(default=0, metadata=OPTIONAL)  # batches that were sent again
-    host_class: HostClass = field(default="", metadata=OPTIONAL)  # not known yet
+    resent: Count = field(default=0, metadata=OPTIONAL)  # batches
+    host_class: HostClass = field(default="", metadata=OPTIONAL)  # empty: not known yet
 
 
 EventKind = Literal[
@@ -126,40 +126,40 @@ EventKind = Literal[
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened to a worker, or to a job in its hands."""
+    """An event of a worker, or of a job that it holds."""
 
     ago: float  # seconds
     what: EventKind
     worker: Word
-    job: Annotated[str, Length(0, 128)]  # kind generation/candidate/episode; empty where it is of no job that is known
+    job: Annotated[str, Length(0, 128)]  # kind generation/candidate/episode; empty if of no known job
 
 
 @dataclass(frozen=True)
 class WorkerCount:
-    """How many workers there are."""
+    """Numbers of workers."""
 
     present: Count
-    known: Count  # the lost ones too
-    # Vanished without a word in the last minutes, and not back. `None` from a coordinator that forgets them at once.
+    known: Count  # lost ones included
+    # Lost in the last minutes and not back; `None` from older coordinators.
     lost: Count | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
 class Throughput:
-    """How fast the fleet is, and what it has done."""
+    """The fleet's speed and its total work."""
 
     steps_per_second: float
     environment_steps: Count
-    # Of closed generations: what a limit of minutes counts. `None` from a coordinator of before this.
+    # Of closed generations, which a limit of minutes counts; `None` from older coordinators.
     seconds: Seconds | None = field(default=None, metadata=OPTIONAL)
-    # At the present workers' speed, if they drove nothing else; `None` before it is known.
+    # At the present workers' speed if they scored nothing else; `None` if unknown.
     episodes_per_second: float | None = field(default=None, metadata=OPTIONAL)  # of candidates
     evaluation_episodes_per_second: float | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
 class Waste:
-    """What was done twice or for nothing; `share` is that of environment steps."""
+    """Work that was repeated or discarded; `share` is that of environment steps."""
 
     discarded_steps: Count
     share: float
@@ -175,13 +175,13 @@ class Waste:
 
 @dataclass(frozen=True)
 class FailureStatus:
-    """A wanted job that failed somewhere."""
+    """An open job that failed on some worker."""
 
     candidate: Word  # generation/index
     kind: Word
     seeds: tuple[Count, ...]
-    errors: dict[str, str]  # the last of each worker
-    attempts: dict[str, int]  # how often each worker failed
+    errors: dict[str, str]  # the last error of each worker
+    attempts: dict[str, int]  # failures of each worker
 
 
 @dataclass(frozen=True)
@@ -194,54 +194,52 @@ class Status:
     incarnation: Count
     package: Word | None  # version of the coordinator's dreamfleet
     state: Word  # running, evaluating, waiting for workers, paused, ended, left
-    why: LongText  # it is paused, or ended
+    why: LongText  # reason why it is paused or ended
     settings: RunSettings
     limits: dict[str, Any]
     uptime: Seconds
     generation: GenerationStatus
     generations: Count  # closed ones
     last: StoredGeneration | None
-    recent: tuple[StoredGeneration, ...]  # the last of the closed ones, oldest first
-    population: Population  # the head of the open generation's candidates
-    last_population: Population | None  # the head of those of the one that was closed last
+    recent: tuple[StoredGeneration, ...]  # the last closed ones, oldest first
+    population: Population  # the first candidates of the open generation
+    last_population: Population | None  # the first candidates of the last closed generation
     evaluation: StoredEvaluation | None  # the last one
-    best: StoredEvaluation | None  # of all; provisional, for the best of many looks is in part luck
+    best: StoredEvaluation | None  # of all; provisional, as the best of many is partly luck
     evaluations: Count  # finished ones
     evaluating: EpisodeProgress
     collecting: EpisodeProgress
     workers: WorkerCount
-    worker_list: tuple[WorkerStatus, ...]  # the first of those that are known
+    worker_list: tuple[WorkerStatus, ...]  # the first of the known workers
     slots: Count
     fingerprint: Text | None
     throughput: Throughput
     waste: Waste
-    failing: Count  # wanted jobs that failed somewhere
-    failures: tuple[FailureStatus, ...]  # the first of them
+    failing: Count  # open jobs that failed on some worker
+    failures: tuple[FailureStatus, ...]  # the first of these
     dropped: dict[str, int]  # messages, by reason
-    refused: dict[str, str] = field(default_factory=dict, metadata=OPTIONAL)  # workers that could not join, and why
-    confirmed: StoredConfirmation | None = field(default=None, metadata=OPTIONAL)  # of what is reported
+    refused: dict[str, str] = field(default_factory=dict, metadata=OPTIONAL)  # workers that could not join: reason
+    confirmed: StoredConfirmation | None = field(default=None, metadata=OPTIONAL)  # of the reported mean
     confirming: EpisodeProgress = field(default=EpisodeProgress(0, 0), metadata=OPTIONAL)  # one round of a confirmation
     strict: bool = field(default=False, metadata=OPTIONAL)  # hosts of another class than the first result's are refused
-    classes: HostClasses = field(
-        default=HostClasses(), metadata=OPTIONAL
-    )  # of the hosts that scored, by accepted results
-    # When the coordinator's join file ends, in seconds since 1970; `None` where it has none.
+    classes: HostClasses = field(default=HostClasses(), metadata=OPTIONAL)  # of the accepted results
+    # When the coordinator's join file expires, in seconds since 1970; `None` without one.
     expires: float | None = field(default=None, metadata=OPTIONAL)
 
-    ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: evaluations are all that is waited for
-    # Episodes of means that the run's end yet takes: evaluations in progress, the last one, the confirmation.
+    ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: only evaluations are left
+    # Episodes of evaluations and of the confirmation until the run's end.
     closing: Count = field(default=0, metadata=OPTIONAL)
 
     @property
     def is_over(self) -> bool:
-        """Whether its coordinator leaves, because the run ended or was left open."""
+        """Whether the run ended or its coordinator leaves it open."""
         return self.state in FINAL_STATES
 
 
 def read_status(document: dict[str, Any]) -> Status:
-    """The typed form of a `status` answer; what a later version added is ignored.
+    """Parse a `status` reply; fields of later versions are ignored.
 
-    `MalformedError` says what to install where it is not understood.
+    `MalformedError` says which version to install if it cannot be read.
     """
     try:
         status = from_plain(Status, known(Status, document))
@@ -252,25 +250,24 @@ def read_status(document: dict[str, Any]) -> Status:
         run, schema = document.get("run", "?"), document.get("schema", "?")
         package = document.get("package") or "another version"
         raise MalformedError(
-            f"run {run} describes its status in words that this version does not know "
-            f"(schema {schema}, not {STATUS_SCHEMA_VERSION}: {error}); "
-            f"install the coordinator's dreamfleet ({package}) here"
+            f"this version cannot read the status of run {run} (schema {schema}, not {STATUS_SCHEMA_VERSION}: "
+            f"{error}); install the coordinator's dreamfleet ({package}) here"
         ) from error
 
 
 def read_document(payload: bytes) -> dict[str, Any]:
-    """The JSON object in an answer; `MalformedError` if it is none."""
+    """Parse a reply's JSON object; `MalformedError` if it is none."""
     try:
         document = json.loads(payload, parse_int=_parse_count) if len(payload) <= MAX_MESSAGE else None
     except (ValueError, RecursionError):
         document = None
     if not isinstance(document, dict):
-        raise MalformedError("what answers for the run is no status: install the same dreamfleet here and there")
+        raise MalformedError("the reply for the run is not a status: install the same dreamfleet here and there")
     return document
 
 
 def _parse_count(digits: str) -> int:
-    """A number as every other message can hold it; more digits are no count, and no float can be made of them."""
+    """Parse an integer of at most 64 bits; a longer one may not fit a float."""
     number = int(digits)
     if abs(number) >= 2**64:
         raise ValueError(digits[:20])

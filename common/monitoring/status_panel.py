@@ -1,4 +1,4 @@
-"""A run's status as a picture for a terminal of any size: what matters least gives way, and no name is cut."""
+"""A run's status as a panel for a terminal of any size: the least important lines give way; no name is truncated."""
 
 from __future__ import annotations
 
@@ -44,30 +44,30 @@ STATE_STYLES = {
     "left": "bold yellow",
     "waiting for workers": "yellow",
 }
-FRAME_WIDTH = 4  # columns of border and air
-BORDERS = 2  # lines
+FRAME_WIDTH = 4  # columns of border and padding
+BORDER_LINES = 2
 LABEL_WIDTH = 17  # columns of a fact's name
-TWO_COLUMN_WIDTH = 110  # columns from which on facts stand in two
-BAR = 40  # columns at most
-MAX_CURVE_LINES = 8  # lines at most
-UNKNOWN_ADDRESS = "--connect tcp/HOST:PORT"  # of a worker, where it is not known how the run is reached
+TWO_COLUMN_WIDTH = 110  # columns from which facts are in two columns
+MAX_BAR_WIDTH = 40  # columns
+MAX_CURVE_LINES = 8
+UNKNOWN_ADDRESS = "--connect tcp/HOST:PORT"  # worker flags if the run's address is not known
 
 
 @dataclass(frozen=True)
 class Block:
-    """A part of the picture: it takes `least` lines or none, would have `wish`, and has use for `most`."""
+    """A part of the panel: it is left out, or has from `min_lines` to `max_lines` lines."""
 
-    need: int  # 0 first: who gets lines before others
-    least: int
-    wish: int
-    most: int
+    priority: int  # blocks of lower numbers get lines first
+    min_lines: int
+    preferred_lines: int
+    max_lines: int
     draw: Callable[[int], list[Text]]
 
 
 class RunPanel:
-    """The whole picture; `fitted`: as high as the terminal at most, for one that is drawn again and again.
+    """The whole panel; if `fitted`, no higher than the terminal, for repeated drawing.
 
-    A worker is started with `worker_flags`, which say where the run is.
+    `worker_flags` are the flags with which a worker joins the run, for display.
     """
 
     def __init__(self, status: Status, worker_flags: str = UNKNOWN_ADDRESS, *, fitted: bool = False) -> None:
@@ -78,7 +78,7 @@ class RunPanel:
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
         """A panel of the console's width."""
         status = self._status
-        lines = options.max_height - BORDERS - 1 if self._fitted else None  # the last line is for the shell's prompt
+        lines = options.max_height - BORDER_LINES - 1 if self._fitted else None  # one line for the shell's prompt
         state = printable(status.state), STATE_STYLES.get(status.state, "")
         title = Text.assemble((printable(status.run), "bold"), " · ", state)
         content = Group(*panel_lines(status, options.max_width - FRAME_WIDTH, lines, self._worker_flags))
@@ -88,43 +88,43 @@ class RunPanel:
 def panel_lines(
     status: Status, width: int, lines: int | None = None, worker_flags: str = UNKNOWN_ADDRESS
 ) -> list[Text]:
-    """The picture without its frame, in `width` columns and at most so many lines; `None`: as many as it takes."""
+    """The panel without its frame, in `width` columns and at most `lines` lines; `None`: no limit."""
     blocks = list(_blocks(status, max(width, 1), worker_flags))
     return [line for block, given in zip(blocks, allocate_lines(blocks, lines), strict=True) if given
             for line in block.draw(given)[:given]]  # fmt: skip
 
 
 def allocate_lines(blocks: Sequence[Block], lines: int | None) -> list[int]:
-    """The lines that each block has: in the order of need first the least of each, then its wish, then the most."""
+    """Give `lines` to the blocks by priority: first the minimum of each, then the preferred number, then the rest."""
     if lines is None:
-        return [each.most for each in blocks]
+        return [each.max_lines for each in blocks]
     given, left = [0] * len(blocks), lines
-    order = sorted(range(len(blocks)), key=lambda index: blocks[index].need)
+    order = sorted(range(len(blocks)), key=lambda index: blocks[index].priority)
     for index in order:
-        if blocks[index].least <= left:
-            given[index] = blocks[index].least
+        if blocks[index].min_lines <= left:
+            given[index] = blocks[index].min_lines
             left -= given[index]
-    for aim in ("wish", "most"):
+    for target in ("preferred_lines", "max_lines"):
         for index in order:
-            more = min(getattr(blocks[index], aim) - given[index], left) if given[index] else 0
+            more = min(getattr(blocks[index], target) - given[index], left) if given[index] else 0
             given[index] += max(more, 0)
             left -= max(more, 0)
     return given
 
 
 def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
-    """From top to bottom."""
+    """The blocks from top to bottom."""
     state = STATE_STYLES.get(status.state, "")
-    yield _text_block(0, Text(printable(describe_state(status)), style=state), width, least=2)
+    yield _text_block(0, Text(printable(describe_state(status)), style=state), width, min_lines=2)
     if status.failures and not status.why:
-        yield _text_block(1, Text(printable(_describe_failure(status.failures[0])), style="red"), width, least=1)
+        yield _text_block(1, Text(printable(_describe_failure(status.failures[0])), style="red"), width, min_lines=1)
     if not status.is_over:
-        yield _text_block(2, Text(printable(estimate_eta(status).description)), width, least=1)
+        yield _text_block(2, Text(printable(estimate_eta(status).description)), width, min_lines=1)
     if progress := list(_progress_lines(status, width)):
         yield Block(3, 1, len(progress), len(progress), lambda _: progress)
     facts = list(_facts(status))
-    most = len(_fact_lines(facts, width))
-    yield Block(4, min(3, most), min(5, most), most, lambda given: _fit_facts(facts, width, given))
+    max_lines = len(_fact_lines(facts, width))
+    yield Block(4, min(3, max_lines), min(5, max_lines), max_lines, lambda given: _fit_facts(facts, width, given))
     if len(status.recent) > 1:
         yield Block(
             7, 1, 4, MAX_CURVE_LINES, lambda given: _curve_lines(status.recent, width, given, status.generation.stage)
@@ -136,19 +136,19 @@ def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
     yield _workers_block(status, width, worker_flags)
 
 
-def _text_block(need: int, text: Text, width: int, least: int) -> Block:
+def _text_block(priority: int, text: Text, width: int, min_lines: int) -> Block:
     lines = _wrap(text.plain, width)
     drawn = [Text(each, style=text.style) for each in lines]
-    return Block(need, min(least, len(lines)), len(lines), len(lines), lambda given: drawn[:given])
+    return Block(priority, min(min_lines, len(lines)), len(lines), len(lines), lambda given: drawn[:given])
 
 
 def _wrap(text: str, width: int) -> list[str]:
-    """Broken between words; text of wide characters anywhere."""
+    """Wrap between words; text with wide characters anywhere."""
     return textwrap.wrap(text, width) if cell_len(text) == len(text) else chop_cells(text, width)
 
 
 def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
-    """Need (0 first), name and value, in the order in which they stand."""
+    """Priority (0 is highest), name and value of each fact, in display order."""
     settings, task, waste = status.settings, status.settings.task, status.waste
     temperature, stage = status.generation.temperature, status.generation.stage
     now, size = (task, settings) if stage is None else (stage, stage)
@@ -176,7 +176,7 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
 
 
 def _fit_facts(facts: Sequence[tuple[int, str, str]], width: int, lines: int) -> list[Text]:
-    """Those that are needed most, as many as have room."""
+    """The facts of the highest priorities that fit into `lines`."""
     for count in range(len(facts), 0, -1):
         kept = sorted(facts, key=lambda each: each[0])[:count]
         drawn = _fact_lines([each for each in facts if each in kept], width)
@@ -186,7 +186,7 @@ def _fit_facts(facts: Sequence[tuple[int, str, str]], width: int, lines: int) ->
 
 
 def _fact_lines(facts: Sequence[tuple[int, str, str]], width: int) -> list[Text]:
-    """Names beside values, in two columns where there is room."""
+    """Names and values as lines, in two columns if there is room."""
     half = (width - 2) // 2
     if width < TWO_COLUMN_WIDTH:
         return [line for each in facts for line in _fact(each, width)]
@@ -234,46 +234,46 @@ def _describe_failure(failure: FailureStatus) -> str:
 
 
 def _progress_lines(status: Status, width: int) -> Iterator[Text]:
-    """What goes on beside the generation."""
+    """Progress bars of evaluations, confirmation and rollouts in progress."""
     parts = {"evaluation": status.evaluating, "confirmation": status.confirming, "kept rollouts": status.collecting}
     for label, part in parts.items():
         if part.episodes:
             share = part.episodes_done / part.episodes
-            told = f" {part.episodes_done}/{part.episodes} episodes"
-            drawn = share_bar(share, max(min(BAR, width - LABEL_WIDTH - len(told)), 0))
-            yield Text.assemble((label.ljust(LABEL_WIDTH), "dim"), (drawn, "cyan"), told)
+            count = f" {part.episodes_done}/{part.episodes} episodes"
+            drawn = share_bar(share, max(min(MAX_BAR_WIDTH, width - LABEL_WIDTH - len(count)), 0))
+            yield Text.assemble((label.ljust(LABEL_WIDTH), "dim"), (drawn, "cyan"), count)
 
 
 def _open_population(status: Status) -> Population | None:
-    """The candidates to show: once a run is over, those of the generation that was closed last."""
+    """The candidates to show: the open generation's, or the last closed one's once the run is over."""
     population = status.last_population if status.is_over else status.population
     return population if population is not None and population.done else None
 
 
 def _candidate_lines(status: Status, population: Population, width: int, lines: int) -> list[Text]:
-    """A line about them, and their cells."""
+    """A caption and the grid of candidates."""
     found = [each for each in population.candidates if each.fitness is not None]
     episodes: GenerationStatus | EpisodeProgress = status.generation
     done, wanted = episodes.episodes_done, episodes.episodes
     if population.generation != status.generation.number:
         done, wanted = sum(population.done), sum(population.wanted)
-    told = [f"{done:,}/{wanted:,} episodes"]
+    parts = [f"{done:,}/{wanted:,} episodes"]
     if found:
         values = [each.fitness or 0.0 for each in found]
-        told.append(f"so far {min(values):.0f} to {max(values):.0f}")
+        parts.append(f"so far {min(values):.0f} to {max(values):.0f}")
     if population.total > len(population.done):
-        told.append(f"the first {len(population.done)} of {population.total} candidates")
-    caption = f"generation {population.generation}".ljust(LABEL_WIDTH) + ", ".join(told)
+        parts.append(f"the first {len(population.done)} of {population.total} candidates")
+    caption = f"generation {population.generation}".ljust(LABEL_WIDTH) + ", ".join(parts)
     return [Text(caption[:width], style="dim"), *candidate_grid(population, width, lines - 1)]
 
 
 def _curve_lines(
     history: Sequence[StoredGeneration], width: int, lines: int, stage: StageStatus | None = None
 ) -> list[Text]:
-    """The mean fitness of all generations: a line of bars, or, with more lines, a plot under a caption.
+    """The mean fitness of all generations: a line of bars, or, with more lines, a bar chart under a caption.
 
-    Where there are more than columns a bar is the mean of several. Those before the open generation's stage are dim:
-    their fitness may be of another kind.
+    If there are more generations than columns, a bar is the mean of several. Generations of earlier stages are dim:
+    their fitness may not be comparable.
     """
     caption = "mean fitness by generation"
     margin = max(len(f"{each.mean:.0f}") for each in history) + 1
@@ -301,9 +301,9 @@ def _colour_bars(row: str, earlier: int) -> tuple[tuple[str, str], tuple[str, st
     return (row[:earlier], "dim green"), (row[earlier:], "green")
 
 
-def _downsample(values: Sequence[float], most: int) -> list[float]:
-    """At most so many: the means of neighbours, as equally many of them as can be."""
-    count = min(len(values), most)
+def _downsample(values: Sequence[float], max_count: int) -> list[float]:
+    """At most `max_count` values: means of groups of neighbours of nearly equal size."""
+    count = min(len(values), max_count)
     edges = [len(values) * each // count for each in range(count + 1)]
     return [sum(each / (last - first) for each in values[first:last]) for first, last in pairwise(edges)]
 
@@ -311,12 +311,15 @@ def _downsample(values: Sequence[float], most: int) -> list[float]:
 def _workers_block(status: Status, width: int, worker_flags: str) -> Block:
     if status.worker_list:
         roster = WorkerTable(status.worker_list, status.workers.known)
-        most = roster.height(width)
-        return Block(6, min(3, most), min(8, most), most, lambda given: roster.lines(width, given))
-    said = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
+        height = roster.height(width)
+        return Block(6, min(3, height), min(8, height), height, lambda given: roster.lines(width, given))
+    messages = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
     task = status.settings.task.task
-    own = f" --task {task}" if is_unregistered(task) else ""
-    none = "no worker is there" if status.throughput.environment_steps else "no workers yet"
-    said = said or [f"{none}; start one with", f"dreamfleet worker --run {status.run} {worker_flags}{own}"]
-    lines = [Text(part, style="yellow") for each in said for part in _wrap(printable(each), width)]
+    task_flag = f" --task {task}" if is_unregistered(task) else ""
+    none = "no worker is present" if status.throughput.environment_steps else "no workers yet"
+    messages = messages or [
+        f"{none}; start one with",
+        f"dreamfleet worker --run {status.run} {worker_flags}{task_flag}",
+    ]
+    lines = [Text(part, style="yellow") for each in messages for part in _wrap(printable(each), width)]
     return Block(6, min(3, len(lines)), len(lines), len(lines), lambda given: lines[:given])

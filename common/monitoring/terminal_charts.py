@@ -1,4 +1,4 @@
-"""Numbers and shares as characters of a terminal: a curve as bars, candidates as cells that fill in. Pure."""
+"""Charts of terminal characters: a curve as bars, a share as a bar, candidates as cells. No input or output."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ WAITING = "·"
 
 
 def bar_chart(values: Sequence[float], rows: int) -> list[str]:
-    """A column of bars for each value, `rows` lines high, the top line first; the least value is an eighth high."""
+    """A bar for each value, `rows` lines high, the top line first; the smallest value is one eighth of a line high."""
     low, high = min(values), max(values)
-    span = high / 2 - low / 2  # halves, so that no difference overflows
+    span = high / 2 - low / 2  # halves: the difference may overflow
     heights = [1 + (round((each / 2 - low / 2) / span * (8 * rows - 1)) if span > 0 else 0) for each in values]
     return ["".join(EIGHTHS[min(max(each - 8 * row, 0), 8)] for each in heights) for row in reversed(range(rows))]
 
 
 def share_bar(share: float, width: int) -> str:
-    """A share from 0 to 1 as a bar of so many columns."""
+    """A share from 0 to 1 as a bar of `width` columns."""
     done = round(min(max(share, 0.0), 1.0) * width)
     return "━" * done + "╌" * (width - done)
 
 
 def candidate_grid(population: Population, width: int, lines: int) -> list[Text]:
-    """A cell for each candidate, the best so far marked; a cell stands for several where they are too many.
+    """A cell for each candidate, or for several if there are too many; the best one so far is highlighted.
 
     At most `lines` lines of at most `width` columns.
     """
     found = population.candidates
-    together = max(1, ceil(len(found) / (width * lines)))
+    group_size = max(1, ceil(len(found) / (width * lines)))
     best = max((each for each in found if each.fitness is not None), key=_fitness, default=None)
-    cells = [_cell(group, best) for group in _grouped(found, together)]
+    cells = [_cell(group, best) for group in _grouped(found, group_size)]
     return [Text.assemble(*cells[start : start + width]) for start in range(0, len(cells), width)]
 
 
 def candidate_grid_height(population: Population, width: int) -> int:
-    """Lines with which each candidate has a cell of its own."""
+    """The number of lines at which each candidate has its own cell."""
     return max(1, ceil(len(population.done) / width))
 
 
-def _grouped(found: Sequence[Candidate], together: int) -> Iterator[Sequence[Candidate]]:
-    return (found[start : start + together] for start in range(0, len(found), together))
+def _grouped(found: Sequence[Candidate], group_size: int) -> Iterator[Sequence[Candidate]]:
+    return (found[start : start + group_size] for start in range(0, len(found), group_size))
 
 
 def _fitness(each: Candidate) -> float:

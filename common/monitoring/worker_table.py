@@ -1,4 +1,7 @@
-"""The workers of a run as lines of a terminal: columns go by worth, rows by need, and no name is cut. Pure."""
+"""A run's workers as a table of any size for a terminal; no name is truncated. No input or output.
+
+In a narrow terminal columns are left out in `DROP_ORDER`, in a low one the rows of unremarkable workers.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,8 @@ from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.monitoring.status import WorkerStatus
 from dreamfleet.common.printable import printable
 
-COLUMN_GAP = 2  # columns of air between two columns
-SLOW_FACTOR = 1.5  # times the median of seconds a job: the slowest is marked from there on
+COLUMN_GAP = 2  # spaces between two columns
+SLOW_FACTOR = 1.5  # the slowest worker is marked if its seconds a job exceed the median by this factor
 COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
     "worker": lambda each: each.worker,
     "state": lambda each: each.state if each.state == "present" else f"{each.state} for {format_duration(each.heard)}",
@@ -35,21 +38,21 @@ LEFT_ALIGNED = ("worker", "state", "picture")
 
 @dataclass(frozen=True)
 class WorkerTable:
-    """The workers that are told of, of `known`."""
+    """The table of `workers`, which may be the first of `known` ones."""
 
     workers: Sequence[WorkerStatus]
     known: int
 
     def height(self, width: int) -> int:
-        """Lines with which each of them is shown."""
+        """The number of lines at which every worker is shown."""
         return 1 + sum(_row_height(each, width) for each in self.workers) + (self.known > len(self.workers))
 
-    def lines(self, width: int, most: int) -> list[Text]:
-        """At most `most` lines, 3 at least, of `width` columns: those of whom there is most to say, in their order."""
+    def lines(self, width: int, max_lines: int) -> list[Text]:
+        """At most `max_lines` (3 or more) lines of `width` columns: the workers of the highest priority, in order."""
         slowest = find_slowest(self.workers)
         shown = set(range(len(self.workers)))
-        if self.height(width) > most:
-            room, shown = most - 2, set()
+        if self.height(width) > max_lines:
+            room, shown = max_lines - 2, set()
             for row in sorted(range(len(self.workers)), key=lambda row: _priority(self.workers[row], slowest)):
                 room -= _row_height(self.workers[row], width)
                 if room < 0 and shown:
@@ -62,14 +65,16 @@ class WorkerTable:
 
 
 def find_slowest(workers: Sequence[WorkerStatus]) -> WorkerStatus | None:
-    """The worker that takes longest for a job, if it stands out from the others."""
+    """The worker with the longest jobs, if these exceed the median by `SLOW_FACTOR`."""
     times = {each.worker: each.job_seconds for each in workers if each.job_seconds is not None}
-    last = max(workers, key=lambda each: times.get(each.worker, 0.0), default=None)
-    return last if last and times and times.get(last.worker, 0.0) > SLOW_FACTOR * median(times.values()) else None
+    slowest = max(workers, key=lambda each: times.get(each.worker, 0.0), default=None)
+    if slowest and times and times.get(slowest.worker, 0.0) > SLOW_FACTOR * median(times.values()):
+        return slowest
+    return None
 
 
 def _priority(each: WorkerStatus, slowest: WorkerStatus | None) -> tuple[bool, bool, float]:
-    """Who is lost or silent comes first, then the slowest ones."""
+    """Sort key: lost and silent workers first, then the slowest ones."""
     return each.state == "present", each is not slowest, -(each.job_seconds or 0.0)
 
 
@@ -80,8 +85,8 @@ def _row_height(each: WorkerStatus, width: int) -> int:
 def _build_table(
     workers: Sequence[WorkerStatus], shown: Collection[int], slowest: WorkerStatus | None, width: int
 ) -> list[Text]:
-    """A heading and the rows that are shown; the columns fit all workers, so that they stand still."""
-    cells = {name: [printable(tell(each)) for each in workers] for name, tell in COLUMNS.items()}
+    """A heading and the shown rows; column widths fit all workers, so that they do not change with the shown ones."""
+    cells = {name: [printable(text_of(each)) for each in workers] for name, text_of in COLUMNS.items()}
     for row, each in enumerate(workers):
         cells["state"][row] += ", slowest" if each is slowest else ""
     widths = {name: max(map(cell_len, (name, *column))) for name, column in cells.items()}
@@ -100,5 +105,5 @@ def _build_table(
 
 
 def _pad(name: str, text: str, width: int) -> str:
-    air = " " * (width - cell_len(text))
-    return text + air if name in LEFT_ALIGNED else air + text
+    padding = " " * (width - cell_len(text))
+    return text + padding if name in LEFT_ALIGNED else padding + text

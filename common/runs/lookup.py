@@ -11,8 +11,8 @@ from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.artifacts.trained_agent import TrainedAgent, is_agent
 from dreamfleet.common.errors import BundleError, ControllerError, JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_file, path_exists
-from dreamfleet.common.host.processes import shell_command
-from dreamfleet.common.runs.run_folder import BUNDLE, CONTROLLER, JOURNAL, open_run
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command
 
 SUBSPACES = "subspaces"  # the folder of those that ship, each named as its world model
 
@@ -40,7 +40,7 @@ def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Pa
     if is_file(run / JOURNAL):
         raise ControllerError(
             f"run {name} has no controller yet: it is written as the first generation is closed; an older run's is "
-            f"written once it is continued: {shell_command('coordinator', '--resume', name, '--runs-dir', runs_dir)}"
+            f"written once it is continued: {resume_command(run)}"
         )
     names = ", ".join(sorted(each.stem for each in pretrained_folder().glob("*.npz"))) or "none"
     raise ControllerError(f"no controller {name!r}: give a file, a run, or one that ships: {names}")

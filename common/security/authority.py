@@ -26,7 +26,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from dreamfleet.common.errors import AccessError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, check_output_path, reporting_write_errors
-from dreamfleet.common.files.folder_lock import folder_lock
+from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.files.regular_files import read_regular, read_text
 from dreamfleet.common.protocol.keys import check_worker_name
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, IssuedJoinFile

@@ -103,7 +103,7 @@ class Watcher:
         try:
             if self._client is None:
                 self._client = Client(self._network)
-                heard = enqueue_into(self._final_statuses, "status", most=MOST_RUNS)
+                heard = enqueue_into(self._final_statuses, "status", max_waiting=MOST_RUNS)
                 self._client.session.declare_subscriber(keys.event_status("*"), heard)
             found = self._client.statuses(ANSWER_TIMEOUT)
         except (HandshakeRejectedError, MalformedError) as error:

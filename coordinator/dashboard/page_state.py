@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.monitoring.eta import Eta, describe_state, estimate_eta, format_duration
 from dreamfleet.common.monitoring.status import Population, Status, WorkerStatus
 from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import format_steps
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.run_paths import resume_command
 from dreamfleet.common.runs.stages import describe_steps
 
 LIVE, LOST, OVER = "live", "lost", "over"
@@ -74,11 +74,6 @@ def _lost_sentence(look: RunSnapshot) -> str:
         "nobody answers for it: its coordinator was killed, or the network is cut. The page goes on once it is back; "
         f"after a kill: {printable(' '.join(words))}, with {rest}"
     )
-
-
-def resume_command(folder: Path) -> str:
-    """The command that goes on with the run in `folder`, as far as its journal's place tells it."""
-    return shell_command("coordinator", "--resume", folder.name, "--runs-dir", folder.parent)
 
 
 def _eta(eta: Eta) -> dict[str, Any]:

@@ -21,10 +21,11 @@ from dreamfleet.common.runs.records import (
     describe_score,
     expand_task_options,
 )
-from dreamfleet.common.runs.run_folder import RunFolder, open_run, run_paths
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.runs.run_paths import resume_command, run_paths
 from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.coordinator.dashboard.curves import Quartiles, RunData, cumulative_effort, curves, downsample
-from dreamfleet.coordinator.dashboard.page_state import NONE, Facts, describe_optimiser, format_score, resume_command
+from dreamfleet.coordinator.dashboard.page_state import NONE, Facts, describe_optimiser, format_score
 
 COLUMNS = (
     "run", "created", "begun", "task", "generations", "mean", "best", "confirmed", "best_error", "confirmed_error",

@@ -34,7 +34,8 @@ from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.monitoring.status_panel import RunPanel
 from dreamfleet.common.runs.records import best_evaluation
-from dreamfleet.common.runs.run_folder import CONTROLLER, open_run
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 
 REFRESH = 0.5

@@ -9,7 +9,7 @@ from pathlib import Path
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
-from dreamfleet.common.runs.run_folder import rollout_path
+from dreamfleet.common.runs.run_paths import rollout_path
 from dreamfleet.common.runs.seeds import collection_seed
 from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler
 from dreamfleet.coordinator.jobs.work import Work, make_work

@@ -6,7 +6,8 @@ from collections.abc import Iterable
 
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
-from dreamfleet.common.runs.run_folder import CONFIRMED, CONTROLLER
+from dreamfleet.common.runs.run_folder import CONFIRMED
+from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.coordinator.jobs.confirmation import FINALISTS, Confirmation, total_episodes
 from dreamfleet.coordinator.jobs.evaluation import Evaluation, Evaluations

@@ -12,10 +12,13 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.cli.global_config import GlobalConfig
 from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
+from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import Intervals
 from dreamfleet.common.runs.records import RunSettings
-from dreamfleet.common.runs.run_folder import ARCHIVE, BUNDLE, JOURNAL, open_run, run_lock
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_lock import run_lock
+from dreamfleet.common.runs.run_paths import ARCHIVE, BUNDLE, JOURNAL, resume_command
 from dreamfleet.common.security.certificate_ledger import RevocationWatcher
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.session import Network
@@ -23,7 +26,7 @@ from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.service.service import Service
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
-from dreamfleet.coordinator.settings.resume_settings import resume_command, serving_facts
+from dreamfleet.coordinator.settings.resume_settings import serving_facts
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, StartPoint
 from dreamfleet.coordinator.storage.file_watch import FileWatch
 from dreamfleet.coordinator.storage.journal import Journal
@@ -58,7 +61,8 @@ class RunRequest:
 
     def resume_command(self, folder: Path | None = None) -> str:
         """The command that continues the run, also in a `folder` that it was moved to."""
-        return resume_command(folder or self.folder, self.join, self.access_dir)
+        own_access_dir = None if self.access_dir == GlobalConfig.access_dir else self.access_dir
+        return resume_command(folder or self.folder, self.join, own_access_dir)
 
 
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
@@ -67,12 +71,8 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
     if request.config is not None and request.name == ARCHIVE:
         raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
     settings, bundle = _resolve_settings(request, folder)
-    try:
+    with reporting_unwritable_folder(request.runs_dir, "choose another --runs-dir", JournalError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise JournalError(
-            f"cannot write in {request.runs_dir}: {error.strerror}; choose another --runs-dir"
-        ) from error
     with run_lock(folder), ExitStack() as stack:
         journal = stack.enter_context(closing(_open_journal(request, folder, settings, bundle)))
         served = stack.enter_context(closing(ServedBundle(folder / BUNDLE))) if bundle else None

@@ -13,7 +13,8 @@ from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.protocol.host_classes import BY_FINGERPRINT
 from dreamfleet.common.runs.records import RunSettings
-from dreamfleet.common.runs.run_folder import CONTROLLER, JOURNAL, RunFolder, open_run
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
 from dreamfleet.coordinator.optimisers.registry import known_optimisers
 from dreamfleet.coordinator.settings.config import LimitsConfig, RunConfig, config_values

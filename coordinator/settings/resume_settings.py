@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.cli.config import Table, read_table
 from dreamfleet.common.cli.global_config import GlobalConfig
 from dreamfleet.common.errors import JournalError, UsageError
-from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT
@@ -59,13 +57,6 @@ def choose_addresses(
         connect = global_config.connect or (credentials.connect if credentials else ())
     default = DEFAULT_ENDPOINT if credentials is None else SECURED_ENDPOINT
     return replace(own, listen=listen or (() if connect else (default,)), connect=connect)
-
-
-def resume_command(folder: Path, join: object = None, access_dir: Path = GlobalConfig.access_dir) -> str:
-    """The command that continues the run in `folder`, as a person writes it: what is not kept with the run is said."""
-    joined = () if join is None else ("--join", join)
-    access = () if join is None or access_dir == GlobalConfig.access_dir else ("--access-dir", access_dir)
-    return shell_command("coordinator", "--resume", folder.name, "--runs-dir", folder.parent, *joined, *access)
 
 
 def resolve_strict(network: NetworkConfig, *, said: bool) -> NetworkConfig:

@@ -20,7 +20,8 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.effort import START_EFFORT, Effort, parse_start_effort
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.records import RunSettings
-from dreamfleet.common.runs.run_folder import JOURNAL, RunFolder, open_run
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.run_provenance import read_run_provenance
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint

@@ -21,11 +21,11 @@ from importlib.resources import files as resources
 from pathlib import Path
 
 from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.files.archives import write_archive
 
 NAME = "dreamfleet"
 NATIVE = (".so", ".pyd", ".dylib")
 EXTRA = "worker"
-_TIME = (1980, 1, 1, 0, 0, 0)  # the earliest of a zip: equal files give equal bytes
 _REQUIREMENT = re.compile(r"([A-Za-z0-9._-]+)[^;]*(?:;(.*))?")
 
 
@@ -105,9 +105,7 @@ def pack_wheel(*, native: bool) -> Wheel:
     lines = [f"{name},sha256={_digest(data)},{len(data)}" for name, data in files.items()]
     files[record] = "\n".join([*lines, f"{record},,", ""]).encode()
     out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in files.items():
-            archive.writestr(zipfile.ZipInfo(name, _TIME), data, zipfile.ZIP_DEFLATED)
+    write_archive(out, files.items(), zipfile.ZIP_DEFLATED)
     return Wheel(f"{head}-{tag}.whl", out.getvalue())
 
 

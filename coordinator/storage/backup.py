@@ -6,7 +6,6 @@ The copy is a run like any other.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import sqlite3
@@ -16,7 +15,10 @@ from pathlib import Path
 
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.atomic_write import fsync_path
-from dreamfleet.common.runs.run_folder import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS, RunFolder, open_run, run_lock
+from dreamfleet.common.files.locks import try_lock
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.runs.run_lock import run_lock
+from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS
 
 
 def back_up(source: RunFolder, target: Path) -> None:
@@ -49,10 +51,8 @@ def _backup_lock(target: Path) -> Iterator[None]:
     path = target.with_name(f".{target.name}.lock")
     while True:
         with path.open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise UsageError(f"another backup into {target} is at work: wait for it") from None
+            if not try_lock(lock):
+                raise UsageError(f"another backup into {target} is at work: wait for it")
             if not path.exists() or not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
                 continue  # who held it has removed it
             try:

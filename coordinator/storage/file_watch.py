@@ -15,7 +15,7 @@ from pathlib import Path
 from tempfile import gettempdir
 
 from dreamfleet.common.errors import DreamfleetError, JournalError
-from dreamfleet.common.runs.run_folder import JOURNAL
+from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.storage.journal import Journal, sqlite_side_files
 from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 

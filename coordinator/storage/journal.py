@@ -20,21 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DreamfleetError, JournalError
-from dreamfleet.common.files.atomic_write import atomic_write, fsync_path
+from dreamfleet.common.files.atomic_write import atomic_write, fsync_path, reporting_unwritable_folder
 from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS, LONGEST_EPISODE, max_steps, to_finite
 from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.journal_reader import class_counts_query, efforts_query
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.run_folder import (
-    BUNDLE,
-    ENDED_AT,
-    JOURNAL,
-    RunFolder,
-    class_counts_query,
-    efforts_query,
-)
+from dreamfleet.common.runs.run_folder import ENDED_AT, RunFolder
+from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL
 from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
@@ -94,7 +89,7 @@ class Journal:
             )
         aside = path.with_suffix(".new")
         own = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": _now()}
-        try:
+        with reporting_unwritable_folder(folder, "choose another --runs-dir", JournalError):
             # What a journal that was removed left beside it would be taken for this one's, and damage it.
             for left in (aside, *sqlite_side_files(aside), *sqlite_side_files(path)):
                 left.unlink(missing_ok=True)
@@ -108,8 +103,6 @@ class Journal:
                 connection.commit()
             aside.replace(path)
             fsync_path(folder)
-        except OSError as error:
-            raise JournalError(f"cannot write in {folder}: {error.strerror}; choose another --runs-dir") from error
         return cls(path)
 
     def close(self) -> None:

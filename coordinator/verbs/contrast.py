@@ -46,7 +46,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
     """Do all trials that are left, and compare."""
-    from dreamfleet.common.files.folder_lock import folder_lock
+    from dreamfleet.common.files.locks import folder_lock
     from dreamfleet.coordinator.experiments.contrast.trials import LOCK, Trials
     from dreamfleet.coordinator.experiments.local_run import LocalFleet
     from dreamfleet.coordinator.experiments.run_flags import parse_run_flags

@@ -173,7 +173,7 @@ def _report(
 ) -> None:  # fmt: skip
     from dreamfleet.common.monitoring.eta import format_duration
     from dreamfleet.common.runs.records import describe_score
-    from dreamfleet.common.runs.run_folder import CONTROLLER
+    from dreamfleet.common.runs.run_paths import CONTROLLER
 
     again = request.resume_command()
     path = request.folder / CONTROLLER

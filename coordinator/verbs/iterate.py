@@ -54,7 +54,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
     """Go on until all rounds are finished, and tell what came of them."""
-    from dreamfleet.common.files.folder_lock import folder_lock
+    from dreamfleet.common.files.locks import folder_lock
     from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 
     for package in PACKAGES:

@@ -7,7 +7,9 @@ import argparse
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import JournalError
-from dreamfleet.common.runs.run_folder import ARCHIVE, check_movable, open_run, reporting_folder_errors, run_lock
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_lock import run_lock
+from dreamfleet.common.runs.run_paths import ARCHIVE, check_movable, reporting_folder_errors
 
 SUMMARY = "move a run that nobody serves into the archive"
 EXTRAS = ()

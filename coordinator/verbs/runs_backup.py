@@ -8,6 +8,7 @@ from pathlib import Path
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import resume_command
 from dreamfleet.common.transport.network import SECURED_PREFIX
 
 SUMMARY = "copy a run, served or not, into another folder of runs, from which it can go on"
@@ -24,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Copy, and look at the copy."""
-    from dreamfleet.coordinator.settings.resume_settings import resume_command, stored_network
+    from dreamfleet.coordinator.settings.resume_settings import stored_network
     from dreamfleet.coordinator.storage.backup import back_up
 
     target = args.to / args.run_name

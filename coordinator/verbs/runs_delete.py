@@ -9,7 +9,9 @@ import sys
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs.run_folder import check_movable, open_run, reporting_folder_errors, run_lock
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_lock import run_lock
+from dreamfleet.common.runs.run_paths import check_movable, reporting_folder_errors
 
 SUMMARY = "delete a run that nobody serves, with its journal, controller and videos"
 EXTRAS = ()

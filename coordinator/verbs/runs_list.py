@@ -10,7 +10,8 @@ from pathlib import Path
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_rows
 from dreamfleet.common.errors import JournalError
-from dreamfleet.common.runs.run_folder import ARCHIVE, RunFolder, run_paths
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.run_paths import ARCHIVE, run_paths
 
 SUMMARY = "list the runs on this disk"
 EXTRAS = ()

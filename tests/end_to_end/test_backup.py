@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.artifacts.bundle_store import find_bundle
-from dreamfleet.common.runs.run_folder import BUNDLE, JOURNAL, ROLLOUTS, open_run
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL, ROLLOUTS
 from dreamfleet.coordinator.storage import backup
 from tests.end_to_end.test_same_bits import GENERATIONS, SETTINGS, outcome
 

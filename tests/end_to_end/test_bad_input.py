@@ -135,7 +135,7 @@ def test_a_full_stdout_is_one_line(processes, odd, more):
             stderr=subprocess.PIPE, check=False, text=True, timeout=DEADLINE,
         )  # fmt: skip
     assert done.returncode == 1
-    assert done.stderr.splitlines() == ["dreamfleet: what this verb prints could not be written: no space left"]
+    assert done.stderr.splitlines() == ["dreamfleet: cannot write to stdout: no space left"]
 
 
 def test_a_controller_of_another_shape(processes, tmp_path):

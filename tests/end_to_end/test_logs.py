@@ -18,7 +18,7 @@ def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, random_bun
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
         "--task", tasks.TOY, "--generations", 100000, "--log-format", "auto",
     )  # fmt: skip
-    record = json.loads(coordinator.wait_for("no worker is there"))
+    record = json.loads(coordinator.wait_for("no worker is present"))
     assert record["event"] == "no worker"
     program, *words = shlex.split(record["command"])
     assert program == "dreamfleet"
@@ -90,6 +90,6 @@ def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(proc
         session.declare_queryable(key, lambda query: query.reply(key, status))
         for run in ((), ("night",)):
             code, _, err = processes.call("story", *run, "--connect", processes.endpoint)
-            assert (code, "run night tells no story: a worker's join file may not" in err) == (1, True), err
+            assert (code, "run night sends no events: a worker's join file has no right" in err) == (1, True), err
     code, _, err = processes.call("story", "night", "--connect", processes.endpoint)
     assert (code, "nobody answers" in err) == (1, True), err

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.runs.run_folder import CONTROLLER, open_run
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.run_provenance import read_run_provenance
 from tests.support import tasks
 from tests.support.processes import DEADLINE, ROOT

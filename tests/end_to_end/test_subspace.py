@@ -7,7 +7,8 @@ import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.subspace import SearchSpace, Subspace
-from dreamfleet.common.runs.run_folder import CONTROLLER, open_run
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import CONTROLLER
 from tests.support import tasks
 
 STAGES = """

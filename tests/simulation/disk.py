@@ -12,7 +12,7 @@ from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.run_folder import JOURNAL
+from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection

@@ -15,7 +15,7 @@ import torch
 
 from dreamfleet.common.errors import StoppedError
 from dreamfleet.common.files.atomic_write import atomic_write
-from dreamfleet.common.files.folder_lock import folder_lock
+from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.common.runs.seeds import training_seed
 from dreamfleet.worker.baselines.agent_config import AgentConfig

@@ -10,8 +10,8 @@ from pathlib import Path
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle, shipped_names
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import BundleError, DatasetError, JournalError, MissingExtraError, UsageError
-from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.errors import BundleError, JournalError, MissingExtraError, UsageError
+from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.stages import begun_stages, join_distinct
@@ -80,7 +80,7 @@ def write_page(
     `pictures` are the user's own files, shown to the bundle's VAE, or without a bundle to that of the first folder.
     """
     sections: list[Section] = []
-    try:
+    with reporting_unwritable_folder(out, "choose another --out"):
         out.mkdir(parents=True, exist_ok=True)
         trained = load_trainings(data)
         for section in sections_of(subject, config, data, pictures, trained):
@@ -91,8 +91,6 @@ def write_page(
                     file.write(section.picture)
         with atomic_write(out / PAGE) as file:
             file.write(_page(subject, trained, sections).html().encode(errors="replace"))
-    except OSError as error:
-        raise DatasetError(f"cannot write in {out}: {error.strerror}; choose another --out") from error
     return out / PAGE
 
 

@@ -48,11 +48,9 @@ def fetch_bundle(
         for attempt in range(1, MAX_ATTEMPTS + 1):
             if (bundle := store.find(sha256)) is not None:  # another worker of this host was faster
                 return bundle
-            try:
+            with store.reporting_write_errors():  # the partial file stays: the next worker continues from there
                 from_start = not path.exists() or path.stat().st_size == 0
                 sources = _download(session, keys.bundle(run, sha256), sha256, path, inbox, stopped, corrupt_sources)
-            except OSError as error:  # the parts so far stay, and the next worker continues from there
-                raise store.write_error(error) from error
             if stopped():
                 return None
             try:

@@ -12,7 +12,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.trained_agent import TrainedAgent
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.resource_limits import usable_cores
-from dreamfleet.common.runs import lookup, run_folder
+from dreamfleet.common.runs import lookup, run_folder, run_paths
 from dreamfleet.common.runs.episode_results import EpisodeResults
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.worker.scoring.agents import Agent, make_agent
@@ -74,4 +74,4 @@ def _agent(controller: Controller | TrainedAgent, bundle: Bundle | None) -> Agen
 
 
 def _folder(runs_dir: Path | str | None) -> Path:
-    return run_folder.default_runs_dir() if runs_dir is None else Path(runs_dir)
+    return run_paths.default_runs_dir() if runs_dir is None else Path(runs_dir)

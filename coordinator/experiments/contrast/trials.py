@@ -14,7 +14,8 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import is_folder, path_exists, read_text
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.records import best_evaluation
-from dreamfleet.common.runs.run_folder import JOURNAL, open_run
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.experiments.contrast.config import Contrast, Trial
 from dreamfleet.coordinator.experiments.contrast.summary import TrialResult
 from dreamfleet.coordinator.experiments.local_run import LocalFleet, evolve

@@ -21,8 +21,9 @@ from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
-from dreamfleet.common.runs.run_folder import BUNDLE as RUN_BUNDLE
-from dreamfleet.common.runs.run_folder import JOURNAL, RunFolder, open_run
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.runs.run_paths import BUNDLE as RUN_BUNDLE
+from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.experiments.iteration import artefacts, gate
 from dreamfleet.coordinator.experiments.iteration.commands import Commands, Words
 from dreamfleet.coordinator.experiments.iteration.layout import ENCODED, EPISODES

@@ -64,8 +64,8 @@ def test_another_number_is_another_subspace(subspace):
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"weights": np.zeros((0, 5), np.float32)}, "no features"),
-        ({"weights": np.zeros(5, np.float32)}, "no features"),
+        ({"weights": np.zeros((0, 5), np.float32)}, "must have shape"),
+        ({"weights": np.zeros(5, np.float32)}, "must have shape"),
         ({"weights": np.full((3, 5), np.nan, np.float32)}, "NaN, or numbers beyond"),
         ({"weights": np.full((3, 5), 2e6, np.float32)}, "NaN, or numbers beyond"),
         ({"weights": np.zeros((3, 1 << 18), np.float32)}, "786432 weights"),
@@ -74,8 +74,8 @@ def test_another_number_is_another_subspace(subspace):
         ({"about": {"names": ["a", "b"]}}, "as many offsets and names"),
         ({"about": {"names": ["a", "b", "c" * 200]}}, "short texts"),
         ({"about": {"names": ["a", "b", 3]}}, "short texts"),
-        ({"about": {"names": 3}}, "names are no list"),
-        ({"about": {"names": "abc"}}, "names are no list"),
+        ({"about": {"names": 3}}, "names are not a list"),
+        ({"about": {"names": "abc"}}, "names are not a list"),
         ({"about": {"bundle": ""}}, "short texts"),
         ({"about": {"format": 2}}, "another format"),
         ({"about": {"format": True}}, "another format"),

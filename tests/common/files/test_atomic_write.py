@@ -25,7 +25,7 @@ def test_where_no_file_can_be_is_said_before_the_work(tmp_path):
     with pytest.raises(UsageError, match="is a folder"):
         check_output_path(tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="cannot be made"):
+    with pytest.raises(UsageError, match="cannot be created"):
         check_output_path(tmp_path / "file" / "tiny.json")
 
 
@@ -34,7 +34,7 @@ def test_a_device_or_pipe_stays_what_it_is(tmp_path):
     os.mkfifo(pipe)
     link.symlink_to(pipe)
     for path in (pipe, link):
-        with pytest.raises(UsageError, match="it is no regular file: name another"):
+        with pytest.raises(UsageError, match="it is not a regular file: choose another"):
             check_output_path(path)
         with pytest.raises(DreamfleetError, match="cannot write"), open_output(path):
             pass
@@ -60,7 +60,7 @@ def test_a_read_only_folder_is_reported_before_the_work():
         with without_root():
             check_output_path(folder / "tiny.json")
         folder.chmod(0o555)
-        with without_root(), pytest.raises(UsageError, match="cannot be written in"):
+        with without_root(), pytest.raises(UsageError, match="is not writable"):
             check_output_path(folder / "tiny.json")
 
 

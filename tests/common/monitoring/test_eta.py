@@ -121,21 +121,21 @@ def test_limits_of_another_version_are_passed_over(strange):
         ({"state": "evaluating", "evaluating": EpisodeProgress(3, 16)}, "waiting for an evaluation: 3 of 16 episodes"),
         (
             {"state": "evaluating", "confirming": EpisodeProgress(3, 1600)},
-            "confirming what it will report: 3 of 1,600 episodes",
+            "confirming its result: 3 of 1,600 episodes",
         ),
-        ({"state": "waiting for workers"}, "waiting for workers: none of 1 is there"),
+        ({"state": "waiting for workers"}, "waiting for workers: none of 1 is present"),
         (
             {"state": "waiting for workers", "workers": WorkerCount(0, 0), "steps": 0},
-            "waiting for workers: none has come yet",
+            "waiting for workers: none has joined yet",
         ),
-        ({"state": "waiting for workers", "workers": WorkerCount(0, 0)}, "waiting for workers: none is there"),
+        ({"state": "waiting for workers", "workers": WorkerCount(0, 0)}, "waiting for workers: none is present"),
         (
             {"state": "waiting for workers", "refused": {"old-host": "no AVX2"}},
             "waiting for workers; old-host cannot join: no AVX2",
         ),
         (
             {"state": "left"},
-            "its coordinator left; `dreamfleet coordinator --resume night` goes on (its log has the whole command)",
+            "its coordinator left; `dreamfleet coordinator --resume night` continues it (its log has the whole command)",
         ),
         (
             {"state": "ended", "why": "30 minutes", "best": None},

@@ -109,10 +109,12 @@ SIZES = st.tuples(st.integers(0, 9), st.integers(1, 5), st.integers(0, 5), st.in
 
 @given(st.lists(SIZES), st.integers(0, 40))
 def test_no_more_lines_are_allotted_than_there_are(parts, lines):
-    blocks = [Block(need, least, least + wish, least + wish + most, list) for need, least, wish, most in parts]
+    blocks = [Block(priority, least, least + more, least + more + most, list) for priority, least, more, most in parts]
     given_lines = allocate_lines(blocks, lines)
     assert sum(given_lines) <= lines
-    assert all(found == 0 or each.least <= found <= each.most for found, each in zip(given_lines, blocks, strict=True))
+    assert all(
+        found == 0 or each.min_lines <= found <= each.max_lines for found, each in zip(given_lines, blocks, strict=True)
+    )
 
 
 def test_candidates_are_cells_that_fill_in_and_the_best_is_marked():
@@ -144,7 +146,7 @@ def test_workers_beyond_the_head_are_counted():
 def test_a_run_without_workers_says_how_to_start_one():
     gone = dataclasses.replace(STATUS, worker_list=())
     told = drawn(gone, 80, "--connect tcp/lab:7448")
-    assert "no worker is there; start one with" in told
+    assert "no worker is present; start one with" in told
     assert "dreamfleet worker --run night --connect tcp/lab:7448" in told
     new = dataclasses.replace(gone, throughput=dataclasses.replace(gone.throughput, environment_steps=0))
     assert "no workers yet; start one with" in drawn(new, 80)

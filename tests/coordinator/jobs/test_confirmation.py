@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import StoredEvaluation
-from dreamfleet.common.runs.run_folder import CONTROLLER, RunFolder
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, VALIDATION
 from dreamfleet.coordinator.jobs.confirmation import FINALISTS, Confirmation, Finalist, total_episodes
 from dreamfleet.coordinator.settings.config import LimitsConfig

@@ -9,7 +9,8 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.lookup import find_controller
-from dreamfleet.common.runs.run_folder import CONTROLLER, RunFolder
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.coordinator.run.report import SAVE_INTERVAL
 from dreamfleet.coordinator.settings.config import LimitsConfig
 from dreamfleet.coordinator.settings.start import find_start

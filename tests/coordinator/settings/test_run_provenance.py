@@ -11,7 +11,7 @@ from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.effort import START_EFFORT, Effort
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
-from dreamfleet.common.runs.run_folder import CONTROLLER
+from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.run_provenance import read_run_provenance, read_run_settings
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.settings.rerun import Rerun

@@ -7,7 +7,8 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import RunSettings, StoredGeneration
-from dreamfleet.common.runs.run_folder import RunFolder, open_run, run_lock
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation

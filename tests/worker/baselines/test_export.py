@@ -186,9 +186,9 @@ def rewritten(file, change=lambda about: about, network=None):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda _about: [], "is no JSON object"),
+        (lambda _about: [], "is not a JSON object"),
         (lambda about: about | {"format": 9}, "of format 9; this version reads 1"),
-        (lambda about: about | {"network": "ab" * 32}, "is not the one that its manifest names"),
+        (lambda about: about | {"network": "ab" * 32}, "is not the one in its manifest"),
         (lambda about: about | {"frame_skip": 0}, "out of range"),
         (lambda about: about | {"frame_skip": True}, "wrong type"),
         (lambda about: about | {"state": 10**9}, "out of range"),

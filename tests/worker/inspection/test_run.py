@@ -10,7 +10,7 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.records import RunSettings, StoredGeneration
-from dreamfleet.common.runs.run_folder import CONTROLLER, run_paths
+from dreamfleet.common.runs.run_paths import CONTROLLER, run_paths
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal

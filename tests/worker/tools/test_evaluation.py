@@ -62,7 +62,7 @@ def test_what_goes_wrong_in_a_process_ends_the_evaluation_and_says_why(controlle
 def test_a_world_model_is_found_beside_its_controller_or_by_name(controller, random_bundle):
     assert find_bundle_of(controller(), str(random_bundle.path)).sha256 == random_bundle.sha256
     assert find_bundle_of(controller(), None, random_bundle.path).sha256 == random_bundle.sha256
-    with pytest.raises(BundleError, match="is not the world model that is wanted"):
+    with pytest.raises(BundleError, match="is another world model"):
         find_bundle_of(replace(controller(), bundle="ab" * 32), None, random_bundle.path)
     with pytest.raises(BundleError, match="name it with --bundle"):
         find_bundle_of(controller(), None)

@@ -3,7 +3,7 @@ import sqlite3
 
 import pytest
 
-from dreamfleet.common.runs.run_folder import JOURNAL
+from dreamfleet.common.runs.run_paths import JOURNAL
 from tests.support import tasks
 
 

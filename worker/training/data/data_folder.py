@@ -5,12 +5,12 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import read_text
 
 NAME = "preset.json"
@@ -70,13 +70,9 @@ def resolve_preset(folder: Path, given: str | None) -> str:
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
-@contextmanager
-def explain_folder_errors(folder: Path) -> Iterator[None]:
+def explain_folder_errors(folder: Path) -> AbstractContextManager[None]:
     """Raise an `OSError` as a `DatasetError` that asks for another data folder than `folder`."""
-    try:
-        yield
-    except OSError as error:
-        raise DatasetError(f"cannot write in {folder}: {error.strerror}; choose another --data") from error
+    return reporting_unwritable_folder(folder, "choose another --data")
 
 
 @contextmanager

@@ -1,0 +1,64 @@
+"""Paths of runs on disk: the files in a run's folder, the list of runs, and the command that resumes one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dreamfleet.common.errors import JournalError
+from dreamfleet.common.files.regular_files import is_folder
+from dreamfleet.common.host.processes import shell_command
+
+JOURNAL = "journal.sqlite"
+BUNDLE = "bundle.zip"
+CONTROLLER = "controller.npz"
+ARCHIVE = "archive"
+ROLLOUTS = "rollouts"
+
+
+def default_runs_dir() -> Path:
+    """The folder of all runs: `$DREAMFLEET_RUNS_DIR`, else `runs` in the current folder."""
+    return Path(os.environ.get("DREAMFLEET_RUNS_DIR", "runs"))
+
+
+def run_paths(runs_dir: Path) -> Iterator[Path]:
+    """The folders of all runs, by name."""
+    if not is_folder(runs_dir):
+        return
+    for journal in sorted(runs_dir.glob(f"*/{JOURNAL}")):
+        yield journal.parent
+
+
+def rollout_path(folder: Path, generation: int, episode: int) -> Path:
+    """The file of a rollout that a run collected, in the format of data sets' episodes."""
+    return folder / ROLLOUTS / f"{generation:06d}-{episode:04d}.npz"
+
+
+def resume_command(folder: Path, join: object = None, access_dir: Path | None = None) -> str:
+    """The shell command that resumes the run in `folder`.
+
+    `join` is a secured run's join file, `access_dir` its authority's folder where that is not the default: the journal
+    keeps neither.
+    """
+    joined = () if join is None else ("--join", join)
+    access = () if join is None or access_dir is None else ("--access-dir", access_dir)
+    return shell_command("coordinator", "--resume", folder.name, "--runs-dir", folder.parent, *joined, *access)
+
+
+def check_movable(folder: Path) -> None:
+    """`JournalError` if a run's folder is a symbolic link or holds other runs: it must not be moved or deleted."""
+    if folder.is_symlink():
+        raise JournalError(f"{folder} is a link: move or delete what it leads to by hand")
+    if inside := ", ".join(each.name for each in run_paths(folder)):
+        raise JournalError(f"{folder} holds other runs ({inside}): move them away first")
+
+
+@contextmanager
+def reporting_folder_errors(folder: Path) -> Iterator[None]:
+    """Turn an `OSError` while moving or deleting a run's folder into a `JournalError`."""
+    try:
+        yield
+    except OSError as error:
+        raise JournalError(f"{folder} cannot be moved or deleted: {error.strerror or error}") from error
