@@ -4,7 +4,16 @@ from __future__ import annotations
 
 
 class DreamfleetError(Exception):
-    """An expected failure; the command line prints its text as one line and exits with `exit_code`."""
+    """An expected failure; the command line prints its text as one line and exits with `exit_code`.
+
+    >>> from pathlib import Path
+    >>> from dreamfleet import Controller, DreamfleetError
+    >>> try:
+    ...     Controller.load(Path("missing.npz"))
+    ... except DreamfleetError as error:
+    ...     print(error)
+    no controller at missing.npz
+    """
 
     exit_code = 1
 

@@ -19,6 +19,12 @@ class Continuous:
     Each action has its own output unless `output_indices` names one for each; several actions may share an output.
     With `choices`, actions that are known, there is an output for each of them, and the one of the largest is done, of
     equals the first; nothing is squashed then.
+
+    >>> import numpy as np
+    >>> from dreamfleet import Continuous
+    >>> actions = Continuous.between(low=[-1, 0], high=[1, 1])
+    >>> actions.to_action(np.array([0, 100], np.float32))
+    array([0., 1.], dtype=float32)
     """
 
     scale: tuple[float, ...]
@@ -86,7 +92,13 @@ class Continuous:
 
 @dataclass(frozen=True)
 class Discrete:
-    """One of `outputs` actions: the one with the largest output, of equals the first."""
+    """One of `outputs` actions: the one with the largest output, of equals the first.
+
+    >>> import numpy as np
+    >>> from dreamfleet import Discrete
+    >>> int(Discrete(3).to_action(np.array([0.1, 0.9, 0.2])))
+    1
+    """
 
     outputs: int
     first: int = 0  # the environment's number of the first one

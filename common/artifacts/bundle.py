@@ -70,7 +70,13 @@ class BundleManifest:
 
 
 class Bundle:
-    """A verified bundle, under the controllers that a run evolves."""
+    """A verified bundle, under the controllers that a run evolves.
+
+    >>> from dreamfleet import find_bundle
+    >>> bundle = find_bundle("tiny")
+    >>> bundle.manifest.latent, bundle.manifest.hidden, bundle.controller_shape.size
+    (32, 256, 867)
+    """
 
     def __init__(
         self, path: Path, sha256: str, manifest: BundleManifest, shape: ControllerShape | None = None,

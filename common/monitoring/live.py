@@ -1,8 +1,10 @@
 """Looking on while a worker scores: its live frames, the newest one alone, whoever else watches.
 
->>> with Client(("tcp/127.0.0.1:7447",)) as client, LiveView(client, "night") as view:  # doctest: +SKIP
+>>> with Client(address) as client, LiveView(client, "cartpole") as view:
 ...     for sight in view:
-...         print(sight.worker, sight.frame.generation, sight.frame.candidate, sight.frame.step)
+...         print(sight.worker.split("/")[0], sight.frame.seed > 0)
+...         break
+alpha True
 """
 
 from __future__ import annotations

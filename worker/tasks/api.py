@@ -24,37 +24,28 @@ from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
 __all__ = [
-    "STEERING_GAS_BRAKE",
-    "Actions",
-    "Assignment",
-    "Batch",
-    "BatchedTask",
-    "Continuous",
-    "Description",
-    "Discrete",
-    "DreamReward",
-    "Driver",
-    "Episode",
-    "Policy",
-    "PolicyWithOutputs",
-    "Preprocessing",
-    "RecordableTask",
-    "RewardAwarePolicy",
-    "Score",
-    "StepObserver",
-    "StepSnapshot",
-    "Task",
-    "TaskWithPolicies",
-    "TaskWithTrueState",
-    "WatchableBatch",
-    "World",
-]
+    "STEERING_GAS_BRAKE", "Actions", "Assignment", "Batch", "BatchedTask", "Continuous", "Description", "Discrete",
+    "DreamReward", "Driver", "Episode", "Policy", "PolicyWithOutputs", "Preprocessing", "RecordableTask",
+    "RewardAwarePolicy", "Score", "StepObserver", "StepSnapshot", "Task", "TaskWithPolicies", "TaskWithTrueState",
+    "WatchableBatch", "World",
+]  # fmt: skip
 
 ENVIRONMENT_LIMIT = 10**6  # steps: the environment's own limit ends an episode
 
 
 class Policy(Protocol):
-    """What turns observations into actions, under one controller."""
+    """What turns observations into actions, under one controller.
+
+    >>> class Steady:
+    ...     def begin(self, parameters):
+    ...         self.action = parameters[:3]
+    ...     def act(self, observation):
+    ...         return self.action
+    >>> policy: Policy = Steady()
+    >>> policy.begin(np.ones(3, np.float32))
+    >>> policy.act(None)
+    array([1., 1., 1.], dtype=float32)
+    """
 
     def begin(self, parameters: NDArray[np.float32]) -> None:
         """Begin an episode with this controller's flat vector."""
@@ -64,14 +55,26 @@ class Policy(Protocol):
 
 
 class RewardAwarePolicy(Protocol):
-    """A policy that also wants to know what its actions bring; a policy need not."""
+    """A policy that also wants to know what its actions bring; a policy need not.
+
+    >>> from dreamfleet import find_controller, make_policy
+    >>> policy = make_policy(find_controller("tiny"))
+    >>> action = policy.act(np.zeros((64, 64, 3), np.uint8))
+    >>> policy.reward(-0.1)
+    """
 
     def reward(self, value: float) -> None:
         """The reward of the last action, before the next one is asked for."""
 
 
 class PolicyWithOutputs(Protocol):
-    """A policy whose actions hide what it computed, such as an index of the largest output; a policy need not tell."""
+    """A policy whose actions hide what it computed, such as an index of the largest output; a policy need not tell.
+
+    >>> policy = FlatPolicy(ControllerShape(features=1, actions=2), Discrete(2))
+    >>> policy.begin(np.array([1, -1, 0, 0], np.float32))
+    >>> policy.outputs(3.0).tolist(), int(policy.act(3.0))
+    ([3.0, -3.0], 0)
+    """
 
     def outputs(self, observation: Any) -> Any:
         """What it makes an action of, as one or more arrays: by these bits too hosts are told apart."""
@@ -79,7 +82,11 @@ class PolicyWithOutputs(Protocol):
 
 @dataclass(frozen=True)
 class Score:
-    """An episode's outcome: fitness, and environment steps made."""
+    """An episode's outcome: fitness, and environment steps made.
+
+    >>> Score(fitness=812.5, steps=1000).fitness
+    812.5
+    """
 
     fitness: float
     steps: int
@@ -90,7 +97,12 @@ Episode = tuple[NDArray[np.float32], int]
 
 
 class StepSnapshot(NamedTuple):
-    """A step of an episode as whoever looks on is shown it, before its action is done."""
+    """A step of an episode as whoever looks on is shown it, before its action is done.
+
+    >>> snapshot = StepSnapshot(step=3, score=1.5, action=np.zeros(3, np.float32))
+    >>> snapshot.step, snapshot.picture
+    (3, None)
+    """
 
     step: int  # those that were made before it
     score: float  # what they brought
@@ -101,7 +113,20 @@ class StepSnapshot(NamedTuple):
 
 
 class StepObserver(Protocol):
-    """Somebody looks on while episodes are scored; what he sees changes no score by a bit."""
+    """Somebody looks on while episodes are scored; what he sees changes no score by a bit.
+
+    >>> from dreamfleet import Scorer
+    >>> class Steps(list):
+    ...     def due(self):
+    ...         return True
+    ...     def see(self, episode, look):
+    ...         self.append(look().step)
+    >>> scorer = Scorer(TaskSpec("gym:CartPole-v1", "", horizon=3, patience=0, controller=ControllerShape(4, 2)))
+    >>> scorer.observer = Steps()
+    >>> score = scorer.score("score", np.zeros(10, np.float32), seed=1)
+    >>> scorer.observer
+    [0, 1, 2]
+    """
 
     def due(self) -> bool:
         """Whether the present step is to be shown: far fewer are than are made."""
@@ -115,6 +140,9 @@ class DreamReward:
     """What a dreamt step is worth where the MDN-RNN predicts no reward itself: `gain * value - cost`.
 
     `value` is the output of the head for the reward's label, or, for `survival`, whether the dream goes on.
+
+    >>> DreamReward(gain=1.0, source="survival").cost
+    0.0
     """
 
     gain: float
@@ -124,7 +152,12 @@ class DreamReward:
 
 @dataclass(frozen=True)
 class World:
-    """All that the rest of the system must know of a world."""
+    """All that the rest of the system must know of a world.
+
+    >>> from dreamfleet import Continuous, World
+    >>> World(Continuous.between(low=[-2], high=[2]), horizon=200).actions.outputs
+    1
+    """
 
     actions: Actions
     packages: tuple[str, ...] = ("numpy", "gymnasium")  # distributions whose versions a fitness may depend on
@@ -143,7 +176,12 @@ class World:
 
 @dataclass(frozen=True)
 class Assignment:
-    """What is to be scored: the run's specification and, for tasks that need one, its world model."""
+    """What is to be scored: the run's specification and, for tasks that need one, its world model.
+
+    >>> from dreamfleet import find_bundle
+    >>> Assignment.of("dream", find_bundle("tiny")).controller.size
+    867
+    """
 
     spec: TaskSpec
     bundle: Bundle | None = None
@@ -184,6 +222,18 @@ class Task:
     A subclass gives `name`, `world` and `make_environment`; one that needs no bundle also `describe(options)`: the
     `Description` that a new run freezes, or `UsageError` for an option that it does not know. Its policy is a linear or
     hidden controller on the flat observation unless `make_policy` says otherwise.
+
+    >>> import gymnasium
+    >>> from dreamfleet import Description, Discrete, Task, World
+    >>> class Balance(Task):
+    ...     name = "balance"
+    ...     world = World(Discrete(2))
+    ...     def make_environment(self, assignment):
+    ...         return gymnasium.make("CartPole-v1")
+    ...     def describe(self, options):
+    ...         return Description(observations=4, outputs=self.world.actions.outputs)
+    >>> Balance().describe({}).outputs
+    2
     """
 
     name: str
@@ -225,7 +275,18 @@ class Task:
 
 
 class Batch(Protocol):
-    """Scores many episodes together; each is the same bits alone."""
+    """Scores many episodes together; each is the same bits alone.
+
+    >>> from dreamfleet import find_bundle, find_controller
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> bundle, parameters = find_bundle("tiny"), find_controller("tiny").parameters
+    >>> spec = TaskSpec("dream", bundle.sha256, horizon=50, patience=0)
+    >>> batch = find_task("dream").make_batch(Assignment(spec, bundle))
+    >>> done = []
+    >>> scores = batch.score([(parameters, 1), (parameters, 2)], on_step=done.append)
+    >>> [score.steps for score in scores], done[-1]
+    ([50, 50], 100)
+    """
 
     def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None]) -> list[Score]:
         """The score of each; `on_step` hears of all steps made so far."""
@@ -233,7 +294,14 @@ class Batch(Protocol):
 
 @runtime_checkable
 class WatchableBatch(Protocol):
-    """A batch that somebody may look on at."""
+    """A batch that somebody may look on at.
+
+    >>> from dreamfleet import find_bundle
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> batch = find_task("dream").make_batch(Assignment.of("dream", find_bundle("tiny")))
+    >>> isinstance(batch, WatchableBatch)
+    True
+    """
 
     def watched(self, observer: StepObserver) -> Batch:
         """The same batch, which shows the onlooker one of its episodes; its scores are the same bits."""
@@ -241,7 +309,12 @@ class WatchableBatch(Protocol):
 
 @runtime_checkable
 class BatchedTask(Protocol):
-    """A task that scores candidates in batches, beside its environment, in which its means are evaluated."""
+    """A task that scores candidates in batches, beside its environment, in which its means are evaluated.
+
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> isinstance(find_task("dream"), BatchedTask)
+    True
+    """
 
     def make_batch(self, assignment: Assignment) -> Batch:
         """What scores candidates; `BundleError` if the bundle has no such thing.
@@ -252,7 +325,11 @@ class BatchedTask(Protocol):
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """One way from an environment's observation to the picture that a world model sees."""
+    """One way from an environment's observation to the picture that a world model sees.
+
+    >>> Preprocessing("half", size=48, picture=lambda picture: picture[::2, ::2]).shape
+    (48, 48, 3)
+    """
 
     name: str  # in bundles' manifests and in recorded rollouts
     size: int  # height and width of its pictures
@@ -267,7 +344,13 @@ class Preprocessing:
 
 @runtime_checkable
 class RecordableTask(Protocol):
-    """A task whose world rollouts are recorded in and world models are trained on."""
+    """A task whose world rollouts are recorded in and world models are trained on.
+
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> task: RecordableTask = find_task("car-racing")
+    >>> task.drivers["random-walk"](np.random.default_rng(1)).act().shape
+    (3,)
+    """
 
     name: str
     world: World
@@ -284,7 +367,12 @@ class RecordableTask(Protocol):
 
 @runtime_checkable
 class TaskWithPolicies(Protocol):
-    """A task that also drives for data sets as others did for theirs."""
+    """A task that also drives for data sets as others did for theirs.
+
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> list(find_task("car-racing").policies)
+    ['uniform', 'pushed', 'network']
+    """
 
     policies: Mapping[str, Callable[[np.random.Generator], Policy]]
     """Random policies by name, each for one drive; none is taken unless it is named."""
@@ -295,6 +383,13 @@ class TaskWithTrueState(Protocol):
     """A task whose worlds tell their true state.
 
     `dreamfleet inspect` measures world models against it, and `dreamfleet evaluate` tells how a controller drove.
+
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> task = find_task("car-racing")
+    >>> with task.make_recorded("box-64") as environment:
+    ...     observation, info = environment.reset(seed=1)
+    ...     task.truth(environment)["speed"]
+    0.0
     """
 
     def truth(self, environment: gymnasium.Env[Any, Any]) -> dict[str, float]:
