@@ -4,7 +4,16 @@ from __future__ import annotations
 
 
 class DreamfleetError(Exception):
-    """Base of expected failures; the command line prints the text as one line and exits with `exit_code`."""
+    """Base of expected failures; the command line prints the text as one line and exits with `exit_code`.
+
+    >>> from pathlib import Path
+    >>> from dreamfleet import Controller, DreamfleetError
+    >>> try:
+    ...     Controller.load(Path("missing.npz"))
+    ... except DreamfleetError as error:
+    ...     print(error)
+    no controller at missing.npz
+    """
 
     exit_code = 1
 

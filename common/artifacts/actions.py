@@ -19,6 +19,12 @@ class Continuous:
     Action `i` reads output `i`, or `output_indices[i]` where these are given; several actions may share an output.
     `choices` are a fixed set of actions with one output each: the action is the choice with the largest output (the
     first of equal ones), and no output is squashed.
+
+    >>> import numpy as np
+    >>> from dreamfleet import Continuous
+    >>> actions = Continuous.between(low=[-1, 0], high=[1, 1])
+    >>> actions.to_action(np.array([0, 100], np.float32))
+    array([0., 1.], dtype=float32)
     """
 
     scale: tuple[float, ...]
@@ -86,7 +92,13 @@ class Continuous:
 
 @dataclass(frozen=True)
 class Discrete:
-    """A choice among `outputs` numbered actions: the largest output wins, the first of equal ones."""
+    """A choice among `outputs` numbered actions: the largest output wins, the first of equal ones.
+
+    >>> import numpy as np
+    >>> from dreamfleet import Discrete
+    >>> int(Discrete(3).to_action(np.array([0.1, 0.9, 0.2])))
+    1
+    """
 
     outputs: int
     first: int = 0  # the environment's number of the first action

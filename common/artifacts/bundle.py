@@ -67,7 +67,13 @@ class BundleManifest:
 
 
 class Bundle:
-    """A verified bundle, and the shape and variant of the controllers that drive by it."""
+    """A verified bundle, and the shape and variant of the controllers that drive by it.
+
+    >>> from dreamfleet import find_bundle
+    >>> bundle = find_bundle("tiny")
+    >>> bundle.manifest.latent, bundle.manifest.hidden, bundle.controller_shape.size
+    (32, 256, 867)
+    """
 
     def __init__(
         self, path: Path, sha256: str, manifest: BundleManifest, shape: ControllerShape | None = None,

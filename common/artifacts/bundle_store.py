@@ -149,7 +149,12 @@ def shipped_names() -> tuple[str, ...]:
 
 
 def find_bundle(name: str) -> Bundle:
-    """A shipped bundle by name, or any bundle by path; `BundleError` if there is none."""
+    """A shipped bundle by name, or any bundle by path; `BundleError` if there is none.
+
+    >>> from dreamfleet import find_bundle
+    >>> find_bundle("tiny").manifest.task
+    'car-racing'
+    """
     shipped = shipped_bundles()
     if name in shipped:
         return Bundle.open(shipped[name])

@@ -83,7 +83,15 @@ def act(
 
 @dataclass(frozen=True)
 class Controller:
-    """Parameters `(size,)` float32, with the task and world model that they were evolved for."""
+    """Parameters `(size,)` float32, with the task and world model that they were evolved for.
+
+    >>> from pathlib import Path
+    >>> from dreamfleet import Controller, find_controller
+    >>> controller = find_controller("tiny")
+    >>> controller.save(Path("copy.npz"))
+    >>> Controller.load(Path("copy.npz")).sha256 == controller.sha256
+    True
+    """
 
     shape: ControllerShape
     parameters: NDArray[np.float32] = field(repr=False)

@@ -41,8 +41,10 @@ MAX_RESTARTS = 5  # of fetching a controller in parts while new controllers repl
 class Client:
     """A connection to the router of one or more runs; use it in a `with`.
 
-    >>> with Client(("tcp/127.0.0.1:7447",)) as client:  # doctest: +SKIP
-    ...     print(client.status("my-run").state)
+    >>> from dreamfleet import Client
+    >>> with Client(address) as client:  # where the coordinator listens, such as "tcp/127.0.0.1:7447"
+    ...     print(client.runs(), client.status("cartpole").state)
+    ['cartpole'] running
     """
 
     def __init__(self, connect: Network | tuple[str, ...] | str) -> None:

@@ -1,8 +1,10 @@
 """Watching a worker while it scores: a stream of its newest live frames.
 
->>> with Client(("tcp/127.0.0.1:7447",)) as client, LiveView(client, "night") as view:  # doctest: +SKIP
-...     for live in view:
-...         print(live.worker, live.frame.generation, live.frame.candidate, live.frame.step)
+>>> with Client(address) as client, LiveView(client, "cartpole") as view:
+...     for sight in view:
+...         print(sight.worker.split("/")[0], sight.frame.seed > 0)
+...         break
+alpha True
 """
 
 from __future__ import annotations

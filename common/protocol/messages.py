@@ -45,7 +45,13 @@ VerdictWord = Literal["accepted", "duplicate", "obsolete", "refused"]
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """What is scored in, frozen with a run: a fitness is a function of this, the parameters and the seeds alone."""
+    """What is scored in, frozen with a run: a fitness is a function of this, the parameters and the seeds alone.
+
+    >>> from dreamfleet import TaskSpec, find_bundle
+    >>> spec = TaskSpec("car-racing", find_bundle("tiny").sha256, horizon=1000, patience=100)
+    >>> spec.with_overrides(horizon=200).horizon
+    200
+    """
 
     task: Word
     bundle: Annotated[str, Length(0, 64)]  # SHA-256 of the bundle's file, hexadecimal; empty where there is none

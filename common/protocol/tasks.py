@@ -26,7 +26,12 @@ DREAM = "dream"  # whose candidates take no step in reality
 
 @dataclass(frozen=True)
 class Description:
-    """What a run freezes of a task that needs no bundle."""
+    """What a run freezes of a task that needs no bundle.
+
+    >>> from dreamfleet import Description
+    >>> Description(observations=4, outputs=2, packages=("numpy", "gymnasium")).version
+    1
+    """
 
     observations: int  # inputs of a controller
     outputs: int  # of a controller

@@ -62,7 +62,14 @@ def open_run(runs_dir: Path, name: str) -> RunFolder:
 
 
 class RunFolder:
-    """A run's folder, read-only; close it, or use it in a `with`."""
+    """A run's folder, read-only; close it, or use it in a `with`.
+
+    >>> from dreamfleet import open_run
+    >>> with open_run("cartpole") as run:
+    ...     generation = run.history()[0]
+    ...     print(run.spec.task, generation.number, generation.worst <= generation.mean <= generation.best)
+    gym:CartPole-v1 0 True
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path

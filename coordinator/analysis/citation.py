@@ -1,4 +1,4 @@
-"""A run's receipt in words, as a paper or a report cites it: what was computed with what, and how to have it again."""
+"""A run's provenance as a citation for papers and reports, with the commands that reproduce it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dreamfleet.common.serialization.optional_fields import to_dict
 
 
 def citation_facts(run: RunFolder) -> dict[str, Any]:
-    """The receipt with what it is of, as plain values; `ControllerError` where the run reports no controller yet."""
+    """The run and its provenance as JSON values; `ControllerError` before the run has a controller."""
     controller = Controller.load(run.controller_path)
     receipt, settings = read_run_provenance(controller), read_run_settings(controller)
     return {
@@ -30,7 +30,7 @@ def citation_facts(run: RunFolder) -> dict[str, Any]:
 
 
 def format_markdown(run: RunFolder) -> str:
-    """The same for people: a list in Markdown, the commands, and an entry for BibTeX."""
+    """The same as Markdown: a list, the commands, and a BibTeX entry."""
     controller = Controller.load(run.controller_path)
     receipt, settings = read_run_provenance(controller), read_run_settings(controller)
     lines = [
@@ -90,7 +90,7 @@ def _score(run: RunFolder) -> str:
 
 
 def _commands(run: RunFolder) -> dict[str, str]:
-    """What checks the run, by what it shows."""
+    """Commands that check the run, keyed by what they show."""
     last = max((each.number for each in run.history()), default=0)
     beside, controller = ("--runs-dir", str(run.path.parent)), str(run.controller_path)
     words = {

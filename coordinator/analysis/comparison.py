@@ -1,8 +1,7 @@
-"""Runs beside each other: settings that differ, scores for equal spending, and what their differences are worth.
+"""Compare runs: differing settings, scores at an equal budget, and paired differences of scores.
 
-Every run evaluates its means on the same validation tracks, and confirms what it reports on the same fresh ones. So
-two runs' scores share what is luck with tracks, their standard errors say little about a difference, and it is told
-track by track (`common/runs/paired_difference.py`).
+All runs evaluate their means on the same validation tracks and confirm reports on the same fresh ones. Luck with tracks
+is therefore common to both scores and cancels in a difference per track (`common/runs/paired_difference.py`).
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ Scores = dict[int, float]  # by validation seed
 
 @dataclass(frozen=True)
 class EvaluatedMean:
-    """An evaluated mean: its generation, what had been spent by then, and its scores."""
+    """An evaluated mean of the search: its generation, the effort spent until then, and its scores."""
 
     generation: int
     point: Point
@@ -34,11 +33,11 @@ class EvaluatedMean:
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """One run, as it is compared; its looks oldest first."""
+    """One side of a comparison; `evaluated_means` oldest first."""
 
     name: str
     settings: RunSettings
-    world: str | None  # that its evaluations drive; `None` where nothing was evaluated
+    world: str | None  # task of the evaluations; `None` before the first
     total: Effort
     evaluated_means: tuple[EvaluatedMean, ...]
     confirmed: StoredConfirmation | None
@@ -46,7 +45,7 @@ class ComparedRun:
 
     @classmethod
     def of(cls, run: RunFolder) -> ComparedRun:
-        """From its journal."""
+        """Read a run's journal."""
         with run.read_transaction():
             return cls._read(run)
 
@@ -63,13 +62,13 @@ class ComparedRun:
         return cls(run.name, run.settings, world, total_effort(run), evaluated_means, confirmed, scores)
 
     def last_within_budget(self, spent: Callable[[Effort], float], most: float) -> EvaluatedMean | None:
-        """The last look that had spent no more; whether it was a lucky one played no part in that choice."""
+        """The last evaluated mean within the budget. Its score plays no part in the choice, so luck does not either."""
         return next((each for each in reversed(self.evaluated_means) if spent(each.point.effort) <= most), None)
 
 
 @dataclass(frozen=True)
 class EqualBudget:
-    """The looks of every run once each had spent so much, in the order of the runs."""
+    """Each run's last evaluated mean within the same budget, in the order of the runs."""
 
     what: str
     spent: float
@@ -83,7 +82,7 @@ BUDGETS: dict[str, Callable[[Effort], float]] = {
 
 
 def differing_settings(sides: Sequence[ComparedRun]) -> dict[str, list[Any]]:
-    """The settings in which the runs differ: of each one a value a run, `None` where it has its default."""
+    """The settings that differ, each with one value a run; `None` is the default."""
     flat = [_flatten(expand_task_options(to_dict(each.settings))) for each in sides]
     names = sorted({name for each in flat for name in each})
     rows = {name: [each.get(name) for each in flat] for name in names}
@@ -91,7 +90,7 @@ def differing_settings(sides: Sequence[ComparedRun]) -> dict[str, list[Any]]:
 
 
 def at_equal_budget(sides: Sequence[ComparedRun]) -> list[EqualBudget]:
-    """What each run had learnt once all had spent as much as the thriftiest one had at its last look."""
+    """Each run's result at the smallest budget of all runs, for each kind of budget; empty without evaluations."""
     found = []
     for what, spent in BUDGETS.items():
         if all(each.evaluated_means for each in sides):
@@ -101,11 +100,11 @@ def at_equal_budget(sides: Sequence[ComparedRun]) -> list[EqualBudget]:
 
 
 def difference(one: Scores, other: Scores) -> PairedDifference | str:
-    """Of the `other` less the `one`, or why there is none."""
+    """The paired difference `other - one`, or the reason why there is none."""
     try:
         return PairedDifference.of(one, other)
     except UsageError:
-        return "no difference can be told: fewer than 2 seeds are in both"
+        return "no difference: fewer than 2 seeds are in both"
 
 
 def _flatten(plain: dict[str, Any], prefix: str = "") -> dict[str, Any]:

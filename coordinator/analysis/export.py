@@ -1,4 +1,4 @@
-"""A run's journal as tables, for whatever reads CSV, Parquet or TensorBoard's events."""
+"""Export a run's journal as CSV, Parquet or TensorBoard events."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dreamfleet.common.files.tensorboard import EXTRA, open_event_file
 from dreamfleet.common.runs.records import StoredCandidate, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import RunFolder
 
-EVENTS = "events.out.tfevents.*"  # the files that TensorBoard reads
+EVENTS = "events.out.tfevents.*"  # names of TensorBoard's files
 Row = dict[str, Any]
 TABLES: dict[str, tuple[type[Any], Callable[[RunFolder], Sequence[Any]]]] = {
     "generations": (StoredGeneration, RunFolder.history),
@@ -25,11 +25,11 @@ TABLES: dict[str, tuple[type[Any], Callable[[RunFolder], Sequence[Any]]]] = {
     "evaluations": (StoredEvaluation, RunFolder.evaluations),
     "confirmation": (StoredConfirmation, lambda run: [each] if (each := run.confirmation()) else []),
 }
-JUDGED = ("evaluations", "confirmation")  # which have a standard error
+JUDGED = ("evaluations", "confirmation")  # tables with a standard error
 
 
 def export_csv(run: RunFolder, folder: Path) -> list[Path]:
-    """A file `TABLE.csv` for each table that has a row; what was written."""
+    """Write `TABLE.csv` for each table with rows; return the paths."""
 
     def save(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
         text = io.StringIO(newline="")
@@ -43,7 +43,7 @@ def export_csv(run: RunFolder, folder: Path) -> list[Path]:
 
 
 def export_parquet(run: RunFolder, folder: Path) -> list[Path]:
-    """A file `TABLE.parquet` for each table that has a row; `MissingExtraError` without pyarrow."""
+    """Write `TABLE.parquet` for each table with rows; return the paths. `MissingExtraError` without pyarrow."""
     try:
         import pyarrow as pa
         from pyarrow import parquet
@@ -59,7 +59,7 @@ def export_parquet(run: RunFolder, folder: Path) -> list[Path]:
 
 
 def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
-    """An event file with curves over generations; `UsageError` where there are events, for they would add up."""
+    """Write a TensorBoard event file; `UsageError` if the folder has one, since TensorBoard would merge both."""
     if is_folder(folder) and any(folder.glob(EVENTS)):
         raise UsageError(f"{folder} holds TensorBoard's events already: delete them, or choose another --out")
     with _remove_on_failure(folder), open_event_file(folder) as events:
@@ -77,7 +77,7 @@ def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
 
 @contextmanager
 def _remove_on_failure(folder: Path) -> Iterator[None]:
-    """What was begun is no file of events, if it cannot be ended: it would stand in the way of the next attempt."""
+    """Remove an incomplete event file, which would block the next attempt."""
     try:
         yield
     except BaseException:
@@ -87,7 +87,7 @@ def _remove_on_failure(folder: Path) -> Iterator[None]:
 
 
 def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
-    """Name, columns and rows of each table that has any."""
+    """Name, columns and rows of each table with rows."""
     for name, (kind, read) in TABLES.items():
         judged = name in JUDGED
         columns = [each.name for each in fields(kind)] + ["error"] * judged
@@ -98,7 +98,7 @@ def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
 def _export_tables(
     run: RunFolder, folder: Path, kind: str, save: Callable[[Path, Sequence[str], Sequence[Row]], None]
 ) -> list[Path]:
-    """A file for each table that has a row; one of an earlier export that has none now is gone."""
+    """Write a file for each table with rows; remove files of an earlier export whose tables are empty now."""
     with reporting_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     written = []

@@ -1,4 +1,4 @@
-"""A run's learning curve: what its evaluated means scored, over all that was spent by then."""
+"""A run's learning curve: the scores of its evaluated means over the effort spent until then."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CAR_RACING = "car-racing"
 
 @dataclass(frozen=True)
 class Point:
-    """A mean's score on validation tracks, and what had been spent when it was known, the run's start included."""
+    """A mean's score on validation tracks, and the effort spent until then, including the run's start."""
 
     effort: Effort
     score: float
@@ -27,13 +27,13 @@ class Point:
 
     @classmethod
     def of(cls, effort: Effort, found: StoredEvaluation | StoredConfirmation) -> Point:
-        """Of what the journal holds."""
+        """From a row of the journal."""
         return cls(effort, found.mean, found.error)
 
 
 @dataclass(frozen=True)
 class PublishedScore:
-    """A published score; `core_hours` where they are known."""
+    """A published score; `core_hours` is `None` if unknown."""
 
     steps: float
     score: float
@@ -42,18 +42,18 @@ class PublishedScore:
 
 @dataclass(frozen=True)
 class LearningCurve:
-    """One run's: its evaluations, oldest first, and the confirmed score of what it reports, if there is one."""
+    """A run's evaluations, oldest first, and the confirmed score of the mean that it reports."""
 
     name: str
-    world: str  # the task of the world that is driven in reality
+    world: str  # the task of the evaluations
     points: tuple[Point, ...]
     confirmed: Point | None
-    reported: Point | None  # the evaluation of the mean that was confirmed
-    total: Effort  # so far, the start's included
+    reported: Point | None  # the confirmed mean's evaluation
+    total: Effort  # so far, including the run's start
 
     @classmethod
     def of(cls, run: RunFolder) -> LearningCurve:
-        """From a journal; `UsageError` where nothing was evaluated yet."""
+        """Read a run's journal; `UsageError` before the first evaluation."""
         points, confirmed, total = tuple(_points(run)), run.confirmation(), total_effort(run)
         if not points:
             raise UsageError(
@@ -66,8 +66,8 @@ class LearningCurve:
         return cls(run.name, _world(run), points, judged, next(found, None), total)
 
 
-# Ha and Schmidhuber's public log of their CarRacing experiment: the evaluated mean on 1024 tracks. Steps are those of
-# candidates alone. Of its time the end is known: 1119 hours on 64 cores.
+# Ha and Schmidhuber's public log of their CarRacing experiment: the evaluated mean on 1024 tracks. Steps count
+# candidates only. Only the total time is known: 1119 hours on 64 cores.
 PAPER_SCORES = (
     PublishedScore(2.6e7, 823),
     PublishedScore(1.0e8, 867),
@@ -77,7 +77,7 @@ PAPER_SCORES = (
 
 
 def _points(run: RunFolder) -> Iterator[Point]:
-    """Each evaluation, with all that was spent up to the generation whose mean it judged."""
+    """Each evaluation, with the effort spent up to its generation."""
     spent = parse_start_effort(run.fact(START_EFFORT)) or Effort()
     efforts = deque(each for each in run.efforts() if not each.confirming)
     for evaluation in run.evaluations():
@@ -87,6 +87,6 @@ def _points(run: RunFolder) -> Iterator[Point]:
 
 
 def _world(run: RunFolder) -> str:
-    """The task that a run is evaluated in: of a dream its world model's."""
+    """The task that a run is evaluated in; for a dream, the task of its world model."""
     task = run.spec.task
     return Bundle.open(run.bundle_path, run.spec.bundle).manifest.task if task == DREAM else task

@@ -1,4 +1,4 @@
-"""Pictures of runs: the fitness of one over its generations, and what several learnt from what they spent."""
+"""Plots: one run's fitness over its generations, and learning curves of several runs over the effort spent."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 from dreamfleet.coordinator.analysis.learning import LearningCurve, PublishedScore
 
-TITLE = 90  # characters of a line of it
+TITLE = 90  # characters in a line of the title
 KINDS = (".png", ".svg")
 PAPERS_NAME = "Ha & Schmidhuber 2018, their public log (1024 tracks; of its time the end alone is known)"
-REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # names of an SVG's parts are drawn at random otherwise
+REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # fixed identifiers in SVG files, instead of random ones
 
 
 def plot_fitness(run: RunFolder, path: Path) -> None:
-    """Draw one run's fitness over its generations, with its evaluated and its confirmed means."""
+    """Plot one run's fitness over its generations, with its evaluated and confirmed means."""
     settings = run.settings
     stages = begun_stages(settings, run.history(), run.evaluations())
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
@@ -47,10 +47,10 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
 
 
 def plot_learning(curves: Sequence[LearningCurve], marks: Sequence[PublishedScore], path: Path) -> None:
-    """Draw evaluated scores over environment steps and over core-hours; `marks` are published ones.
+    """Plot evaluated scores over environment steps and over core-hours, with published scores as `marks`.
 
-    Environment steps are all that were made in reality: those of candidates, kept rollouts, evaluations, and what the
-    run began from. Dreamt ones are told in the legend.
+    Environment steps are all steps in reality: of candidates, kept rollouts, evaluations, and of the run that this one
+    began from. The legend shows dreamt steps.
     """
     figure, (over_steps, over_hours) = plt.subplots(1, 2, figsize=(11, 5.6), sharey=True, layout="constrained")
     for curve, colour in zip(curves, PLOT_COLOURS * len(curves), strict=False):
@@ -69,7 +69,7 @@ def plot_learning(curves: Sequence[LearningCurve], marks: Sequence[PublishedScor
 
 
 def _scale(axes: Any) -> None:
-    """Logarithmic, with 20 and 50 beside 10 and 100 where there is room for them."""
+    """Make the x axis logarithmic, with labels at 20 and 50 too where there is room."""
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     named = FuncFormatter(lambda value, _: f"{value:g}" if value < 1000 else format_steps(round(value)))
@@ -83,7 +83,7 @@ def _scale(axes: Any) -> None:
 
 
 def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Callable[[Effort], float]) -> None:
-    """Evaluations as a line, and as a star the confirmed score, dotted to the evaluation of the same mean."""
+    """Plot evaluations as a line. The confirmed score is a star, dotted to the same mean's evaluation."""
     points, last, reported = curve.points, curve.confirmed, curve.reported
     axes.errorbar(
         [spent(each.effort) for each in points],
@@ -111,7 +111,7 @@ def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]]) -> None:
     if not marks:
         return
     axes.plot(*zip(*marks, strict=True), "s--", color="black", markersize=5, linewidth=1, label=PAPERS_NAME)
-    for number, (spent, score) in enumerate(marks):  # neighbours on two sides, so that none lies on another
+    for number, (spent, score) in enumerate(marks):  # alternate sides, so that labels do not overlap
         place = (0, 7 if number % 2 else -14)
         axes.annotate(f"{score:g}", (spent, score), place, textcoords="offset points", ha="center", fontsize=9)
 
@@ -122,8 +122,8 @@ def _score_axis(curves: Sequence[LearningCurve]) -> str:
 
 
 def _save(figure: Any, path: Path) -> None:
-    """Whole or not at all, of the kind that its name ends in; equal pictures are equal files."""
-    told = {"Date": None} if path.suffix == ".svg" else None
+    """Write the figure atomically in the format of the file name; equal figures give equal files."""
+    metadata = {"Date": None} if path.suffix == ".svg" else None
     with open_output(path) as file, mpl.rc_context(REPEATABLE):
-        figure.savefig(file, format=path.suffix.removeprefix("."), dpi=120, metadata=told)
+        figure.savefig(file, format=path.suffix.removeprefix("."), dpi=120, metadata=metadata)
     plt.close(figure)

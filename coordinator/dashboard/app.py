@@ -1,4 +1,4 @@
-"""What is answered under which path. Only GET, and nothing that is answered changes anything."""
+"""The dashboard's routes. All are GET and change nothing."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FOR_EVER = "private, max-age=31536000, immutable"
 
 
 def make_app(feed: Feed, views: ViewProcesses, runs_dir: Path, config: DashboardConfig) -> ASGIApp:
-    """The page, behind its guard; `ModuleNotFoundError` where a package of the extra is missing."""
+    """The page behind its guard; `ModuleNotFoundError` if a package of the extra is missing."""
     handlers = _Handlers(feed, views, runs_dir, Assets())
     routes = [
         Route("/", handlers.index), Route("/files/{digest}/{name}", handlers.file), Route("/live", handlers.live),
@@ -42,7 +42,7 @@ def make_app(feed: Feed, views: ViewProcesses, runs_dir: Path, config: Dashboard
 
 
 class _Handlers:
-    """Those that are no `async def` run in a thread: they read disks."""
+    """The request handlers. Those without `async` read disks, so they run in a thread."""
 
     def __init__(self, feed: Feed, views: ViewProcesses, runs_dir: Path, files: Assets) -> None:
         self._feed = feed
@@ -78,14 +78,14 @@ class _Handlers:
         return _stream(request, self._views.events(target))
 
     async def metrics(self, _request: Request) -> Response:
-        """Of all live runs; who reads them is a viewer for one picture."""
+        """Prometheus metrics of all live runs; a scrape counts as a viewer of one snapshot."""
         async with aclosing(self._feed.snapshots()) as snapshots:
             async for snapshot in snapshots:
                 return Response(exposition(*snapshot.statuses), media_type=CONTENT_TYPE)
         return PlainTextResponse("this page is about to leave\n", 503)
 
     async def runs(self, _request: Request) -> Response:
-        """Read once for all who ask meanwhile: thousands of journals take seconds, and would take every thread."""
+        """List the stored runs; concurrent requests share one read, since thousands of journals take seconds."""
         if self._listing is None or self._listing.done():
             self._listing = asyncio.create_task(asyncio.to_thread(stored_runs.list_runs, self._runs_dir))
         rows = await asyncio.shield(self._listing)
@@ -98,7 +98,7 @@ class _Handlers:
             return _json({"error": printable(str(error))}, 404)
 
     async def _events(self, run: str | None) -> AsyncIterator[bytes]:
-        """A frame for each picture, and the curves of its run whenever they are others."""
+        """A frame for each snapshot, and the curves whenever they changed."""
         yield event("hello", {"digest": self._files.digest, "views": self._views.is_enabled})
         curves_version = None
         async for snapshot in self._feed.snapshots():
@@ -113,7 +113,7 @@ class _Handlers:
 
 
 def _stream(request: Request, events: AsyncIterator[bytes]) -> Response:
-    """Events as they come; of a stream that has no end nobody gets the head alone."""
+    """An endless stream of events; for HEAD only its headers."""
     return Response(media_type=EVENTS) if request.method == "HEAD" else StreamingResponse(events, media_type=EVENTS)
 
 

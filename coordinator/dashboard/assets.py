@@ -1,4 +1,4 @@
-"""What a browser loads once: our own page, and the charts' library as its package ships it."""
+"""The static files of the page: our own, and plotly.js from its package."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ FOLDER = Path(__file__).parent / "page"
 INDEX = "index.html"
 CHARTS = "plotly.min.js"
 MEDIA_TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
-DIGEST_LENGTH = 16  # characters of a hash in an address
+DIGEST_LENGTH = 16  # characters of the hash in a URL
 
 
 @dataclass(frozen=True)
 class Asset:
-    """One file, as it is and packed."""
+    """A static file."""
 
     data: bytes
     media_type: str
 
     @cached_property
     def gzipped(self) -> bytes:
-        """With gzip; made when it is first asked for."""
+        """The compressed data, computed on first use."""
         return gzip.compress(self.data, 6)
 
 
 class Assets:
-    """Addresses hold a hash of what lies there, so that a browser may keep it for ever."""
+    """The files by URL. URLs hold a hash of the content, so browsers may cache them for ever."""
 
     def __init__(self) -> None:
-        """`ModuleNotFoundError` where plotly is not installed."""
+        """`ModuleNotFoundError` if plotly is not installed."""
         names = sorted(each.name for each in FOLDER.iterdir() if each.suffix in MEDIA_TYPES)
         ours = {name: Asset((FOLDER / name).read_bytes(), MEDIA_TYPES[Path(name).suffix]) for name in names}
         charts = Asset(_plotly_path().read_bytes(), MEDIA_TYPES[".js"])
-        # The modules name each other, so one hash is of them all.
+        # The modules import each other, so one hash covers them all.
         self.digest = _digest(*(each.data for each in ours.values()))
         charts_digest = _digest(charts.data)
         self._files = {(self.digest, name): each for name, each in ours.items()} | {(charts_digest, CHARTS): charts}
@@ -45,7 +45,7 @@ class Assets:
         self.index = text.replace("$ours", f"files/{self.digest}").replace("$charts", f"files/{charts_digest}/{CHARTS}")
 
     def find(self, digest: str, name: str) -> Asset | None:
-        """The file at an address."""
+        """The file of a URL; `None` if there is none."""
         return self._files.get((digest, name))
 
 
@@ -54,7 +54,7 @@ def _digest(*parts: bytes) -> str:
 
 
 def _plotly_path() -> Path:
-    """Found without importing the package, which takes long and is not needed."""
+    """The path of plotly.js, found without the slow import of the package."""
     spec = find_spec("plotly")
     if spec is None or spec.origin is None:
         raise ModuleNotFoundError(name="plotly")

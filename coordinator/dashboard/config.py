@@ -1,4 +1,4 @@
-"""Where the page is, and who may look at it."""
+"""The dashboard's settings: address, token and limits."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.transport.network import is_loopback_host
 
-LEAST_TOKEN = 12  # characters: whoever can reach the port can guess
+LEAST_TOKEN = 12  # characters: anyone who reaches the port can guess
 
 
 @dataclass(frozen=True)
 class DashboardConfig:
-    """Its address, a token, and how much it may do."""
+    """Address, token, and the number of live views."""
 
-    host: str = option("127.0.0.1", "listen here; on any other address than this computer's own a token is needed")
+    host: str = option("127.0.0.1", "listen here; addresses that others can reach need a token")
     port: int = option(8420, "port; 0: any that is free")
     views: int = option(4, "live views at a time, each a process on this computer; 0: none")
     token: str | None = field(
         default=None, repr=False,
-        metadata={"help": "only who knows it may look; $DREAMFLEET_DASHBOARD_TOKEN stands in no list of processes"},
+        metadata={"help": "token that viewers must give; $DREAMFLEET_DASHBOARD_TOKEN keeps it out of process lists"},
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -37,9 +37,9 @@ class DashboardConfig:
 
     @property
     def is_loopback(self) -> bool:
-        """Whether this computer alone reaches the page."""
+        """Whether only this computer can reach the page."""
         return is_loopback_host(self.host)
 
     def address(self, port: int) -> str:
-        """Where a browser finds it."""
+        """The URL of the page."""
         return f"http://{f'[{self.host}]' if ':' in self.host else self.host}:{port}/"

@@ -1,4 +1,4 @@
-"""What charts draw of a run, live or past: its generations and evaluations as columns. Pure."""
+"""The columns that the charts plot for a run, live or stored: generations and evaluations. Pure."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, Stor
 from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 
-MOST_POINTS = 600  # that are sent and drawn, however long a run is: more than a screen can tell apart
+MOST_POINTS = 600  # sent and drawn at most: a screen shows no more
 T = TypeVar("T")
 Quartiles = Mapping[int, tuple[float, float]]  # by generation
 
 
 @dataclass(frozen=True)
 class RunData:
-    """What is known of a run's course."""
+    """A run's settings and results."""
 
     settings: RunSettings
     history: Sequence[StoredGeneration]
@@ -30,21 +30,21 @@ class RunData:
 
 
 def downsample(rows: Sequence[T]) -> Sequence[T]:
-    """Every k-th row and the last one, `MOST_POINTS` or fewer."""
+    """Every k-th row and the last one, at most `MOST_POINTS`."""
     step = sampling_step(len(rows))
     kept = rows[::step]
     return [*kept, rows[-1]] if (len(rows) - 1) % step else kept
 
 
 def sampling_step(rows: int) -> int:
-    """Of how many rows one is kept."""
+    """The k of `downsample` for so many rows."""
     return max(math.ceil(rows / (MOST_POINTS - 1)), 1) if rows > MOST_POINTS else 1
 
 
 def curves(data: RunData, quartiles: Quartiles | None, spent: Sequence[Effort] | None = None) -> dict[str, Any]:
-    """The columns: `spent` is what a run took up to each generation, its start included.
+    """The columns as a JSON document; `spent` is the effort up to each generation, including the run's start.
 
-    Without quartiles the band is one standard deviation about the mean, and says so.
+    Without quartiles the band is one standard deviation around the mean; `band` names which one it is.
     """
     settings, rows = data.settings, downsample(data.history)
     dreamt = settings.task.task == DREAM
@@ -74,7 +74,7 @@ def curves(data: RunData, quartiles: Quartiles | None, spent: Sequence[Effort] |
 
 
 def cumulative_effort(start: Effort, efforts: Iterable[GenerationEffort], generations: int) -> list[Effort]:
-    """What had been spent after each of so many generations; confirming a report is not among it."""
+    """The total effort after each of so many generations, without that of confirmations."""
     by_generation: dict[int, Effort] = {}
     for each in efforts:
         if not each.confirming:
@@ -95,7 +95,7 @@ def _band(rows: Sequence[StoredGeneration], quartiles: Quartiles | None) -> list
 def _temperatures(
     data: RunData, rows: Sequence[StoredGeneration], finished: Mapping[int, StoredEvaluation]
 ) -> list[float] | None:
-    """At which each generation dreamt; `None` where a task has no temperature."""
+    """Each generation's temperature; `None` if the task has none."""
     if data.settings.task.temperature is None:
         return None
     agenda = ScheduleState(data.settings)
@@ -105,22 +105,26 @@ def _temperatures(
 
 def _evaluations(data: RunData, spent: Sequence[Effort] | None) -> dict[str, Any]:
     rows = downsample(data.evaluations)
-    told: dict[str, Any] = {
+    columns: dict[str, Any] = {
         "generation": [each.generation for each in rows],
         "mean": [_rounded(each.mean) for each in rows],
         "error": [_rounded(each.error) for each in rows],
         "episodes": [each.episodes for each in rows],
     }
-    return told if spent is None else told | _effort_columns([_effort_at(spent, each.generation) for each in rows])
+    if spent is not None:
+        columns |= _effort_columns([_effort_at(spent, each.generation) for each in rows])
+    return columns
 
 
 def _confirmed(found: StoredConfirmation, data: RunData, spent: Sequence[Effort] | None) -> dict[str, Any]:
-    told = {"generation": found.generation, "mean": _rounded(found.mean), "error": _rounded(found.error)}
-    told["episodes"] = found.episodes
+    point = {
+        "generation": found.generation, "mean": _rounded(found.mean), "error": _rounded(found.error),
+        "episodes": found.episodes,
+    }  # fmt: skip
     if spent is None:
-        return told
+        return point
     columns = _effort_columns([_effort_at(spent, len(data.history) - 1)])
-    return told | {name: column[0] for name, column in columns.items()}
+    return point | {name: column[0] for name, column in columns.items()}
 
 
 def _effort_at(spent: Sequence[Effort], generation: int) -> Effort:
@@ -135,6 +139,6 @@ def _effort_columns(efforts: Sequence[Effort]) -> dict[str, list[float]]:
 
 
 def _rounded(value: float) -> float | None:
-    """As much of a number as a chart shows; nothing of one that is none."""
+    """The number with 5 digits; `None` for NaN and infinity."""
     short = float(f"{value:.5g}")
     return short if math.isfinite(short) else None

@@ -1,4 +1,4 @@
-"""One picture a second for everybody who looks, and none while nobody does."""
+"""One snapshot a second, shared by all viewers; none while there are no viewers."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from dreamfleet.common.host.error_counter import ErrorCounter
 from dreamfleet.coordinator.dashboard.live_runs import DashboardSnapshot, Watcher
 
 REFRESH = 1.0  # seconds
-LINGER = 5.0  # seconds that it looks on after the last viewer has gone: perhaps the page is only loaded anew
+LINGER = 5.0  # seconds of polling after the last viewer left: the page may just be reloading
 MOST_VIEWERS = 500
 log = logging.getLogger(__name__)
 
 
 class Feed:
-    """Looks in a thread of its own, one look at a time.
+    """Polls the watcher in a thread while there are viewers.
 
-    Viewers take the latest picture as fast as each can: who is slow misses some, and holds back nobody.
+    Each viewer gets the latest snapshot when it is ready for one: a slow viewer skips some and delays nobody.
     """
 
     def __init__(self, watcher: Watcher, refresh: float = REFRESH, linger: float = LINGER) -> None:
@@ -28,7 +28,7 @@ class Feed:
         self._error_counter = ErrorCounter(log)
         self._viewers = 0
         self._latest: DashboardSnapshot | None = None
-        self._changed = asyncio.Event()  # set, and replaced, as a picture becomes the latest
+        self._changed = asyncio.Event()  # set and replaced with each new snapshot
         self._polling: asyncio.Task[None] | None = None
         self._closed = False
 
@@ -39,11 +39,11 @@ class Feed:
 
     @property
     def is_polling(self) -> bool:
-        """Whether anybody is asked anything."""
+        """Whether runs are polled now."""
         return self._polling is not None
 
     async def snapshots(self) -> AsyncGenerator[DashboardSnapshot, None]:
-        """The latest one, then each that is newer, until the feed is closed."""
+        """The latest snapshot, then each newer one, until the feed is closed."""
         self._viewers += 1
         if self._polling is None:
             self._polling = asyncio.create_task(self._poll())
@@ -60,13 +60,13 @@ class Feed:
             self._viewers -= 1
 
     def close(self) -> None:
-        """Let every viewer go."""
+        """End the streams of all viewers."""
         self._closed = True
         self._notify()
 
     async def _poll(self) -> None:
         clock = asyncio.get_running_loop().time
-        left = clock() + self._linger  # when it stops, if nobody comes
+        left = clock() + self._linger  # when to stop without viewers
         try:
             while not self._closed and clock() < left:
                 began = clock()
@@ -81,7 +81,7 @@ class Feed:
     async def _poll_once(self, poll: Callable[[], DashboardSnapshot]) -> None:
         try:
             self._latest = await asyncio.to_thread(poll)
-        except Exception as error:  # a look that fails costs that look alone
+        except Exception as error:  # a failed poll must not end the feed
             self._error_counter.record("look", error, "at live runs")
             return
         self._notify()

@@ -1,4 +1,4 @@
-"""Who may see what the page shows: in front of every answer, and the headers that each one has."""
+"""Access control in front of every response, and the security headers of each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from starlette.responses import HTMLResponse, PlainTextResponse, RedirectRespons
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 COOKIE = "dreamfleet"
-# Scripts come from this server's own files alone. The charts' library sets styles on its elements, which is harmless.
+# Only this server's own scripts run. plotly sets styles on its elements, which is harmless.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -37,7 +37,7 @@ padding:0 1rem;color-scheme:light dark}}input,button{{font:inherit;padding:.4rem
 
 
 class Guard:
-    """Lets through what may be answered: GET, asked of an own name, by somebody who knows the token if there is one."""
+    """Passes on GET requests to one of our own host names, with the token if there is one; refuses all others."""
 
     def __init__(self, app: ASGIApp, token: str | None, *, is_loopback: bool) -> None:
         self._app = app
@@ -45,12 +45,12 @@ class Guard:
         self._is_loopback = is_loopback
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Handle one request."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
         if scope["type"] != "http":
-            return  # a websocket: refused without a word
+            return  # a websocket: no response
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -68,7 +68,7 @@ class Guard:
         if scope["method"] not in ("GET", "HEAD"):
             return PlainTextResponse("this page is only looked at: GET\n", 405, {"allow": "GET, HEAD"})
         if self._is_loopback and not is_own_host(headers.get("host", "")):
-            # Else a page of somebody's own, whose name is made to lead here, could read along (DNS rebinding).
+            # Otherwise a page whose host name resolves to this address could read ours (DNS rebinding).
             return PlainTextResponse("ask for this page as http://127.0.0.1, with its port\n", 421)
         if is_foreign(headers, scope["path"]):
             return PlainTextResponse("another site's page asks for this: open it by its own address\n", 403)
@@ -82,16 +82,17 @@ class Guard:
         if self._is_authorised(headers):
             return None
         text = "This is not the token." if given is not None else "Who looks at these runs must know their token."
-        told = {"www-authenticate": 'Bearer realm="dreamfleet"'}
-        return HTMLResponse(LOGIN_PAGE.format(text=escape(text)), 401, told)
+        challenge = {"www-authenticate": 'Bearer realm="dreamfleet"'}
+        return HTMLResponse(LOGIN_PAGE.format(text=escape(text)), 401, challenge)
 
     def _is_authorised(self, headers: Mapping[str, str]) -> bool:
         assert self._token is not None
-        kind, _, told = headers.get("authorization", "").partition(" ")
+        kind, _, credentials = headers.get("authorization", "").partition(" ")
         if kind.lower() == "bearer":
-            # A header is read as Latin-1, and whoever holds a token of other letters writes it in UTF-8.
-            travelled = told.strip().encode("latin-1", "replace").decode(errors="replace")
-            return any([constant_time_equal(told.strip(), self._token), constant_time_equal(travelled, self._token)])
+            # Headers are decoded as Latin-1, but clients send tokens with other letters in UTF-8.
+            given = credentials.strip()
+            as_utf8 = given.encode("latin-1", "replace").decode(errors="replace")
+            return any([constant_time_equal(given, self._token), constant_time_equal(as_utf8, self._token)])
         try:
             cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
         except CookieError:
@@ -100,14 +101,14 @@ class Guard:
 
 
 def is_own_host(host: str) -> bool:
-    """Whether a Host header names this computer, as nobody else's page can."""
+    """Whether a Host header is a loopback name, which no other site's page can send."""
     return bool(_OWN_HOST.fullmatch(host))
 
 
 def is_foreign(headers: Mapping[str, str], path: str) -> bool:
-    """Whether a page of another site makes a browser ask: it may lead people here, and nothing else.
+    """Whether another site's page caused this request; such a page may only link to ours.
 
-    https://www.w3.org/TR/fetch-metadata/: what is no browser does not say where it asks from.
+    Browsers say so in Sec-Fetch headers (https://www.w3.org/TR/fetch-metadata/); other clients send none.
     """
     if headers.get("sec-fetch-site", "none") in ("same-origin", "none"):
         return False
@@ -115,10 +116,10 @@ def is_foreign(headers: Mapping[str, str], path: str) -> bool:
 
 
 def constant_time_equal(given: str, wanted: str) -> bool:
-    """Whether two texts are the same, in a time that tells nothing of where they differ."""
+    """Compare two texts in a time that does not depend on where they differ."""
     return hmac.compare_digest(*(hashlib.sha256(each.encode(errors="replace")).digest() for each in (given, wanted)))
 
 
 def cookie_value(token: str) -> str:
-    """What a browser keeps: it shows that the token was known, and is not it."""
+    """The cookie of an authorised browser: proves knowledge of the token without holding it."""
     return hmac.new(token.encode(errors="replace"), b"dreamfleet dashboard", hashlib.sha256).hexdigest()

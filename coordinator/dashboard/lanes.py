@@ -1,4 +1,4 @@
-"""What each worker did over the last minutes: a character for each stretch of time, newest last. Pure."""
+"""What each worker did during the last minutes: one character a time slice, newest last. Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from dreamfleet.common.monitoring.status import WorkerStatus
 
-STRETCH = 5.0  # seconds of one character
+STRETCH = 5.0  # seconds in a slice
 LENGTH = 60  # characters: five minutes
 UNKNOWN, LOST, SILENT, IDLE = " ", "x", "?", "."  # and 1 to 9: how fast, 9 being the fleet's fastest slot
 
@@ -16,17 +16,19 @@ UNKNOWN, LOST, SILENT, IDLE = " ", "x", "?", "."  # and 1 to 9: how fast, 9 bein
 @dataclass
 class _Stretch:
     began: float
-    states: dict[str, tuple[str, float]] = field(default_factory=dict)  # by worker: a sign, or a slot's steps a second
+    states: dict[str, tuple[str, float]] = field(
+        default_factory=dict
+    )  # by worker: a sign, or steps per second and slot
 
 
 class Lanes:
-    """Remembers what was seen; a stretch that nobody looked at is unknown."""
+    """The slices seen so far; a slice without an update is unknown."""
 
     def __init__(self) -> None:
         self._stretches: deque[_Stretch] = deque(maxlen=LENGTH)
 
     def update(self, workers: Sequence[WorkerStatus], now: float) -> None:
-        """What was seen at `now`, in seconds of any clock."""
+        """Record the workers' states at `now`, in seconds of any clock."""
         began = now - now % STRETCH
         if self._stretches:
             missing = round((began - self._stretches[-1].began) / STRETCH)
@@ -37,7 +39,7 @@ class Lanes:
         self._stretches[-1].states |= {each.worker: _sign_and_rate(each) for each in workers}
 
     def render(self, workers: Sequence[WorkerStatus]) -> list[str]:
-        """The lane of each of these workers, all equally long."""
+        """The lane of each worker, `LENGTH` characters each."""
         fastest = max((rate for each in self._stretches for _, rate in each.states.values()), default=0.0)
         signs = [
             {worker: sign or _speed_digit(rate, fastest) for worker, (sign, rate) in each.states.items()}

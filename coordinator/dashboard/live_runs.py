@@ -1,4 +1,4 @@
-"""Asking live runs how they are: what was heard of each, and one immutable picture of all of them a look."""
+"""Poll the live runs: each poll gives an immutable snapshot of all of them."""
 
 from __future__ import annotations
 
@@ -28,35 +28,41 @@ from dreamfleet.coordinator.dashboard.page_state import RunSnapshot, page_state
 from dreamfleet.coordinator.dashboard.sse import event
 from dreamfleet.coordinator.dashboard.stored_runs import read_quartiles
 
-ANSWER_TIMEOUT = 1.5  # seconds that an answer may take
-PATIENCE = 5.0  # seconds of slow answers after which a run counts as lost; where nobody is there it does at once
-MOST_RUNS = 32  # that are followed
-MOST_ROWS = 100_000  # generations, evaluations, workers of a run that are fetched
+ANSWER_TIMEOUT = 1.5  # seconds to wait for answers
+PATIENCE = 5.0  # seconds of slow answers after which a silent run counts as lost; after fast answers at once
+MOST_RUNS = 32  # followed at a time
+MOST_ROWS = 100_000  # generations, evaluations or workers fetched of a run
 
 T = TypeVar("T")
-UNREADABLE = (MalformedError, LookupError, TypeError, ValueError, ArithmeticError)  # of what another version may say
+UNREADABLE = (
+    MalformedError,
+    LookupError,
+    TypeError,
+    ValueError,
+    ArithmeticError,
+)  # raised by documents of other versions
 
 
 @dataclass(frozen=True)
 class RunEvents:
-    """What viewers of one run get: two server-sent events, ready to be written."""
+    """What viewers of a run receive: two serialized server-sent events."""
 
     page_state: bytes
     curves: bytes
-    curves_version: tuple[str, int]  # the run's uid and how often its curves were drawn: others are others
+    curves_version: tuple[str, int]  # the run's uid and a counter; differs when the curves changed
 
 
 @dataclass(frozen=True)
 class DashboardSnapshot:
-    """All that is known at one moment."""
+    """All followed runs at one moment."""
 
     runs: Mapping[str, RunEvents]
-    default_run: str | None  # for whoever names no run
-    absent_event: bytes  # for whom there is none: the event that says so
-    statuses: Sequence[Status] = ()  # of the live ones, with all workers that are known
+    default_run: str | None  # shown if the viewer names no run
+    absent_event: bytes  # sent if the viewer's run is unknown
+    statuses: Sequence[Status] = ()  # of live runs, with all known workers
 
     def find(self, run: str | None) -> RunEvents | None:
-        """The run of that name, or the chosen one."""
+        """The run of that name, or the default one."""
         return self.runs.get(run or self.default_run or "")
 
 
@@ -70,17 +76,17 @@ class Watcher:
         self._client: Client | None = None
         self._final_statuses: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._followed: dict[str, _FollowedRun] = {}
-        self._past_lanes: dict[str, Lanes] = {}  # by a run's uid: what its workers did while somebody looked
-        self._problem = ""  # what the last look could not read, or why it is not let in
+        self._past_lanes: dict[str, Lanes] = {}  # by run uid; kept while polling is suspended
+        self._problem = ""  # why the last poll failed, in part or whole
 
     def poll(self) -> DashboardSnapshot:
-        """Ask, and tell. Never raises for what comes over the wire."""
+        """Query all live runs. Bad answers never raise; the snapshot names the problem."""
         self._problem = ""
         began, answered = time.monotonic(), self._query_statuses()
         slow = time.monotonic() - began >= ANSWER_TIMEOUT
         now = time.time()
         for name, document in answered.items():
-            with suppress(ConnectionFailedError):  # it left between two questions
+            with suppress(ConnectionFailedError):  # it left between two queries
                 self._update_run(name, document, now)
         for each in self._followed.values():
             if each.name not in answered and (not slow or now - each.heard > PATIENCE):
@@ -90,7 +96,7 @@ class Watcher:
         return self._snapshot()
 
     def suspend(self) -> None:
-        """Nobody looks: leave the network, and forget what will be old by the next look."""
+        """Disconnect while there are no viewers, and forget the runs' states, which will be stale."""
         if self._client is not None:
             self._client.__exit__(None, None, None)
             self._client = None
@@ -99,7 +105,7 @@ class Watcher:
         self._followed.clear()
 
     def _query_statuses(self) -> dict[str, dict[str, Any]]:
-        """The answers of live runs by their names."""
+        """The status documents of live runs by name."""
         try:
             if self._client is None:
                 self._client = Client(self._network)
@@ -120,7 +126,7 @@ class Watcher:
             status = read_status(document)
             followed = self._followed.get(name)
             if followed is None or followed.uid != status.run_uid or followed.is_ahead_of(status):
-                self._followed.pop(name, None)  # so that the newest one stands last
+                self._followed.pop(name, None)  # reinsert it as the newest
                 followed = self._followed[name] = _FollowedRun(status, self._runs_dir)
                 followed.lanes = self._past_lanes.pop(followed.uid, followed.lanes)
             followed.update(status, self._client, now)
@@ -138,7 +144,7 @@ class Watcher:
                         followed.update_final(status, now)
 
     def _forget_oldest(self) -> None:
-        """The oldest of those that nobody serves any more, beyond what is kept."""
+        """Drop the oldest runs that are no longer live, beyond `MOST_RUNS`."""
         gone = [name for name, each in self._followed.items() if not each.is_live]
         for name in gone[: max(len(self._followed) - MOST_RUNS, 0)]:
             del self._followed[name]
@@ -149,7 +155,7 @@ class Watcher:
         for name, each in self._followed.items():
             try:
                 events[name] = each.events(sorted(live))
-            except UNREADABLE as error:  # numbers that are none, say
+            except UNREADABLE as error:  # such as non-numeric values
                 self._problem = f"run {name}: {error}"
         default_run = next(reversed(live or list(self._followed)), None)
         absent_event = {
@@ -166,7 +172,7 @@ class Watcher:
 
 @dataclass
 class _FollowedRun:
-    """One run: what was heard of it so far."""
+    """What is known of one run so far."""
 
     status: Status
     runs_dir: Path
@@ -177,8 +183,8 @@ class _FollowedRun:
     lanes: Lanes = field(default_factory=Lanes)
     _workers: Sequence[WorkerStatus] = ()
     _population: Sequence[Population] = ()
-    _quartiles: dict[int, tuple[float, float]] | None = None  # `None`: its journal does not lie here
-    _rendered_curves: tuple[Any, bytes, int] = (None, b"", 0)  # of what, the event, how often
+    _quartiles: dict[int, tuple[float, float]] | None = None  # `None`: no journal of it here
+    _rendered_curves: tuple[Any, bytes, int] = (None, b"", 0)  # cache key, event, counter
 
     def __post_init__(self) -> None:
         with suppress(DreamfleetError), open_run(self.runs_dir, self.name) as stored:
@@ -187,12 +193,12 @@ class _FollowedRun:
 
     @property
     def name(self) -> str:
-        """The run's."""
+        """The run's name."""
         return self.status.run
 
     @property
     def uid(self) -> str:
-        """Of the run that was first heard of under that name."""
+        """The run's uid; a later run of the same name has another."""
         return self.status.run_uid
 
     @property
@@ -206,15 +212,15 @@ class _FollowedRun:
         return replace(self.status, worker_list=tuple(self._workers))
 
     def matches(self, final_status: Status) -> bool:
-        """Whether that is its coordinator's, and not of an earlier life whose word came late."""
+        """Whether a final status belongs to this run, and not to an earlier incarnation."""
         return final_status.run_uid == self.uid and final_status.incarnation >= self.status.incarnation
 
     def is_ahead_of(self, status: Status) -> bool:
-        """Whether it knows of generations that the run has not: an older copy of it is served now."""
+        """Whether more generations are known here than the run reports: an older copy of it was resumed."""
         return len(self.history) > status.generations
 
     def update(self, status: Status, client: Client, now: float) -> None:
-        """What it answered, and the rest of what came as a head."""
+        """Take a status, and fetch the rows that it leaves out."""
         self.status, self.heard, self.lost = status, now, None
         self._workers, self._population = status.worker_list, (status.population,)
         self._update_lanes(now)
@@ -226,13 +232,13 @@ class _FollowedRun:
             self._population = client.candidates(self.name, status.generation.number)
 
     def update_final(self, status: Status, now: float) -> None:
-        """What its coordinator said as it left."""
+        """Take the status that the coordinator published as it left."""
         self.status, self.heard, self.lost = status, now, None
         self._workers, self._population = status.worker_list, (status.population,)
         self._append_recent(status)
 
     def events(self, live: list[str]) -> RunEvents:
-        """As viewers get it."""
+        """The events for viewers."""
         snapshot = RunSnapshot(
             self.status, self._workers, self.lanes.render(self._workers), self._population, self.heard, self.lost,
             folder=None if self._quartiles is None else self.runs_dir / self.name,
@@ -245,7 +251,7 @@ class _FollowedRun:
         self.lanes.update(self._workers, now)
 
     def _fetch_missing_rows(self, status: Status, client: Client) -> None:
-        """Closed generations and evaluations that are not known yet."""
+        """Fetch closed generations and evaluations that are not known yet."""
         self._append_recent(status)
         if len(self.history) < min(status.generations, MOST_ROWS):
             self._append(_fetch_rows(client, "history", StoredGeneration, self.name, len(self.history)))
@@ -259,7 +265,7 @@ class _FollowedRun:
     def _append(self, rows: Iterable[StoredGeneration]) -> None:
         for each in rows:
             if each.number != len(self.history):
-                raise MalformedError(f"run {self.name} tells of generation {each.number} after {len(self.history) - 1}")
+                raise MalformedError(f"run {self.name} lists generation {each.number} after {len(self.history) - 1}")
             self.history.append(each)
 
     def _fetch_evaluations(self, status: Status, client: Client) -> None:
@@ -270,12 +276,12 @@ class _FollowedRun:
             return
         try:
             found = list(_fetch_rows(client, "evaluations", StoredEvaluation, self.name))
-        except ConnectionFailedError:  # an earlier coordinator: what is seen while somebody looks
+        except ConnectionFailedError:  # older coordinators have no list: collect those seen
             found = [*self.evaluations, *(each for each in (status.best, last) if each is not None)]
         self.evaluations = sorted({each.generation: each for each in found}.values(), key=lambda each: each.generation)
 
     def _render_curves(self) -> None:
-        """The curves, if there is anything new in them."""
+        """Render the curves again if their data changed."""
         of = len(self.history), tuple(self.evaluations[-1:]), len(self.evaluations), self.status.confirmed
         if self._rendered_curves[0] == of:
             return
@@ -284,7 +290,7 @@ class _FollowedRun:
         self._rendered_curves = of, event("curves", curves(data, self._quartiles)), self._rendered_curves[2] + 1
 
     def _read_quartiles(self) -> None:
-        """From the journal, if it lies here: those that are drawn and not known yet."""
+        """Read the missing quartiles of drawn generations from the journal, if it is on this disk."""
         read = self._quartiles
         if read is None:
             return
@@ -303,6 +309,6 @@ class _FollowedRun:
 
 
 def _fetch_rows(client: Client, part: str, kind: type[T], run: str, offset: int = 0) -> Iterator[T]:
-    """The rows of a paged part from `offset` on, as many as anybody wants to see."""
+    """The rows of a paged part from `offset` on, at most `MOST_ROWS` in all."""
     rows = islice(client.fetch_rows(part, run, offset), MOST_ROWS - offset)
     return (from_plain(kind, known(kind, row)) for row in rows)

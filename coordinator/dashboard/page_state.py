@@ -1,4 +1,4 @@
-"""What the page shows of a live run, apart from its curves: one document a refresh, in words and columns. Pure."""
+"""The JSON document that the page shows of a live run, apart from its curves. Pure."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ Facts = list[tuple[str, str]]
 
 @dataclass(frozen=True)
 class RunSnapshot:
-    """A run as it was when it was last heard of."""
+    """A run's last known state."""
 
     status: Status
     workers: Sequence[WorkerStatus]
-    lanes: Sequence[str]  # of each worker, by `lanes.Lanes`
+    lanes: Sequence[str]  # of `Lanes.render`, one a worker
     population: Sequence[Population]  # the open generation's candidates, in parts
     heard: float  # seconds since 1970
-    lost: float | None = None  # since then nobody answers
-    folder: Path | None = None  # where its journal lies, if on this disk
+    lost: float | None = None  # seconds since 1970 at which answers stopped
+    folder: Path | None = None  # of its journal, if on this disk
 
 
 def page_state(look: RunSnapshot) -> dict[str, Any]:
-    """The document; texts of others are printable, and whoever shows them takes them for text."""
+    """The document. Texts from other hosts are made printable; the page must insert them as text, not HTML."""
     status = look.status
     link = OVER if status.is_over else LIVE if look.lost is None else LOST
     eta = estimate_eta(status)
@@ -94,7 +94,7 @@ def _task(status: Status) -> str:
 
 
 def _tiles(status: Status, eta: Eta, link: str) -> list[dict[str, str]]:
-    """The few figures that stand large: name, value, and what stands small beneath."""
+    """The headline figures: name, value and caption."""
     reported = status.confirmed or status.best
     spent = status.throughput
     pace = "" if eta.pace is None else f"{format_duration(eta.pace)} each"
@@ -115,7 +115,7 @@ def _tile(name: str, value: str, caption: str) -> dict[str, str]:
 
 
 def format_score(found: StoredEvaluation | StoredConfirmation) -> str:
-    """A mean with its standard error."""
+    """Format a mean with its standard error."""
     return f"{found.mean:,.1f} ± {found.error:,.1f}"
 
 
@@ -131,7 +131,7 @@ def _reported_caption(reported: StoredEvaluation | StoredConfirmation | None) ->
 
 
 def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
-    """Columns, a cell each: episodes done and wanted, fitness so far; none where no generation is open."""
+    """Columns with a row a candidate: episodes done and wanted, fitness so far; empty without an open generation."""
     if status.state == "ended" or (status.state == "evaluating" and not status.generation.episodes_done):
         parts = ()
     return {
@@ -144,7 +144,7 @@ def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
 
 
 def _progress(status: Status) -> list[dict[str, Any]]:
-    """What is driven beside the candidates."""
+    """Progress of evaluation, confirmation and kept rollouts."""
     parts = {
         "evaluation of the mean": status.evaluating, "confirmation": status.confirming,
         "kept rollouts": status.collecting,
@@ -169,12 +169,12 @@ def _search(status: Status) -> Facts:
 
 
 def describe_optimiser(settings: RunSettings) -> str:
-    """In words, with its covariance matrix where it has that choice."""
+    """The optimiser's name, with the kind of covariance matrix for CMA-ES."""
     return printable(f"CMA-ES, {settings.covariance}" if settings.optimiser == "cma" else settings.optimiser)
 
 
 def _waste(status: Status) -> Facts:
-    """What was done twice or for nothing."""
+    """Work that was repeated or discarded."""
     waste = status.waste
     return [
         ("share of steps", f"{waste.share:.1%}"), ("discarded steps", f"{waste.discarded_steps:,}"),
@@ -187,7 +187,7 @@ def _waste(status: Status) -> Facts:
 
 
 def _problems(status: Status) -> list[str]:
-    """What somebody may want to do something about."""
+    """Problems that may need action."""
     found = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
     for failure in status.failures:
         for worker, error in failure.errors.items():
@@ -204,14 +204,14 @@ def _fleet(status: Status, link: str) -> str:
     counts = status.workers
     lost = counts.lost or 0
     silent = counts.known - counts.present - lost
-    told = f"{counts.present} present, {_plural(status.slots, 'slot')}"
-    told += "".join(f", {count} {state}" for count, state in ((silent, "silent"), (lost, "lost")) if count > 0)
-    told = told if link == LIVE else f"at the last: {told}"
-    return f"{told}; {status.classes.description}" if status.classes.total else told
+    text = f"{counts.present} present, {_plural(status.slots, 'slot')}"
+    text += "".join(f", {count} {state}" for count, state in ((silent, "silent"), (lost, "lost")) if count > 0)
+    text = text if link == LIVE else f"at the last: {text}"
+    return f"{text}; {status.classes.description}" if status.classes.total else text
 
 
 def _workers(look: RunSnapshot, link: str) -> dict[str, list[Any]]:
-    """Columns, a row for each worker, those of one host together; what is true for a moment, of a live run alone."""
+    """Columns with a row a worker, sorted by host. Momentary values are empty unless the run is live."""
     order = sorted(range(len(look.workers)), key=lambda index: look.workers[index].worker)
     rows = [look.workers[index] for index in order]
     return {

@@ -1,4 +1,4 @@
-"""The page's life: a port is taken, its address told, and it is served until somebody ends it."""
+"""Serve the page: open the port, report its address, and run until stopped."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from dreamfleet.coordinator.dashboard.feed import Feed
 from dreamfleet.coordinator.dashboard.live_runs import Watcher
 from dreamfleet.coordinator.dashboard.view_processes import ViewProcesses
 
-SHUTDOWN_TIMEOUT = 2  # seconds that open pages have to go
-IDLE_TIMEOUT = 8.0  # seconds within which a connection asks for something whole
-MOST_CONNECTIONS = 800  # that are answered: a process may hold some thousand descriptors
+SHUTDOWN_TIMEOUT = 2  # seconds to close open pages
+IDLE_TIMEOUT = 8.0  # seconds until a connection without a complete request is closed
+MOST_CONNECTIONS = 800  # at a time: a process has some thousand file descriptors
 
 
 def serve(
     config: DashboardConfig, watcher: Watcher, views: ViewProcesses, runs_dir: Path, on_ready: Callable[[str], None]
 ) -> None:
-    """Serve until SIGINT or SIGTERM; `on_ready` gets the address once it can be opened."""
+    """Serve until SIGINT or SIGTERM; call `on_ready` with the URL once the port is open."""
     feed = Feed(watcher)
     app = make_app(feed, views, runs_dir, config)
     with _open_socket(config) as listening:
@@ -51,10 +51,10 @@ def serve(
 
 
 class _Connection(H11Protocol):
-    """Is closed while nothing is asked or answered on it: whoever sends half a request would hold it for ever."""
+    """A connection that is closed while idle: a client with half a request would hold it for ever."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """As uvicorn does it, and watch it."""
+        """Accept the connection as uvicorn does, and check it for idleness."""
         super().connection_made(transport)
         self._schedule_idle_check()
 
@@ -69,14 +69,14 @@ class _Connection(H11Protocol):
 
 
 class _PageServer(uvicorn.Server):
-    """Lets go of open pages as it ends: their streams have no end of their own."""
+    """Closes open pages at shutdown: their streams are endless."""
 
     def __init__(self, config: uvicorn.Config, feed: Feed, views: ViewProcesses) -> None:
         super().__init__(config)
         self._feed, self._views = feed, views
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """As uvicorn does it, once nobody waits for another picture."""
+        """End the streams, then shut down as uvicorn does."""
         self._feed.close()
         await self._views.close()
         await super().shutdown(sockets)

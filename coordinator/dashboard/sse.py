@@ -1,4 +1,4 @@
-"""Documents as JSON that every browser reads: a number that JSON does not have becomes null."""
+"""Server-sent events and their JSON: NaN and infinity, which browsers refuse, become null."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def to_json(document: Mapping[str, Any]) -> str:
-    """The document, on one line."""
+    """The document as JSON, on one line."""
     try:
         return _dumps(document)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Runs on this disk as the page shows them: a list, and one run whole. Only reads journals."""
+"""The runs on this disk for the page: a list, and details of one. Only reads journals."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ COLUMNS = (
     "run", "created", "begun", "task", "generations", "mean", "best", "confirmed", "best_error", "confirmed_error",
     "again", "state", "damaged",
 )  # fmt: skip
-LAST = 20  # generations that are listed one by one
-MOST_READ = 256 << 20  # bytes of candidates that are looked at for their quartiles; beyond it takes too long
+LAST = 20  # generations in the table
+MOST_READ = 256 << 20  # bytes of candidates that are read for quartiles
 
 
 def list_runs(runs_dir: Path) -> list[dict[str, Any]]:
-    """A row for each run, by name; a damaged journal is a row too."""
+    """A row for each run, by name; damaged journals included."""
     return [_run_row(path) for path in run_paths(runs_dir)]
 
 
 def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
-    """One run; `JournalError` or `UsageError` where there is no such run, or it cannot be read."""
+    """All details of one run; `JournalError` or `UsageError` if there is none or it is unreadable."""
     with open_run(runs_dir, name) as run, run.read_transaction():
         settings, history = run.settings, run.history()
         if [each.number for each in history] != list(range(len(history))):
@@ -66,7 +66,7 @@ def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
 
 
 def read_quartiles(run: RunFolder, settings: RunSettings, drawn: Sequence[StoredGeneration]) -> Quartiles | None:
-    """Those of the generations that are drawn; `None` where there would be too much to read."""
+    """The fitness quartiles of these generations; `None` if they need more than `MOST_READ` bytes."""
     numbers = [each.number for each in drawn]
     largest = max(each.population for each in stages_of(settings))
     if len(numbers) * largest * settings.controller.size * 4 > MOST_READ:
@@ -75,7 +75,7 @@ def read_quartiles(run: RunFolder, settings: RunSettings, drawn: Sequence[Stored
 
 
 def flatten_settings(settings: RunSettings) -> Facts:
-    """Every setting by its name, those of a part with the part's name before it."""
+    """Every setting by its dotted name."""
     rows: Facts = []
 
     def walk(prefix: str, value: object) -> None:
@@ -117,19 +117,19 @@ def _run_row(path: Path) -> dict[str, Any]:
 
 
 def _resume_command(run: RunFolder) -> str:
-    """The command that goes on with an open run; empty of one that is live, or has ended."""
+    """The command that resumes an open run; empty for live and ended runs."""
     return printable(resume_command(run.path)) if run.state == "open" else ""
 
 
 def format_created(created: str) -> str:
-    """When a run began, as a person reads it, such as 2026-11-23 17:30 UTC."""
+    """Format a start time for people, such as 2026-11-23 17:30 UTC."""
     with suppress(ValueError):
         return f"{datetime.fromisoformat(created).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
     return printable(created)
 
 
 def _world(run: RunFolder) -> str:
-    """The task whose reality gives the scores: of a dream its world model's."""
+    """The task that gives the scores; for a dream, the task of its world model."""
     task = run.spec.task
     if task == DREAM:
         with suppress(DreamfleetError, OSError):  # its world model may be gone

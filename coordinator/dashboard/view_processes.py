@@ -1,7 +1,7 @@
-"""Live views for the page: a `dreamfleet live` for each thing that somebody looks at, shared by all who look at it.
+"""Live views for the page: one `dreamfleet live` process for each target, shared by all its viewers.
 
-The page's own process has no simulator and no world model. A view's process begins with the first who looks and ends
-soon after the last, so that workers publish frames only while somebody sees them.
+The dashboard's process has no simulator and no world model. A view's process starts with the first viewer and ends soon
+after the last one, so that workers publish frames only while somebody watches.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from dreamfleet.common.protocol import keys
 from dreamfleet.coordinator.dashboard.sse import event
 
 RATE = 10  # pictures a second
-LINGER = 5.0  # seconds that a view goes on after the last who looked: perhaps the page is only loaded anew
-CHECK_INTERVAL = 0.5  # seconds between looks at whether anybody is there
-STALLED = 15.0  # seconds after which who takes nothing looks no more
-PATIENCE = 3.0  # seconds that a process whose stream has ended has to end
+LINGER = 5.0  # seconds until a view without viewers ends: the page may just be reloading
+CHECK_INTERVAL = 0.5  # seconds between checks for viewers
+STALLED = 15.0  # seconds after which a viewer that takes nothing no longer counts
+PATIENCE = 3.0  # seconds for a process to exit after its stream ended
 MOST_VIEWERS = 200
-LONGEST = 500  # characters of what a process said as it ended
-NICE = ("nice", "-n", "10")  # whoever scores on this host goes first
+LONGEST = 500  # characters of a process's last message
+NICE = ("nice", "-n", "10")  # workers on this host go first
 WORKER, BEST, GENERATION = "worker", "best", "generation"
 _NUMBER = re.compile(r"\d{1,9}")
 
 
 @dataclass(frozen=True)
 class ViewTarget:
-    """What is looked at: a worker by `name/life`, the best mean, an evaluated generation's mean, or who is busiest."""
+    """What a view shows: a worker by `name/life`, the best mean, a generation's mean, or the busiest worker."""
 
     run: str
     kind: str = ""
@@ -45,7 +45,7 @@ class ViewTarget:
 
     @classmethod
     def of(cls, asked: Mapping[str, str]) -> ViewTarget:
-        """As an address asks for it; `UsageError` for what nothing can be named."""
+        """Parse a URL's query parameters; `UsageError` for invalid names."""
         run, worker, generation = keys.check_run_name(asked.get("run", "")), asked.get(WORKER), asked.get(GENERATION)
         if worker is not None:
             if not keys.is_worker_identity(worker):
@@ -58,7 +58,7 @@ class ViewTarget:
         return cls(run, BEST if BEST in asked else "")
 
     def flags(self, connection_flags: Sequence[str], runs_dir: Path) -> list[str]:
-        """The flags that select it; `connection_flags` lead to the fleet."""
+        """The flags of `dreamfleet live` for this target; `connection_flags` lead to the fleet."""
         if self.kind == GENERATION:
             return [f"--controller={self.run}", f"--generation={self.name}", f"--runs-dir={runs_dir}"]
         whom = {WORKER: [f"--worker={self.name}"], BEST: ["--best"]}.get(self.kind, [])
@@ -66,7 +66,7 @@ class ViewTarget:
 
 
 class ViewProcesses:
-    """All that is looked at now; used by one event loop."""
+    """All open views; used by one event loop."""
 
     def __init__(self, connection_flags: Sequence[str], runs_dir: Path, limit: int) -> None:
         """`connection_flags` lead to the fleet; at most `limit` processes at a time, 0: no live views."""
@@ -77,16 +77,16 @@ class ViewProcesses:
 
     @property
     def is_enabled(self) -> bool:
-        """Whether there is anything to look at."""
+        """Whether live views are allowed."""
         return self._limit > 0
 
     @property
     def is_full(self) -> bool:
-        """Whether there is no room for another who looks."""
+        """Whether there is no room for another viewer."""
         return sum(each.viewers for each in self._views.values()) >= MOST_VIEWERS
 
     async def events(self, target: ViewTarget) -> AsyncIterator[bytes]:
-        """The newest picture, each time that there is one, and what is to be said instead; until it is over."""
+        """Each new picture, or a notice in its place, until the view ends."""
         view = self._views.get(target)
         if view is None or view.is_closing:
             if self._closed or not self._has_room():
@@ -105,7 +105,7 @@ class ViewProcesses:
             yield each
 
     def _has_room(self) -> bool:
-        """Whether there may be one more; a view that nobody looks at makes room."""
+        """Whether one more view may start; closes a view without viewers to make room."""
         self._views = {target: each for target, each in self._views.items() if not each.is_closing}
         if len(self._views) < self._limit:
             return True
@@ -115,7 +115,7 @@ class ViewProcesses:
         return idle is not None
 
     async def close(self) -> None:
-        """Let everybody go, and end every process."""
+        """End all views and their processes."""
         self._closed = True
         for each in self._tasks:
             each.cancel()
@@ -123,30 +123,28 @@ class ViewProcesses:
 
 
 class _ViewProcess:
-    """One process, and all who look at its pictures. Who is slow misses some, and holds back nobody."""
+    """One process and its viewers. A slow viewer skips pictures and delays nobody."""
 
     def __init__(self, flags: Sequence[str]) -> None:
         self.viewers = 0
-        self.is_closing = False  # its process is to end
+        self.is_closing = False  # its process is ending
         self._over = False  # nothing comes after the latest
         self._latest = notice_event(
             "starting", "Starting: the first picture takes some seconds, on a busy host half a minute."
         )
         self._pictures = 0
-        self._sending_since: dict[
-            object, float
-        ] = {}  # since when each of those to whom something is being sent takes it
-        self._changed = asyncio.Event()  # set, and replaced, as something becomes the latest
+        self._sending_since: dict[object, float] = {}  # by viewer that is being sent something: since when
+        self._changed = asyncio.Event()  # set and replaced with each new event
         self._ended = asyncio.Event()  # its process closed the stream
         self._loop = asyncio.get_running_loop()
-        # It hears of the death of the thread that started it, so this is the loop's own.
+        # The child is signalled when the thread that started it dies, so the loop's own thread starts it.
         self._child = VerbProcess(
             "live", *flags, "--fps", RATE, "--out", "-", inside=(*NICE, *parent_death_command()), read=self._read
         )
         self.task = asyncio.create_task(self._run())
 
     async def events(self) -> AsyncIterator[bytes]:
-        """The latest, then each that is newer."""
+        """The latest event, then each newer one."""
         self.viewers += 1
         seen, viewer = None, object()
         try:
@@ -171,7 +169,7 @@ class _ViewProcess:
         return self.viewers > sum(since < late for since in self._sending_since.values())
 
     async def _run(self) -> None:
-        """Until the process ends, or nobody looks any more."""
+        """Run until the process ends or no viewers are left."""
         clock = self._loop.time
         left, heard = clock() + LINGER, ""
         try:
@@ -190,14 +188,14 @@ class _ViewProcess:
             self._publish(notice_event("ended", _end_reason(self._child)))
 
     def _stop_process(self) -> None:
-        """In a thread: a process that has ended its stream ends by itself, any other holds nothing and is killed."""
+        """In a thread: wait for a process whose stream ended; kill any other, which has nothing to lose."""
         if self._ended.is_set():
             with suppress(subprocess.TimeoutExpired):
                 self._child.popen.wait(PATIENCE)
         self._child.end(patience=0)
 
     def _read(self, stream: IO[bytes]) -> None:
-        """In a thread: what was drawn twice is sent once."""
+        """In a thread: read the process's pictures; repeated ones are sent once."""
         before = b""
         with suppress(RuntimeError), stream:  # the loop may be closed
             for picture, facts in read_parts(stream):
@@ -217,7 +215,7 @@ class _ViewProcess:
 
 
 def notice_event(state: str, text: str) -> bytes:
-    """What stands in a picture's place: `starting`, `waiting`, or `ended`."""
+    """An event in a picture's place; `state` is `starting`, `waiting` or `ended`."""
     return event("told", {"state": state, "text": truncate(text.strip(), LONGEST)})
 
 

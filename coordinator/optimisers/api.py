@@ -25,6 +25,10 @@ class Search:
 
     `mean` `(dimension,)` is where it begins, `sigma0` its first step size, `population` the candidates that every `ask`
     returns, `seed` a number of at least 0 from which all its randomness follows, and `options` what the user gave.
+
+    >>> search = Search(mean=np.zeros(3), population=8, sigma0=0.5, seed=1, options={"covariance": "full"})
+    >>> search.dimension, search.choice("covariance", "diagonal", "full")
+    (3, 'full')
     """
 
     mean: NDArray[np.float64]
@@ -54,6 +58,13 @@ class Optimiser(Protocol):
 
     It may have one thing more, which is shown: `axis_ratio`, a float, how many times longer the longest axis of its
     distribution is than the shortest.
+
+    >>> from dreamfleet.coordinator.optimisers.separable import Separable
+    >>> optimiser: Optimiser = Separable(Search(mean=np.zeros(3), population=8, sigma0=0.5, seed=1))
+    >>> for _ in range(100):
+    ...     optimiser.tell(-np.square(optimiser.ask() - 1).sum(axis=1))
+    >>> optimiser.mean.round(3)
+    array([1., 1., 1.])
     """
 
     requirement: ClassVar[str]

@@ -17,6 +17,7 @@ class Separable(CmaesOptimiser):
     The covariance learns (n + 2) / 3 times as fast as the full matrix would. The step size follows the evolution path
     whatever the dimension (Hansen 2016, arXiv:1604.00772, equations 43 and 44), which tells it from pycma's diagonal.
 
+    >>> import numpy as np
     >>> optimiser = Separable(Search(mean=np.zeros(3), population=4, sigma0=0.1, seed=1))
     >>> candidates = optimiser.ask()
     >>> optimiser.tell(-np.square(candidates - 1).sum(axis=1))

@@ -32,10 +32,13 @@ class Scorer:
 
     `UsageError` or `BundleError` if the task, its version or the world model does not fit this host.
 
-    >>> from dreamfleet.common.artifacts.bundle_store import find_bundle
+    >>> from dreamfleet import Scorer, TaskSpec, find_bundle, find_controller
     >>> bundle = find_bundle("tiny")
-    >>> scorer = Scorer(TaskSpec("car-racing", bundle.sha256, horizon=100, patience=0), bundle)  # doctest: +SKIP
-    >>> scorer.score("score", np.zeros(867, np.float32), seed=2**20)  # doctest: +SKIP
+    >>> scorer = Scorer(TaskSpec("car-racing", bundle.sha256, horizon=20, patience=0), bundle)
+    >>> score = scorer.score("score", find_controller("tiny").parameters, seed=2**20)
+    >>> score.steps
+    20
+    >>> scorer.close()
     """
 
     def __init__(self, spec: TaskSpec, bundle: Bundle | None = None) -> None:

@@ -24,31 +24,11 @@ from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
 __all__ = [
-    "STEERING_GAS_BRAKE",
-    "Actions",
-    "Assignment",
-    "Batch",
-    "BatchedTask",
-    "Continuous",
-    "Description",
-    "Discrete",
-    "DreamReward",
-    "Driver",
-    "Episode",
-    "Policy",
-    "PolicyWithOutputs",
-    "Preprocessing",
-    "RecordableTask",
-    "RewardAwarePolicy",
-    "Score",
-    "StepObserver",
-    "StepSnapshot",
-    "Task",
-    "TaskWithPolicies",
-    "TaskWithTrueState",
-    "WatchableBatch",
-    "World",
-]
+    "STEERING_GAS_BRAKE", "Actions", "Assignment", "Batch", "BatchedTask", "Continuous", "Description", "Discrete",
+    "DreamReward", "Driver", "Episode", "Policy", "PolicyWithOutputs", "Preprocessing", "RecordableTask",
+    "RewardAwarePolicy", "Score", "StepObserver", "StepSnapshot", "Task", "TaskWithPolicies", "TaskWithTrueState",
+    "WatchableBatch", "World",
+]  # fmt: skip
 
 ENVIRONMENT_LIMIT = 10**6  # steps: the environment's own limit ends an episode
 
@@ -73,7 +53,18 @@ def accept_former_names(*owners: Any) -> None:
 
 
 class Policy(Protocol):
-    """Turns observations into actions, with the parameters of one controller."""
+    """Turns observations into actions, with the parameters of one controller.
+
+    >>> class Steady:
+    ...     def begin(self, parameters):
+    ...         self.action = parameters[:3]
+    ...     def act(self, observation):
+    ...         return self.action
+    >>> policy: Policy = Steady()
+    >>> policy.begin(np.ones(3, np.float32))
+    >>> policy.act(None)
+    array([1., 1., 1.], dtype=float32)
+    """
 
     def begin(self, parameters: NDArray[np.float32]) -> None:
         """Start an episode with a controller's flat parameter vector `(size,)`."""
@@ -83,14 +74,26 @@ class Policy(Protocol):
 
 
 class RewardAwarePolicy(Protocol):
-    """Optional: a policy that is informed of rewards."""
+    """Optional: a policy that is informed of rewards.
+
+    >>> from dreamfleet import find_controller, make_policy
+    >>> policy = make_policy(find_controller("tiny"))
+    >>> action = policy.act(np.zeros((64, 64, 3), np.uint8))
+    >>> policy.reward(-0.1)
+    """
 
     def reward(self, value: float) -> None:
         """Called with the reward of the last action, before the next `act`."""
 
 
 class PolicyWithOutputs(Protocol):
-    """Optional: a policy whose actions hide the numbers they come from, for example the index of the largest output."""
+    """Optional: a policy whose actions hide the numbers they come from, for example the index of the largest output.
+
+    >>> policy = FlatPolicy(ControllerShape(features=1, actions=2), Discrete(2))
+    >>> policy.begin(np.array([1, -1, 0, 0], np.float32))
+    >>> policy.outputs(3.0).tolist(), int(policy.act(3.0))
+    ([3.0, -3.0], 0)
+    """
 
     def outputs(self, observation: Any) -> Any:
         """The numbers that an action comes from, as one or more arrays. Their bits too tell host classes apart."""
@@ -98,7 +101,11 @@ class PolicyWithOutputs(Protocol):
 
 @dataclass(frozen=True)
 class Score:
-    """Result of an episode: its fitness, and the number of environment steps."""
+    """Result of an episode: its fitness, and the number of environment steps.
+
+    >>> Score(fitness=812.5, steps=1000).fitness
+    812.5
+    """
 
     fitness: float
     steps: int
@@ -109,7 +116,12 @@ Episode = tuple[NDArray[np.float32], int]
 
 
 class StepSnapshot(NamedTuple):
-    """One step of an episode for a live view, taken before its action is applied."""
+    """One step of an episode for a live view, taken before its action is applied.
+
+    >>> snapshot = StepSnapshot(step=3, score=1.5, action=np.zeros(3, np.float32))
+    >>> snapshot.step, snapshot.picture
+    (3, None)
+    """
 
     step: int  # number of steps before it
     score: float  # sum of the rewards of those
@@ -123,6 +135,18 @@ class StepObserver(Protocol):
     """Receives some steps of episodes while they are scored. It changes no score.
 
     The observer that a task gets also answers to the methods' former names `due` and `see`.
+
+    >>> from dreamfleet import Scorer
+    >>> class Steps(list):
+    ...     def is_due(self):
+    ...         return True
+    ...     def observe(self, episode, look):
+    ...         self.append(look().step)
+    >>> scorer = Scorer(TaskSpec("gym:CartPole-v1", "", horizon=3, patience=0, controller=ControllerShape(4, 2)))
+    >>> scorer.observer = Steps()
+    >>> score = scorer.score("score", np.zeros(10, np.float32), seed=1)
+    >>> scorer.observer
+    [0, 1, 2]
     """
 
     def is_due(self) -> bool:
@@ -137,6 +161,9 @@ class DreamReward:
     """The reward of a dreamt step where the MDN-RNN does not predict it: `gain * value - cost`.
 
     `value` is the output of the head for the reward's label, or, with `survival`, 1 if the dream goes on and else 0.
+
+    >>> DreamReward(gain=1.0, source="survival").cost
+    0.0
     """
 
     gain: float
@@ -149,6 +176,10 @@ class World:
     """What the rest of the system must know of a world.
 
     `off_course` and `off_course_cost` may also be given and read by their former names `stray` and `stray_cost`.
+
+    >>> from dreamfleet import Continuous, World
+    >>> World(Continuous.between(low=[-2], high=[2]), horizon=200).actions.outputs
+    1
     """
 
     actions: Actions
@@ -182,7 +213,12 @@ World.__init__ = _init_world_by_former_names  # type: ignore[method-assign]
 
 @dataclass(frozen=True)
 class Assignment:
-    """What is scored: a run's specification and, for tasks that need one, its world model."""
+    """What is scored: a run's specification and, for tasks that need one, its world model.
+
+    >>> from dreamfleet import find_bundle
+    >>> Assignment.of("dream", find_bundle("tiny")).controller.size
+    867
+    """
 
     spec: TaskSpec
     bundle: Bundle | None = None
@@ -227,6 +263,18 @@ class Task:
 
     Three members have former names that still work, defined or called: `make_judge` is
     `make_evaluation_environment`, `make_shown` is `make_watched_environment`, and `width` is `batch_size`.
+
+    >>> import gymnasium
+    >>> from dreamfleet import Description, Discrete, Task, World
+    >>> class Balance(Task):
+    ...     name = "balance"
+    ...     world = World(Discrete(2))
+    ...     def make_environment(self, assignment):
+    ...         return gymnasium.make("CartPole-v1")
+    ...     def describe(self, options):
+    ...         return Description(observations=4, outputs=self.world.actions.outputs)
+    >>> Balance().describe({}).outputs
+    2
     """
 
     name: str
@@ -281,7 +329,18 @@ accept_former_names(Task)
 
 
 class Batch(Protocol):
-    """Scores many episodes together; each score has the same bits as when it is scored alone."""
+    """Scores many episodes together; each score has the same bits as when it is scored alone.
+
+    >>> from dreamfleet import find_bundle, find_controller
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> bundle, parameters = find_bundle("tiny"), find_controller("tiny").parameters
+    >>> spec = TaskSpec("dream", bundle.sha256, horizon=50, patience=0)
+    >>> batch = find_task("dream").make_batch(Assignment(spec, bundle))
+    >>> done = []
+    >>> scores = batch.score([(parameters, 1), (parameters, 2)], on_step=done.append)
+    >>> [score.steps for score in scores], done[-1]
+    ([50, 50], 100)
+    """
 
     def score(self, episodes: Sequence[Episode], on_step: Callable[[int], None]) -> list[Score]:
         """The score of each episode; calls `on_step` with the number of steps so far, over all episodes."""
@@ -289,7 +348,14 @@ class Batch(Protocol):
 
 @runtime_checkable
 class WatchableBatch(Protocol):
-    """Optional: a batch whose episodes can be watched."""
+    """Optional: a batch whose episodes can be watched.
+
+    >>> from dreamfleet import find_bundle
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> batch = find_task("dream").make_batch(Assignment.of("dream", find_bundle("tiny")))
+    >>> isinstance(batch, WatchableBatch)
+    True
+    """
 
     def watched(self, observer: StepObserver) -> Batch:
         """The same batch with the same scores, which passes steps of one episode to `observer`."""
@@ -297,7 +363,12 @@ class WatchableBatch(Protocol):
 
 @runtime_checkable
 class BatchedTask(Protocol):
-    """Optional: a task that scores candidates in batches. Its evaluations are still driven in its environment."""
+    """Optional: a task that scores candidates in batches. Its evaluations are still driven in its environment.
+
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> isinstance(find_task("dream"), BatchedTask)
+    True
+    """
 
     def make_batch(self, assignment: Assignment) -> Batch:
         """A batch that scores candidates; `BundleError` if the bundle cannot do that.
@@ -308,7 +379,11 @@ class BatchedTask(Protocol):
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """A function from an environment's observation to the picture that a world model sees."""
+    """A function from an environment's observation to the picture that a world model sees.
+
+    >>> Preprocessing("half", size=48, picture=lambda picture: picture[::2, ::2]).shape
+    (48, 48, 3)
+    """
 
     name: str  # as bundles' manifests and recorded rollouts name it
     size: int  # height and width of its pictures
@@ -323,7 +398,13 @@ class Preprocessing:
 
 @runtime_checkable
 class RecordableTask(Protocol):
-    """Optional: a task in whose world rollouts are recorded and world models are trained."""
+    """Optional: a task in whose world rollouts are recorded and world models are trained.
+
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> task: RecordableTask = find_task("car-racing")
+    >>> task.drivers["random-walk"](np.random.default_rng(1)).act().shape
+    (3,)
+    """
 
     name: str
     world: World
@@ -340,7 +421,12 @@ class RecordableTask(Protocol):
 
 @runtime_checkable
 class TaskWithPolicies(Protocol):
-    """Optional: a task that also has random policies of published data sets."""
+    """Optional: a task that also has random policies of published data sets.
+
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> list(find_task("car-racing").policies)
+    ['uniform', 'pushed', 'network']
+    """
 
     policies: Mapping[str, Callable[[np.random.Generator], Policy]]
     """Random policies by name, each for one drive; each is used only if it is named."""
@@ -351,6 +437,13 @@ class TaskWithTrueState(Protocol):
     """Optional: a task whose worlds report their true state.
 
     `dreamfleet inspect` measures world models against it, and `dreamfleet evaluate` reports how a controller drove.
+
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> task = find_task("car-racing")
+    >>> with task.make_recorded("box-64") as environment:
+    ...     observation, info = environment.reset(seed=1)
+    ...     task.truth(environment)["speed"]
+    0.0
     """
 
     def truth(self, environment: gymnasium.Env[Any, Any]) -> dict[str, float]:

@@ -21,25 +21,50 @@ from dreamfleet.worker.tools import evaluation
 
 
 def find_controller(name: str, runs_dir: Path | str | None = None) -> Controller:
-    """A controller by the name of a file, of a run, or of one that ships; `ControllerError` lists those that ship."""
+    """A controller by the name of a file, of a run, or of one that ships; `ControllerError` lists those that ship.
+
+    >>> from dreamfleet import find_controller
+    >>> find_controller("tiny").parameters.shape
+    (867,)
+    """
     controller, _ = lookup.find_controller(name, _folder(runs_dir))
     return controller
 
 
 def find_agent(path: Path | str) -> TrainedAgent:
-    """A trained agent that `dreamfleet baseline export` wrote. The functions here take it like a controller."""
+    """A trained agent that `dreamfleet baseline export` wrote. The functions here take it like a controller.
+
+    >>> from dreamfleet import find_agent
+    >>> agent = find_agent("drqn.zip")
+    >>> agent.task, len(agent.manifest.choices)
+    ('car-racing', 5)
+    """
     return TrainedAgent.load(Path(path))
 
 
 def open_run(name: str, runs_dir: Path | str | None = None) -> run_folder.RunFolder:
-    """A run's journal, read-only; close it or use it in a `with`. `JournalError` lists the existing runs."""
+    """A run's journal, read-only; close it or use it in a `with`. `JournalError` lists the existing runs.
+
+    >>> from dreamfleet import open_run
+    >>> with open_run("cartpole") as run:
+    ...     print(run.spec.task, len(run.history()) > 0)
+    gym:CartPole-v1 True
+    """
     return run_folder.open_run(_folder(runs_dir), name)
 
 
 def make_environment(
     controller: Controller | TrainedAgent, bundle: Bundle | None = None, render_mode: str | None = None
 ) -> gymnasium.Env[Any, Any]:
-    """The environment that a controller is evaluated in, with the observations that its policy takes."""
+    """The environment that a controller is evaluated in, with the observations that its policy takes.
+
+    >>> from dreamfleet import find_controller, make_environment
+    >>> environment = make_environment(find_controller("tiny"))
+    >>> observation, info = environment.reset(seed=1)
+    >>> observation.shape
+    (64, 64, 3)
+    >>> environment.close()
+    """
     return _agent(controller, bundle).make_evaluation_environment(render_mode)
 
 
@@ -47,6 +72,14 @@ def make_policy(controller: Controller | TrainedAgent, bundle: Bundle | None = N
     """The policy of a controller, with its first episode started; `act(observation)` returns the next action.
 
     If the policy has a method `reward`, call it with the reward of each action; some world models use it.
+
+    >>> from dreamfleet import find_controller, make_environment, make_policy
+    >>> controller = find_controller("tiny")
+    >>> environment, policy = make_environment(controller), make_policy(controller)
+    >>> observation, info = environment.reset(seed=1)
+    >>> observation, reward, terminated, truncated, info = environment.step(policy.act(observation))
+    >>> policy.reward(reward)
+    >>> environment.close()
     """
     agent = _agent(controller, bundle)
     policy = agent.make_policies()(0)
@@ -62,6 +95,11 @@ def evaluate(
 
     This is what `dreamfleet evaluate` does. With more than one job, call it under `if __name__ == "__main__":` in a
     script, because processes are spawned.
+
+    >>> from dreamfleet import evaluate, find_controller
+    >>> results = evaluate(find_controller("cartpole"), episodes=3, jobs=1)
+    >>> len(results.scores), results.steps > 0
+    (3, True)
     """
     if episodes < 1 or first_seed < 0 or (jobs is not None and jobs < 1):
         raise UsageError("episodes and jobs must be at least 1, first_seed at least 0")
