@@ -80,7 +80,7 @@ class RunSettings:
     features: Literal["zh", "z"] = field(default="zh", metadata=OPTIONAL)  # what the controller sees
     collect_every: Count = field(default=0, metadata=OPTIONAL)  # generations; 0: never
     collect_episodes: EpisodesPerCandidate = field(default=1, metadata=OPTIONAL)
-    # What a dream's temperature is multiplied by when evaluations fall; 1: never.
+    # Only older runs have one: the temperature was multiplied by it when evaluations fell. 1: never.
     heat: float = field(default=1.0, metadata=OPTIONAL)
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions its fingerprint names
     optimiser: str = field(default="cma", metadata=OPTIONAL)  # registered, or module:attribute

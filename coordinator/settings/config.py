@@ -86,9 +86,6 @@ class RunConfig:
         "share of a candidate's episodes, 0 to 1, that is driven in the world that the others dream of; 1: all, as in "
         "a schedule whose first stage dreams",
     )
-    heat: float = option(
-        1.0, "multiply the temperature by this each time that the evaluated mean falls clearly behind; 1: never"
-    )
     seed: int = option(1, "makes the run: population and training seeds follow from it")
     evaluate_every: int = option(25, "drive the mean in reality every so many generations; 0: never")
     evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation seeds")
@@ -134,10 +131,6 @@ class RunConfig:
         if self.recorded and self.task != DREAM:
             raise UsageError(f"--recorded is of task {DREAM}, not of {self.task}: leave it out, or say 0")
         self._check_driven()
-        if not 1 <= self.heat < float("inf"):
-            raise UsageError(f"--heat must be a number of at least 1, not {self.heat}")
-        if self.heat > 1 and (self.temperature is None or not self.evaluate_every):
-            raise UsageError("--heat raises --temperature when evaluations fall: give it and --evaluate-every too")
 
     def _check_driven(self) -> None:
         if not 0 <= self.driven <= 1:
@@ -188,7 +181,6 @@ class RunConfig:
             confirm_episodes=self._confirm_episodes,
             collect_every=self.collect_every,
             collect_episodes=self.collect_episodes,
-            heat=self.heat,
             driven=self.driven,
             optimiser=self.optimiser,
             optimiser_options=tuple(filter(None, self.optimiser_options)),
@@ -385,7 +377,6 @@ class NetworkConfig:
         "take results only of hosts that compute the same bits as the first one that scored, so that the run ends with "
         "the same bits whoever is killed",
     )
-    mixed: bool = option(False, "deprecated: any host may score unless --strict is given")
     metrics_port: str = option(
         "", "answer Prometheus under /metrics at this port of 127.0.0.1, or at HOST:PORT; anybody there may read it"
     )

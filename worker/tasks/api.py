@@ -246,7 +246,7 @@ class BatchedTask(Protocol):
     def make_batch(self, assignment: Assignment) -> Batch:
         """What scores candidates; `BundleError` if the bundle has no such thing.
 
-        Called again whenever the specification's temperature (`--heat`), horizon or patience (`--schedule`) changes.
+        Called again whenever the specification's temperature, horizon or patience changes.
         """
 
 

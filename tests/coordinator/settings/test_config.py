@@ -49,17 +49,10 @@ def test_a_preset_of_a_run_is_one_that_can_begin_and_be_configured_again(name):
     assert RunSettings.from_json(settings.to_json()) == settings
 
 
-def test_heat_is_journalled_and_can_be_configured_again(random_bundle):
-    settings = RunConfig(heat=1.2, temperature=1.25).settings(random_bundle)
-    assert settings.heat == 1.2
-    assert RunSettings.from_json(settings.to_json()) == settings
-    assert RunConfig(**config_values(settings, random_bundle.path)).settings(random_bundle) == settings
-
-
 def test_a_default_controller_leaves_the_words_of_the_first_version(random_bundle):
     text = json.loads(RunConfig().settings(random_bundle).to_json())
     assert text["controller"] == {"features": 288, "actions": 3}
-    assert not {"features", "racing", "heat"} & text.keys()
+    assert not {"features", "racing"} & text.keys()
     assert "controller" not in text["task"]
 
 
@@ -215,21 +208,6 @@ def test_a_start_of_another_length_is_refused(random_bundle):
 def test_a_temperature_that_a_journal_cannot_keep_is_refused(temperature):
     with pytest.raises(UsageError, match=r"--temperature must be from 0\.001 to 1000"):
         RunConfig(temperature=temperature)
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"heat": 0.9}, "at least 1"),
-        ({"heat": float("nan")}, "at least 1"),
-        ({"heat": float("inf")}, "at least 1"),
-        ({"temperature": None}, "give it and --evaluate-every"),
-        ({"evaluate_every": 0}, "give it and --evaluate-every"),
-    ],
-)
-def test_heat_that_cannot_raise_a_temperature_is_refused(changes, says):
-    with pytest.raises(UsageError, match=says):
-        RunConfig(**{"heat": 1.2, "temperature": 1.25, "evaluate_every": 5, **changes})
 
 
 def test_a_hidden_layer_has_units():
