@@ -248,11 +248,11 @@ def test_what_an_optimiser_cannot_do_is_refused_before_there_is_a_run(random_bun
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"horizon": 2_000_000}, "--horizon must be at most 1000000"),
-        ({"patience": 10**8}, "--patience must be at most"),
-        ({"seed": 10**20}, "--seed must be at most"),
-        ({"population": 10**11}, "--population must be at most 100000"),
-        ({"hidden_units": 10**12}, "--hidden-units must be at most"),
+        ({"horizon": 2_000_000}, "--horizon must be from 1 to 1000000"),
+        ({"patience": 10**8}, "--patience must be from 0 to 1000000"),
+        ({"seed": 10**20}, "--seed must be from 0 to"),
+        ({"population": 10**11}, "--population must be from 2 to 100000"),
+        ({"hidden_units": 10**12}, "--hidden-units must be from 1 to 100000"),
         ({"sigma0": 1e300}, "at most 1e"),
         ({"task": ""}, "cannot name a task"),
         ({"task": "a b:x"}, "cannot name a task"),
