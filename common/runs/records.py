@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Annotated, Any, Literal
 
 from dreamfleet.common.artifacts.controller import ControllerShape
@@ -21,36 +21,42 @@ from dreamfleet.common.serialization.validation import MalformedError, from_plai
 MAX_STAGES = 32  # of a schedule: a status carries them too
 PopulationSize = Annotated[int, Between(2, 10**5)]
 EpisodesPerCandidate = Annotated[int, Between(1, 10**4)]
+ConfirmationEpisodes = Annotated[int, Between(0, 10**4)]  # fresh tracks; 0: no confirmation
 EpisodeCount = Annotated[int, Between(1, 2**63 - 1)]  # that a score was taken over: of none there is no error
+
+
+def stage_option(default: Any, text: str) -> Any:
+    """A key of a `[[stage]]`, which is stored only where it differs from its default."""
+    return field(default=default, metadata={**OPTIONAL, "help": text})
 
 
 @dataclass(frozen=True)
 class StageSettings:
-    """One stage of a schedule: when it ends, and what is named anew. What it does not name is as in the one before."""
+    """One `[[stage]]` of a schedule: what ends it, and the settings that it changes."""
 
-    # It ends after so many generations or environment steps of its own (0: never by these), or once a mean that was
-    # asked in it is evaluated at this score: by whichever is reached first.
-    generations: Count = field(default=0, metadata=OPTIONAL)
-    steps: Count = field(default=0, metadata=OPTIONAL)
-    score: float | None = field(default=None, metadata=OPTIONAL)
-    horizon: Horizon | None = field(default=None, metadata=OPTIONAL)
-    patience: Patience | None = field(default=None, metadata=OPTIONAL)
-    episodes: EpisodesPerCandidate | None = field(default=None, metadata=OPTIONAL)
-    population: PopulationSize | None = field(default=None, metadata=OPTIONAL)
-    sigma0: float | None = field(default=None, metadata=OPTIONAL)
-    racing: bool | None = field(default=None, metadata=OPTIONAL)
-    driven: Share | None = field(default=None, metadata=OPTIONAL)
-    whole: bool = field(default=False, metadata=OPTIONAL)  # from here on the search leaves the run's subspace
+    # The first of these that is reached ends it. 0 or None: never.
+    generations: Count = stage_option(0, "generations of the stage")
+    steps: Count = stage_option(0, "environment steps of the stage")
+    score: float | None = stage_option(None, "an evaluated score of a mean that was sampled in the stage")
+    # None: as in the stage before.
+    horizon: Horizon | None = stage_option(None, "as --horizon")
+    patience: Patience | None = stage_option(None, "as --patience")
+    episodes: EpisodesPerCandidate | None = stage_option(None, "as --episodes")
+    population: PopulationSize | None = stage_option(None, "as --population; a change restarts the search at the mean")
+    sigma0: float | None = stage_option(None, "as --sigma0; restarts the search at the mean")
+    racing: bool | None = stage_option(None, "as --racing")
+    driven: Share | None = stage_option(None, "as --driven")
+    whole: bool = stage_option(False, "leave the run's subspace at the mean; needs a sigma0")
 
     @property
     def overrides(self) -> dict[str, Any]:
-        """What it names anew, by the names of a run's settings."""
+        """The settings that it changes, by name."""
         plain = {name: getattr(self, name) for name in STAGE_FIELDS}
         return {name: value for name, value in plain.items() if value is not None}
 
     @property
     def end(self) -> StageSettings:
-        """The same without what it names anew."""
+        """The same without the settings that it changes."""
         return StageSettings(self.generations, self.steps, self.score)
 
     @property
@@ -59,7 +65,8 @@ class StageSettings:
         return bool(self.generations or self.steps or self.score is not None)
 
 
-STAGE_FIELDS = ("horizon", "patience", "episodes", "population", "sigma0", "racing", "driven")
+_END = ("generations", "steps", "score")
+STAGE_FIELDS = tuple(each.name for each in fields(StageSettings) if each.name not in (*_END, "whole"))
 
 
 @dataclass(frozen=True)
@@ -80,13 +87,13 @@ class RunSettings:
     features: Literal["zh", "z"] = field(default="zh", metadata=OPTIONAL)  # what the controller sees
     collect_every: Count = field(default=0, metadata=OPTIONAL)  # generations; 0: never
     collect_episodes: EpisodesPerCandidate = field(default=1, metadata=OPTIONAL)
-    # What a dream's temperature is multiplied by when evaluations fall; 1: never.
+    # Only older runs have one: the temperature was multiplied by it when evaluations fell. 1: never.
     heat: float = field(default=1.0, metadata=OPTIONAL)
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions its fingerprint names
     optimiser: str = field(default="cma", metadata=OPTIONAL)  # registered, or module:attribute
     optimiser_options: tuple[str, ...] = field(default=(), metadata=OPTIONAL)  # each as name=value
     # Fresh tracks on which the reported mean is driven as the run ends; 0: never, as in runs from before this.
-    confirm_episodes: Annotated[int, Between(0, 10**4)] = field(default=0, metadata=OPTIONAL)
+    confirm_episodes: ConfirmationEpisodes = field(default=0, metadata=OPTIONAL)
     # Of a candidate's episodes in a dream: driven in the world that it dreams of, the first ones.
     driven: Share = field(default=0.0, metadata=OPTIONAL)
     subspace: str = field(default="", metadata=OPTIONAL)  # SHA-256 of the one that the search keeps to; empty: none

@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.protocol.messages import MAX_TEMPERATURE, TaskSpec
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.stages import BegunStage, Stage, StageTracker
-from dreamfleet.common.runs.temperature_schedule import TemperatureSchedule
+from dreamfleet.common.runs.stages import BegunStage, Stage, StageTracker, latest_usable_evaluation
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class ScheduleState:
 
     def __init__(self, settings: RunSettings) -> None:
         self.stages = StageTracker(settings)
-        self._heat = TemperatureSchedule(settings)
+        self._settings = settings
         self._own = settings.task
 
     def scoring_params(
@@ -49,17 +48,41 @@ class ScheduleState:
         evaluations that it depends on.
         """
         begun = self.stages.advance_to(generation, history, finished)
-        return ScoringParams(
-            begun.stage.spec(self._own).with_overrides(self._heat.temperature_at(generation, finished)), begun
-        )
+        temperature = _temperature_at(generation, self._settings, finished)
+        return ScoringParams(begun.stage.spec(self._own).with_overrides(temperature), begun)
 
     def required_evaluation(self, generation: int) -> int:
         """The evaluation, by its generation, without which `generation`, the next one, cannot open; negative: none."""
-        return max(self._heat.required_evaluation(generation), self.stages.required_evaluation(generation))
+        return max(_raising_evaluation(generation, self._settings), self.stages.required_evaluation(generation))
 
     def spec(self, generation: int) -> TaskSpec:
         """What the mean after `generation` is driven in where it is driven as candidates are, not evaluated."""
         return self.stages.stage_of(generation).stage.spec(self._own)
+
+
+def _raising_evaluation(generation: int, settings: RunSettings) -> int:
+    """The last evaluation, by its generation, that may raise the temperature of `generation`; negative: none."""
+    return -1 if settings.heat == 1 else latest_usable_evaluation(settings.evaluate_every, generation)
+
+
+def _temperature_at(
+    generation: int, settings: RunSettings, finished: Mapping[int, StoredEvaluation]
+) -> float | None:  # fmt: skip
+    """The temperature of `generation`; `None` for tasks without one.
+
+    It is constant in every run that can be started today. In older runs with `heat`, each scheduled evaluation clearly
+    below the best one since the last raise multiplies the temperature by `heat`.
+    """
+    temperature, best = settings.task.temperature, None
+    if temperature is None or (last := _raising_evaluation(generation, settings)) < 0:
+        return temperature
+    for number in range(settings.evaluate_every - 1, last + 1, settings.evaluate_every):
+        evaluation = finished.get(number)
+        if evaluation is not None and best is not None and evaluation.is_clearly_below(best):
+            temperature, best = min(temperature * settings.heat, MAX_TEMPERATURE), None
+        elif evaluation is not None and (best is None or evaluation.mean > best.mean):
+            best = evaluation
+    return temperature
 
 
 def scoring_params_at(

@@ -217,11 +217,9 @@ class Run:
 
     def _note_stage_changes(self, generation: Generation) -> None:
         """Say for the log under which other terms a generation opens, and why."""
-        begun, number, warm = self.scoring_params.begun, generation.number, generation.spec.temperature
+        begun, number = self.scoring_params.begun, generation.number
         if begun.since == number:
             self.fleet.notes.append(f"{self._stage_told} begins with generation {number} after {begun.why}")
-        if warm is not None and warm != self.generation.spec.temperature:
-            self.fleet.notes.append(f"generation {number} dreams at temperature {warm:g}: the evaluated mean fell")
 
     @property
     def _stage_told(self) -> str:

@@ -1,14 +1,16 @@
-"""What a run is, when it stops, and where it is reached: the coordinator's configuration."""
+"""What a run is, when it stops, and where it is reached: the coordinator's configuration.
+
+Each setting is one field. The bounds are in its annotation; `frozen_option` names the record that stores it.
+"""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
@@ -18,27 +20,35 @@ from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
-from dreamfleet.common.protocol.messages import MAX_OPTIONS, MAX_TEMPERATURE, MIN_TEMPERATURE, TaskSpec
+from dreamfleet.common.protocol.messages import MAX_OPTIONS, Horizon, Patience, Share, TaskSpec, Temperature
 from dreamfleet.common.protocol.tasks import GYM, check_task, describe_task, is_self_describing
-from dreamfleet.common.runs.records import STAGE_FIELDS, RunSettings, StageSettings
+from dreamfleet.common.runs.records import (
+    STAGE_FIELDS,
+    ConfirmationEpisodes,
+    EpisodesPerCandidate,
+    PopulationSize,
+    RunSettings,
+    StageSettings,
+)
 from dreamfleet.common.runs.stages import Stage, stages_of
+from dreamfleet.common.serialization.constraints import Between, Count
 from dreamfleet.common.transport.network import parse_metrics_address
 from dreamfleet.coordinator.settings.schedule import check_schedule, split_first_stage
+from dreamfleet.coordinator.settings.task_options import (
+    check_normalisation,
+    parse_arguments,
+    parse_environment,
+)
 
 DEFAULT_BUNDLE, NO_BUNDLE, NO_SUBSPACE = "tiny", "none", "none"
 DREAM = "dream"
+LARGEST_STEP = 1e6  # of sigma0: parameters travel in single precision
+Interval = Annotated[int, Between(0, 10**6)]  # generations; 0: never
 
 
-PYTHON_LITERALS = {"True": True, "False": False, "None": None}
-LARGEST_SHARE = 0.9  # of the fleet's time that evaluations may have: the strategy needs some
-LARGEST_STEP = 1e6  # first step size; parameters travel in single precision
-# What a journal and a message can hold.
-SETTING_BOUNDS = {
-    "population": (2, 10**5), "episodes": (1, 10**4), "horizon": (1, 10**6), "patience": (0, 10**6),
-    "seed": (0, 2**63 - 1), "evaluate_every": (0, 10**6), "evaluation_episodes": (1, 10**4),
-    "collect_every": (0, 10**6), "collect_episodes": (1, 10**4), "hidden_units": (1, 10**5),
-    "confirm_episodes": (0, 10**4),
-}  # fmt: skip
+def frozen_option(record: type, default: Any, text: str) -> Any:
+    """An option that a run freezes under the same name: in `RunSettings`, or in `TaskSpec` where workers need it."""
+    return field(default=default, metadata={"help": text, "record": record})
 
 
 @dataclass(frozen=True)
@@ -46,12 +56,14 @@ class RunConfig:
     """What is frozen with a run."""
 
     preset: str | None = option(None, preset_help_text("run"))
-    task: str = option("car-racing", "what candidates are scored in; a worker must know it")
+    task: str = frozen_option(TaskSpec, "car-racing", "what candidates are scored in; a worker must know it")
     bundle: str | None = option(
         None, "the frozen world model: a shipped name, a file, or none (default tiny; none for gym:ENVIRONMENT)"
     )
-    environment: tuple[str, ...] = option((), "KEY=VALUE of what a gym:ENVIRONMENT is made with; values as in JSON")
-    normalise: bool = option(False, "shift and scale what a gym:ENVIRONMENT shows, as it is when the run begins")
+    environment: tuple[str, ...] = option((), "KEY=VALUE arguments of gym:ENVIRONMENT; values as in JSON")
+    normalise: bool = option(
+        False, "shift and scale the observations of gym:ENVIRONMENT by their statistics when the run begins"
+    )
     task_options: str | None = option(None, "the task's own options as `runs show` prints them, instead of these two")
     variant: tuple[str, ...] = option(
         (),
@@ -59,65 +71,80 @@ class RunConfig:
         "feedback=last, in its dream too, and time_cost=, offroad_cost= (docs/tasks.md)",
     )
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
-    hidden_units: int = option(8, "units of a hidden controller's layer")
-    features: Literal["zh", "z"] = option("zh", "what the controller sees: latent and hidden state, or latent alone")
-    population: int = option(32, "candidates a generation")
-    episodes: int = option(2, "episodes a candidate, on the same fresh seeds for all")
-    sigma0: float = option(0.1, "first step size")
-    optimiser: str = option("cma", "what asks for candidates: cma, cmaes-lra, cmaes-sep, or yours as module:attribute")
-    optimiser_options: tuple[str, ...] = option((), "the optimiser's own options, each as name=value")
-    covariance: Literal["diagonal", "full"] = option("diagonal", "the model of CMA-ES; an option of cma")
+    hidden_units: Annotated[int, Between(1, 10**5)] = option(8, "units of a hidden controller's layer")
+    features: Literal["zh", "z"] = frozen_option(
+        RunSettings, "zh", "what the controller sees: latent and hidden state, or latent alone"
+    )
+    population: PopulationSize = frozen_option(RunSettings, 32, "candidates a generation")
+    episodes: EpisodesPerCandidate = frozen_option(
+        RunSettings, 2, "episodes a candidate, on the same fresh seeds for all"
+    )
+    sigma0: float = frozen_option(RunSettings, 0.1, "first step size")
+    optimiser: str = frozen_option(
+        RunSettings, "cma", "what proposes candidates: cma, cmaes-lra, cmaes-sep, or yours as module:attribute"
+    )
+    optimiser_options: tuple[str, ...] = frozen_option(
+        RunSettings, (), "the optimiser's own options, each as name=value"
+    )
+    covariance: Literal["diagonal", "full"] = frozen_option(
+        RunSettings, "diagonal", "the model of CMA-ES; an option of cma"
+    )
     subspace: str | None = option(
         None,
-        "a file of `dreamfleet subspace`, or one that ships: the search changes what controllers make of these few "
-        "features alone, from where it begins; none: everything",
+        "search only in the features of this subspace, from the run's first mean: a file of `dreamfleet subspace`, or "
+        "a shipped name; none: all parameters",
     )
-    racing: bool = option(False, "let only the better half of the candidates drive the second half of the episodes")
-    horizon: int = option(1000, "steps of a scored episode at most")
-    patience: int = option(0, "cut a scored episode after so many steps without reward; 0: never")
-    temperature: float | None = option(None, "of a dream's sampling; above 1 it is harder, and harder to exploit")
-    recorded: float = option(
+    racing: bool = frozen_option(
+        RunSettings, False, "let only the better half of the candidates drive the second half of the episodes"
+    )
+    horizon: Horizon = frozen_option(TaskSpec, 1000, "steps of a scored episode at most")
+    patience: Patience = frozen_option(TaskSpec, 0, "cut a scored episode after so many steps without reward; 0: never")
+    temperature: Temperature | None = frozen_option(
+        TaskSpec, None, "temperature of a dream's sampling; above 1 it is harder, and harder to exploit"
+    )
+    recorded: Share = frozen_option(
+        TaskSpec,
         0.0,
         "share of the dreams, 0 to 1, that begins where recorded drives were, with what the model remembered there; "
         "the bundle must hold such states",
     )
-    driven: float = option(
+    driven: Share = frozen_option(
+        RunSettings,
         0.0,
         "share of a candidate's episodes, 0 to 1, that is driven in the world that the others dream of; 1: all, as in "
         "a schedule whose first stage dreams",
     )
-    heat: float = option(
-        1.0, "multiply the temperature by this each time that the evaluated mean falls clearly behind; 1: never"
+    seed: Count = frozen_option(RunSettings, 1, "makes the run: population and training seeds follow from it")
+    evaluate_every: Interval = frozen_option(
+        RunSettings, 25, "drive the mean in reality every so many generations; 0: never"
     )
-    seed: int = option(1, "makes the run: population and training seeds follow from it")
-    evaluate_every: int = option(25, "drive the mean in reality every so many generations; 0: never")
-    evaluation_episodes: int = option(100, "whole episodes of an evaluation, on validation seeds")
-    confirm_episodes: int | None = option(
+    evaluation_episodes: EpisodesPerCandidate = frozen_option(
+        RunSettings, 100, "whole episodes of an evaluation, on validation seeds"
+    )
+    confirm_episodes: ConfirmationEpisodes | None = frozen_option(
+        RunSettings,
         None,
         "confirm what is reported as the run ends, after its limits: the best evaluated means drive about twice as "
-        "many seeds in rounds, then the one that is left so many fresh ones, which give its score (default as many "
+        "many seeds in rounds, then the remaining one drives so many fresh ones, which give its score (default as many "
         "as of an evaluation, 2 at least); 0: never",
     )
-    collect_every: int = option(0, "keep rollouts of the mean for training, every so many generations; 0: never")
-    collect_episodes: int = option(8, "drives that are kept each time, on training seeds")
+    collect_every: Interval = frozen_option(
+        RunSettings, 0, "keep rollouts of the mean for training, every so many generations; 0: never"
+    )
+    collect_episodes: EpisodesPerCandidate = frozen_option(
+        RunSettings, 8, "drives that are kept each time, on training seeds"
+    )
     schedule: str | None = option(
         None,
         "a TOML file of stages, each a [[stage]] with its end (generations, steps, score) and its own horizon, "
         "patience, episodes, population, sigma0 and racing (docs/operations.md); none: no stages",
     )
-    preset_variant: tuple[str, ...] = ()  # how the preset drives, where nothing else says it by name
-    stages: tuple[StageSettings, ...] = ()  # what the schedule, or the configuration file, holds
-    loaded_subspace: Subspace | None = None  # what that file holds
+    preset_variant: tuple[str, ...] = ()  # the preset's variant, which `variant` overrides name by name
+    stages: tuple[StageSettings, ...] = field(default=(), metadata={"record": RunSettings})  # read from the schedule
+    loaded_subspace: Subspace | None = None  # read from the file that `subspace` names
 
     def __post_init__(self) -> None:
-        for name, (least, most) in SETTING_BOUNDS.items():
-            flag, value = f"--{name.replace('_', '-')}", getattr(self, name)
-            if value is None:
-                continue
-            if value < least:
-                raise UsageError(f"{flag} must be at least {least}, not {value}")
-            if value > most:
-                raise UsageError(f"{flag} must be at most {most}, not {value}")
+        check_bounds(self)
         if self.confirm_episodes == 1:
             raise UsageError("--confirm-episodes must be 0 or at least 2: one episode has no standard error")
         check_task(self.task)
@@ -125,27 +152,14 @@ class RunConfig:
             raise UsageError("--racing needs at least 2 episodes: there is no second half of one")
         if not 0 < self.sigma0 <= LARGEST_STEP:
             raise UsageError(f"--sigma0 must be a positive number of at most {LARGEST_STEP:g}, not {self.sigma0}")
-        if self.temperature is not None and not MIN_TEMPERATURE <= self.temperature <= MAX_TEMPERATURE:
-            raise UsageError(
-                f"--temperature must be from {MIN_TEMPERATURE:g} to {MAX_TEMPERATURE:g}, not {self.temperature}"
-            )
-        if not 0 <= self.recorded <= 1:
-            raise UsageError(f"--recorded must be from 0 to 1, not {self.recorded}")
-        if self.recorded and self.task != DREAM:
-            raise UsageError(f"--recorded is of task {DREAM}, not of {self.task}: leave it out, or say 0")
-        self._check_driven()
-        if not 1 <= self.heat < float("inf"):
-            raise UsageError(f"--heat must be a number of at least 1, not {self.heat}")
-        if self.heat > 1 and (self.temperature is None or not self.evaluate_every):
-            raise UsageError("--heat raises --temperature when evaluations fall: give it and --evaluate-every too")
+        for name in ("recorded", "driven"):
+            if getattr(self, name) and self.task != DREAM:
+                raise UsageError(f"--{name} is of task {DREAM}, not of {self.task}: leave it out, or say 0")
+        if 0 < self.driven < 1:
+            self._check_driven()
 
     def _check_driven(self) -> None:
-        if not 0 <= self.driven <= 1:
-            raise UsageError(f"--driven must be from 0 to 1, not {self.driven}")
-        if self.driven and self.task != DREAM:
-            raise UsageError(f"--driven is of task {DREAM}, not of {self.task}: leave it out, or say 0")
-        if not 0 < self.driven < 1:
-            return
+        """`UsageError` for a mixture of dreams and drives that no candidate can have."""
         if round(self.driven * self.episodes) in (0, self.episodes):
             raise UsageError(
                 f"--driven {self.driven:g} of {self.episodes} episodes is none of them, or all: give another share, or "
@@ -163,7 +177,10 @@ class RunConfig:
         return self.bundle == NO_BUNDLE or (self.bundle is None and is_self_describing(self.task))
 
     def settings(self, bundle: Bundle | None) -> RunSettings:
-        """What the journal keeps: the bundle by its hash, or what a task that needs none says of itself."""
+        """The settings to store in the journal; `config_values` is the inverse.
+
+        They hold the bundle's hash, or without a bundle the task's description of itself.
+        """
         named, stages = split_first_stage(self.stages)
         if stages != self.stages:
             with _naming_stage(1):
@@ -172,40 +189,26 @@ class RunConfig:
         spec, shape, packages = self._resolve_without_bundle() if bundle is None else self._resolve_with_bundle(bundle)
         if self.loaded_subspace is not None:
             _check_subspace(self.loaded_subspace, spec, shape)
-        settings = RunSettings(
-            task=spec,
-            packages=packages,
-            controller=shape,
-            population=self.population,
-            episodes=self.episodes,
-            sigma0=self.sigma0,
-            covariance=self.covariance,
-            seed=self.seed,
-            evaluate_every=self.evaluate_every,
-            evaluation_episodes=self.evaluation_episodes,
-            racing=self.racing,
-            features=self.features,
-            confirm_episodes=self._confirm_episodes,
-            collect_every=self.collect_every,
-            collect_episodes=self.collect_episodes,
-            heat=self.heat,
-            driven=self.driven,
-            optimiser=self.optimiser,
-            optimiser_options=tuple(filter(None, self.optimiser_options)),
-            subspace="" if self.loaded_subspace is None else self.loaded_subspace.sha256,
-            stages=self.stages,
-        )
+        derived = {
+            "task": spec,
+            "packages": packages,
+            "controller": shape,
+            "confirm_episodes": self._confirm_episodes,
+            "optimiser_options": tuple(filter(None, self.optimiser_options)),
+            "subspace": "" if self.loaded_subspace is None else self.loaded_subspace.sha256,
+        }
+        settings = RunSettings(**{**frozen_values(RunSettings, self), **derived})
         check_schedule(settings)
         for stage in stages_of(settings):
             with _naming_stage(stage.number if self.stages else None):
-                replace(self, **{name: getattr(stage, name) for name in STAGE_FIELDS})  # which looks at each value
+                replace(self, **{name: getattr(stage, name) for name in STAGE_FIELDS})  # checks each value
                 if stage.starts_new_search:
                     _try_optimiser(settings, stage, self.loaded_subspace)
         return settings
 
     @property
     def _confirm_episodes(self) -> int:
-        """None where nothing is evaluated: there is nothing to choose among."""
+        """0 where nothing is evaluated: there is nothing to choose among."""
         if not self.evaluate_every:
             return 0
         return max(self.evaluation_episodes, 2) if self.confirm_episodes is None else self.confirm_episodes
@@ -223,16 +226,18 @@ class RunConfig:
             bundle.check_recorded()
         variant = self._variant()
         shape = bundle.with_controllers(bundle.shape_of(self.features, self._hidden, variant), variant).controller_shape
-        named = None if shape == bundle.default_shape else shape
-        spec = TaskSpec(
-            self.task, bundle.sha256, self.horizon, self.patience, named, self.temperature, variant.options,
-            variant.version, self.recorded,
-        )  # fmt: skip
-        return spec, shape, NUMERIC_PACKAGES
+        own_shape = None if shape == bundle.default_shape else shape
+        return self._spec(bundle.sha256, own_shape, variant.options, variant.version), shape, NUMERIC_PACKAGES
+
+    def _spec(self, bundle: str, shape: ControllerShape | None, options: str, version: int) -> TaskSpec:
+        values = frozen_values(TaskSpec, self)
+        return TaskSpec(**values, bundle=bundle, controller=shape, options=options, version=version)
 
     def _variant(self) -> Variant:
         """How the run's controllers drive."""
-        given, preset = (_arguments("--variant", each, "pedals=one") for each in (self.variant, self.preset_variant))
+        given, preset = (
+            parse_arguments("--variant", each, "pedals=one") for each in (self.variant, self.preset_variant)
+        )
         variant = Variant.from_values(preset | given)
         if not variant.is_default and self.task not in (CAR_RACING, DREAM):
             raise UsageError(f"task {self.task} has no variants: {CAR_RACING} has, and its dream")
@@ -246,69 +251,57 @@ class RunConfig:
     def _resolve_without_bundle(self) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
         if self.temperature is not None or self.collect_every or self.variant:
             raise UsageError("--temperature, --collect-every and --variant are of tasks with a world model")
-        told = describe_task(self.task, self._options())
-        options = told.options if self.task_options is None else self.task_options
-        shape = ControllerShape(told.observations, told.outputs, self._hidden)
+        description = describe_task(self.task, self._description_options())
+        options = description.options if self.task_options is None else self.task_options
+        shape = ControllerShape(description.observations, description.outputs, self._hidden)
         if len(options) > MAX_OPTIONS:
             raise UsageError(
-                f"what the run would freeze of {self.task} takes {len(options)} characters, {MAX_OPTIONS} at most: "
-                "leave --normalise out, or give smaller arguments"
+                f"the options of {self.task} to freeze with the run have {len(options)} characters, {MAX_OPTIONS} at "
+                "most: leave --normalise out, or give smaller arguments"
             )
-        _check_normalisation(options, told.observations)
-        spec = TaskSpec(self.task, "", self.horizon, self.patience, shape, options=options, version=told.version)
-        return spec, shape, told.packages
+        check_normalisation(options, description.observations)
+        return self._spec("", shape, options, description.version), shape, description.packages
 
-    def _options(self) -> dict[str, Any]:
-        """What the task is asked to describe itself under."""
+    def _description_options(self) -> dict[str, Any]:
+        """The options under which the task describes itself."""
         if self.task_options is not None:
-            try:
-                frozen = json.loads(self.task_options or "{}")
-                return {"environment": dict(frozen.get("environment", {}))}
-            except (ValueError, AttributeError, TypeError, RecursionError) as error:
-                raise UsageError(f"--task-options must be a JSON object, not {self.task_options!r}") from error
-        arguments = _arguments("--environment", self.environment, "continuous=true")
+            return {"environment": parse_environment(self.task_options)}
+        arguments = parse_arguments("--environment", self.environment, "continuous=true")
         options: dict[str, Any] = {"environment": arguments} if arguments else {}
         return options | ({"normalise": True, "seed": self.seed} if self.normalise else {})
 
 
-def _check_normalisation(options: str, observations: int) -> None:
-    """`UsageError` if a normalisation that was given by hand cannot be one of so many observations."""
-    try:
-        normal = json.loads(options or "{}").get("normal")
-        if normal is None:
-            return
-        mean, deviation = normal["mean"], normal["deviation"]
-        whole = len(mean) == len(deviation) == observations and all(map(math.isfinite, (*mean, *deviation)))
-        fits = whole and min(deviation) > 0
-    except (TypeError, KeyError, ValueError, AttributeError, OverflowError, RecursionError):
-        fits = False
-    if not fits:
-        raise UsageError(f"--task-options: normal must have a mean and a positive deviation of {observations} numbers")
+def frozen_values(record: type, source: Any) -> dict[str, Any]:
+    """The settings that runs freeze in `record`, read from a `RunConfig` or from such a record."""
+    return {
+        each.name: getattr(source, each.name) for each in fields(RunConfig) if each.metadata.get("record") is record
+    }
 
 
-def _arguments(flag: str, texts: Sequence[str], example: str) -> dict[str, Any]:
-    """The values of a flag's KEY=VALUE texts by their keys; `example` is one of them."""
-    arguments = [_argument(flag, text, example) for text in texts]
-    if len(dict(arguments)) < len(arguments):
-        raise UsageError(f"{flag}: a KEY stands there twice")
-    return dict(arguments)
+def config_values(run: RunSettings, bundle: Path) -> dict[str, Any]:
+    """The settings of a run as they would be configured; `bundle` is the path of its copy of the world model."""
+    spec, hidden = run.task, run.controller.hidden
+    values = frozen_values(RunSettings, run) | frozen_values(TaskSpec, spec)
+    values |= {"controller": "hidden", "hidden_units": hidden} if hidden else {"controller": "linear"}
+    if not spec.bundle:
+        return {**values, "bundle": NO_BUNDLE, "task_options": spec.options}
+    return {**values, "bundle": str(bundle), "variant": Variant.from_json(spec.options).option_texts}
 
 
-def _argument(flag: str, text: str, example: str) -> tuple[str, Any]:
-    name, equals, value = text.partition("=")
-    if not (equals and name.isidentifier()):
-        raise UsageError(f"{flag} {text!r}: write KEY=VALUE, such as {example}")
-    if value in PYTHON_LITERALS:  # as people who know gymnasium write it
-        return name, PYTHON_LITERALS[value]
-    try:
-        return name, json.loads(value)
-    except (ValueError, RecursionError):
-        return name, value
+def check_bounds(config: Any) -> None:
+    """`UsageError` for a number outside the `Between` in its field's annotation; `None` is within any."""
+    for name, hint in get_type_hints(type(config), include_extras=True).items():
+        value = getattr(config, name)
+        for kind in (hint, *get_args(hint)):  # the second finds the parts of `Annotated[...] | None`
+            for bounds in getattr(kind, "__metadata__", ()):
+                if value is not None and not bounds.low <= value <= bounds.high:
+                    low, high = (f"{each:g}" if isinstance(each, float) else each for each in (bounds.low, bounds.high))
+                    raise UsageError(f"--{name.replace('_', '-')} must be from {low} to {high}, not {value}")
 
 
 @contextmanager
 def _naming_stage(number: int | None) -> Iterator[None]:
-    """Say of which stage an error is; `None`: of no schedule's."""
+    """Name the stage in an error; `None`: the run has no schedule."""
     try:
         yield
     except UsageError as error:
@@ -316,7 +309,7 @@ def _naming_stage(number: int | None) -> Iterator[None]:
 
 
 def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape) -> None:
-    """`UsageError` for one of another world model, or of controllers that see something else."""
+    """`UsageError` for a subspace of another world model, or of controllers with other inputs."""
     if subspace.bundle != spec.bundle:
         own = f"world model {spec.bundle[:12]}" if spec.bundle else "a task without a world model"
         raise UsageError(
@@ -331,25 +324,13 @@ def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape) 
 
 
 def _try_optimiser(settings: RunSettings, stage: Stage, subspace: Subspace | None) -> None:
-    """Build the run's optimiser once, so that what it cannot do is said before there is a run."""
+    """Build the run's optimiser once, so that a search which it cannot do is refused before the run exists."""
     from dreamfleet.coordinator.optimisers.evolution import (  # heavy: `--help` reads this module too
         Evolution,
         EvolutionConfig,
     )
 
     Evolution(EvolutionConfig.of(settings, stage, subspace))
-
-
-def config_values(run: RunSettings, bundle: Path) -> dict[str, Any]:
-    """The settings of a run as they would be configured; `bundle` is where its copy of the world model lies."""
-    frozen = {each.name: getattr(run, each.name) for each in fields(RunConfig) if hasattr(run, each.name)}
-    del frozen["subspace"]  # its hash there, where a file is named here
-    spec, hidden = run.task, run.controller.hidden
-    frozen |= {"controller": "hidden", "hidden_units": hidden} if hidden else {"controller": "linear"}
-    frozen |= {name: getattr(spec, name) for name in ("task", "horizon", "patience", "temperature", "recorded")}
-    if not spec.bundle:
-        return {**frozen, "bundle": NO_BUNDLE, "task_options": spec.options}
-    return {**frozen, "bundle": str(bundle), "variant": Variant.from_json(spec.options).option_texts}
 
 
 @dataclass(frozen=True)
@@ -359,7 +340,7 @@ class LimitsConfig:
     generations: int = option(0, "stop after so many generations")
     steps: int = option(0, "stop after so many environment steps")
     minutes: float = option(
-        0.0, "stop after so many minutes of generations; what is evaluated last, and confirmed, comes on top"
+        0.0, "stop after so many minutes of generations; the last evaluation and the confirmation come on top"
     )
     target: float | None = option(None, "stop when an evaluated mean reaches this score")
     parted: int = option(0, "stop when so many evaluations in a row fell clearly behind the best one before them")
@@ -378,16 +359,19 @@ class NetworkConfig:
 
     listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
     connect: tuple[str, ...] = option((), "connect to these stand-alone routers, as well where --listen is given")
-    beat: float = option(1.0, "seconds between a worker's beats")
-    evaluation_share: float = option(0.25, "of a busy fleet's time that evaluations get, 0 to 0.9; 0: only idle slots")
+    beat: Annotated[float, Between(0.05, 60.0)] = option(1.0, "seconds between a worker's beats")
+    evaluation_share: Annotated[float, Between(0.0, 0.9)] = option(
+        0.25, "share of a busy fleet's time for evaluations, 0 to 0.9; 0: only idle slots"
+    )  # the search needs the rest
     strict: bool = option(
         False,
         "take results only of hosts that compute the same bits as the first one that scored, so that the run ends with "
-        "the same bits whoever is killed",
+        "the same bits even if processes are killed",
     )
-    mixed: bool = option(False, "deprecated: any host may score unless --strict is given")
     metrics_port: str = option(
-        "", "answer Prometheus under /metrics at this port of 127.0.0.1, or at HOST:PORT; anybody there may read it"
+        "",
+        "serve Prometheus metrics under /metrics at this port of 127.0.0.1, or at HOST:PORT; anybody there may read "
+        "them",
     )
     insecure: bool = option(
         False, "listen beyond this host without a join file: anyone who reaches the port owns the run, may read, forge "
@@ -397,7 +381,4 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         if self.metrics_port:
             parse_metrics_address(self.metrics_port)
-        if not 0.05 <= self.beat <= 60:
-            raise UsageError(f"--beat must be from 0.05 to 60 seconds, not {self.beat}")
-        if not 0 <= self.evaluation_share <= LARGEST_SHARE:
-            raise UsageError(f"--evaluation-share must be from 0 to {LARGEST_SHARE}, not {self.evaluation_share}")
+        check_bounds(self)

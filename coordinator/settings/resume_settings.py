@@ -7,6 +7,7 @@ when a run is continued is stronger, and is kept from then on.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -35,11 +36,10 @@ def stored_limits(stored: RunFolder) -> Table:
 def stored_network(stored: RunFolder) -> Table:
     """Where a run was last reached, and how it treated its workers.
 
-    One from before runs said whether they are strict was so, unless it was `mixed`.
+    Older runs did not store `strict`: they were strict unless they had stored `mixed`.
     """
-    kept = _read(stored, NETWORK, NetworkConfig)
-    mixed = kept.pop("mixed", False)
-    return {"strict": not mixed, **kept}
+    kept = _read(stored, NETWORK, NetworkConfig, removed=("mixed",))
+    return {"strict": not kept.pop("mixed", False), **kept}
 
 
 def choose_addresses(
@@ -59,14 +59,12 @@ def choose_addresses(
     return replace(own, listen=listen or (() if connect else (default,)), connect=connect)
 
 
-def resolve_strict(network: NetworkConfig, *, said: bool) -> NetworkConfig:
-    """The same without `mixed`: it asks for what is done anyway, and loosens a run unless `strict` is `said` too."""
-    return replace(network, strict=network.strict and (said or not network.mixed), mixed=False)
-
-
-def _read(stored: RunFolder, name: str, section: type[Any]) -> dict[str, Any]:
+def _read(stored: RunFolder, name: str, section: type[Any], removed: Iterable[str] = ()) -> dict[str, Any]:
+    """The values of a section that the run stored; those of settings `removed` since then are not checked."""
     try:
-        return read_table(section, f"the {name} kept with run {stored.name}", json.loads(stored.fact(name) or "{}"))
+        table = json.loads(stored.fact(name) or "{}")
+        old = {key: table.pop(key) for key in removed if key in table}
+        return old | read_table(section, f"the {name} kept with run {stored.name}", table)
     except (ValueError, AttributeError) as error:
         raise JournalError(f"the {name} kept with run {stored.name} are damaged: {error}") from error
     except UsageError as error:

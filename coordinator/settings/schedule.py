@@ -4,47 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.cli.config import Table, option, read_table, read_toml
+from dreamfleet.common.cli.config import Table, read_table, read_toml
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.records import MAX_STAGES, STAGE_FIELDS, RunSettings, StageSettings
 from dreamfleet.common.runs.stages import Stage, stages_of
 
 STAGE, NO_SCHEDULE = "stage", "none"
-
-
-@dataclass(frozen=True)
-class StageConfig:
-    """One `[[stage]]`: what ends it, and what it names anew."""
-
-    generations: int | None = option(None, "it ends after so many of its generations,")
-    steps: int | None = option(None, "or so many environment steps of its own,")
-    score: float | None = option(None, "or when a mean that was asked in it is evaluated at this score")
-    horizon: int | None = option(None, "as --horizon; what is not named is as in the stage before")
-    patience: int | None = option(None, "as --patience")
-    episodes: int | None = option(None, "as --episodes")
-    population: int | None = option(None, "as --population; another one begins the search anew from the mean")
-    sigma0: float | None = option(None, "as --sigma0; begins the search anew from the mean")
-    racing: bool | None = option(None, "as --racing")
-    driven: float | None = option(None, "as --driven")
-    whole: bool = option(False, "true: from here on the search leaves the subspace, from the mean; it needs a sigma0")
-
-    def __post_init__(self) -> None:
-        for name in ("generations", "steps"):
-            value = getattr(self, name)
-            if value is not None and not 1 <= value < 2**63:
-                raise UsageError(f"{name} must be from 1 to {2**63 - 1}, not {value}")
-        if self.score is not None and not math.isfinite(self.score):
-            raise UsageError(f"score must be a number, not {self.score}")
-
-    @property
-    def settings(self) -> StageSettings:
-        """As a journal keeps it."""
-        named: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
-        return StageSettings(**{**named, "generations": self.generations or 0, "steps": self.steps or 0})
 
 
 def find_schedule(name: str | None, file: Table) -> tuple[StageSettings, ...] | None:
@@ -67,11 +35,13 @@ def read_stages(tables: Sequence[Table], where: str) -> tuple[StageSettings, ...
 
 def _read_stage(number: int, table: Table) -> StageSettings:
     name = f"stage {number}"
-    values = read_table(StageConfig, name, table)
-    try:
-        return StageConfig(**values).settings
-    except UsageError as error:
-        raise UsageError(f"{name}: {error}") from error
+    values = read_table(StageSettings, name, table)
+    for key in ("generations", "steps"):
+        if not 1 <= values.get(key, 1) < 2**63:
+            raise UsageError(f"{name}: {key} must be from 1 to {2**63 - 1}, not {values[key]}")
+    if not math.isfinite(values.get("score", 0)):
+        raise UsageError(f"{name}: score must be a number, not {values['score']}")
+    return StageSettings(**values)
 
 
 def split_first_stage(stages: tuple[StageSettings, ...]) -> tuple[dict[str, Any], tuple[StageSettings, ...]]:

@@ -85,13 +85,10 @@ def build_request(
 ) -> RunRequest:  # fmt: skip
     """What is to be served where the arguments say, else where it was `kept`; without `config` it is continued."""
     from dreamfleet.coordinator.service.main import RunRequest
-    from dreamfleet.coordinator.settings.resume_settings import choose_addresses, resolve_strict
+    from dreamfleet.coordinator.settings.resume_settings import choose_addresses
 
     base = {key: value for key, value in kept.items() if key not in ("listen", "connect")}
     own = load(NetworkConfig, "network", base=base, **args.sources)
-    if own.mixed:
-        log.warning("--mixed is deprecated: a run takes any host unless it is --strict (--no-strict loosens one)")
-    own = resolve_strict(own, said="strict" in args.given)
     credentials = load_credentials(args, ("coordinator",))
     network = choose_addresses(own, args.global_config, kept, credentials)
     Network(network.listen, network.connect, credentials).check_open(insecure=network.insecure)

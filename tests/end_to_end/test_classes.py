@@ -101,8 +101,7 @@ def test_a_strict_run_refuses_another_class_and_stays_strict_when_resumed(proces
     assert "--no-strict" in odd.wait_for("classes differ")
     coordinator.wait_for("classes differ")
     coordinator.end()
-    coordinator = processes.start(*resumed, "--mixed")
-    coordinator.wait_for("--mixed is deprecated")
+    coordinator = processes.start(*resumed, "--no-strict")
     own(processes, inside=ODD)
     assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:

@@ -10,12 +10,9 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.runs.scoring_params import scoring_params_of
-from tests.support import tasks
 from tests.support.bundles import states, write_random_bundle
 
 GENERATIONS, POPULATION, EPISODES = 4, 8, 3
-HEATED_GENERATIONS = 14
 
 
 def begin(processes, bundle, name, *flags):
@@ -88,48 +85,6 @@ def test_recorded_states_that_a_bundle_lacks_are_refused_as_the_run_begins(proce
     assert "random.zip holds no recorded states" in err
     assert "Traceback" not in err
     assert not (processes.runs / "run").exists()
-
-
-def begin_heated(processes, bundle, name):
-    return processes.coordinator(
-        "--bundle", bundle.path, "--task", tasks.OPTIMISTIC, "--population", POPULATION, "--episodes", EPISODES,
-        "--sigma0", 0.5, "--temperature", 1.0, "--heat", 1.5, "--evaluate-every", 2, "--evaluation-episodes", 8,
-        "--generations", HEATED_GENERATIONS, name=name,
-    )  # fmt: skip
-
-
-def heated_outcome(processes, name):
-    with open_run(processes.runs, name) as run:
-        places = [(g, i) for g in range(HEATED_GENERATIONS) for i in range(POPULATION)]
-        scores = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
-        temperatures = [scoring_params_of(run, g).spec.temperature for g in range(HEATED_GENERATIONS)]
-        return scores, run.evaluations(), temperatures
-
-
-def test_a_heated_run_whose_coordinator_is_killed_raises_at_the_same_generations(processes, random_bundle):
-    coordinator = begin_heated(processes, random_bundle, "calm")
-    worker = processes.worker("--task", tasks.OPTIMISTIC, "--run", "calm")
-    coordinator.wait_for("dreams at temperature")
-    assert coordinator.finish()[0] == 0
-    worker.end()
-    coordinator = begin_heated(processes, random_bundle, "night")
-    processes.worker("--task", tasks.OPTIMISTIC, "--run", "night")
-    for said in ("generation 2: mean", "dreams at temperature"):
-        coordinator.wait_for(said)
-        coordinator.end()
-        coordinator = processes.start(
-            "coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint,
-            "--beat", 0.2, "--generations", HEATED_GENERATIONS,
-        )  # fmt: skip
-    assert coordinator.finish()[0] == 0
-    calm = heated_outcome(processes, "calm")
-    assert calm == heated_outcome(processes, "night")
-    warm = next(g for g, temperature in enumerate(calm[2]) if temperature > 1)
-    for generation in (warm - 1, warm):
-        code, out, err = processes.call(
-            "replay", "night", "--runs-dir", processes.runs, "--candidate", f"{generation}/3"
-        )
-        assert (code, out.count("same bits")) == (0, EPISODES), err
 
 
 def test_a_world_model_without_a_dream_is_refused_by_its_worker(processes, random_bundle, tmp_path):

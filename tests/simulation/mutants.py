@@ -69,9 +69,9 @@ class Mutant:
 
 MUTANTS: dict[str, Mutant] = {}
 FOUND = [Schedule.from_json(line) for line in Path(__file__).with_name("found.jsonl").read_text().splitlines()]
-COLLECTING = {"collect_every": 1, "rollout": 90_000, "heat": 1.0}
-SCORED = {"evaluate_every": 1, "first_stage": 3, "first_score": 1.2, "heat": 1.0, "generations": 3}
-LONG = {"parameters": 23_000, "width": 1, "heat": 1.0}
+COLLECTING = {"collect_every": 1, "rollout": 90_000}
+SCORED = {"evaluate_every": 1, "first_stage": 3, "first_score": 1.2, "generations": 3}
+LONG = {"parameters": 23_000, "width": 1}
 
 
 def mutant(target: Any, attribute: str, **shape: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -264,7 +264,7 @@ def evaluations_forget_the_scores_of_the_life_before(original):
     return lambda self, evaluation, spec, _known: original(self, evaluation, spec, {})
 
 
-@mutant(Confirmation, "record", confirm_episodes=4, evaluate_every=1, heat=1.0, ends=True)
+@mutant(Confirmation, "record", confirm_episodes=4, evaluate_every=1, ends=True)
 def confirmation_fills_its_round_in_the_order_in_which_scores_come(original):
     def record(self, digest, score):
         still = [each for each in self._digests if each not in self._scores]

@@ -25,7 +25,6 @@ class Shape:
     first_stage: int = 0  # generations after which a second stage begins; 0: never
     first_score: float = 0.0  # of an evaluated mean, at which it begins earlier; 0: at none
     anew: bool = False  # whether the second stage begins the search anew
-    heat: float = 1.0
     evaluate_every: int = 0
     evaluation_episodes: int = 2
     confirm_episodes: int = 0  # with which the best evaluated means are confirmed as the run ends
@@ -146,18 +145,16 @@ def _draw_fault(source: random.Random, kind: str, workers: int) -> Fault:
 def _draw_shape(source: random.Random) -> Shape:
     wide = source.random() < 0.1
     long = source.random() < 0.03
-    heated = source.random() < 0.1
     return Shape(
         workers=source.choice((2, 2, 3, 4)),
         slots=source.choice((1, 1, 2)),
         width=256 if wide else 1,
-        generations=3 if heated else source.choice((2, 2, 3)),
+        generations=source.choice((2, 2, 3)),
         population=12 if wide else source.choice((2, 3, 4)),
         episodes=2 if long else source.choice((1, 2, 3)),
         parameters=23_000 if long else 4,
         racing=source.random() < 0.15,
-        heat=1.5 if heated else 1.0,
-        evaluate_every=1 if heated else source.choice((0, 0, 1, 2)),
+        evaluate_every=source.choice((0, 0, 1, 2)),
         confirm_episodes=source.choice((0, 0, 0, 4)),
         collect_every=source.choice((0, 0, 0, 2)),
         rollout=source.choice((300, 300, 90_000)),

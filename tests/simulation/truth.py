@@ -16,7 +16,6 @@ import numpy as np
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.protocol.messages import Job, TaskSpec
 from dreamfleet.common.runs.records import RunSettings, StageSettings, StoredEvaluation
-from dreamfleet.common.runs.scoring_params import scoring_params_at
 from dreamfleet.common.runs.seeds import collection_seed, search_seed, training_seed, validation_seeds
 from dreamfleet.coordinator.optimisers.api import Search
 from tests.simulation.schedule import Shape
@@ -62,9 +61,8 @@ class Strategy:
 @lru_cache(4096)
 def settings_of(shape: Shape) -> RunSettings:
     """The frozen settings of the run."""
-    temperature = 1.0 if shape.heat != 1.0 else None
     return RunSettings(
-        task=TaskSpec(TASK, "", STEPS, 0, temperature=temperature),
+        task=TaskSpec(TASK, "", STEPS, 0),
         controller=ControllerShape(shape.parameters // 2 - 1, 2),
         population=shape.population,
         episodes=shape.episodes,
@@ -76,7 +74,6 @@ def settings_of(shape: Shape) -> RunSettings:
         racing=shape.racing,
         confirm_episodes=shape.confirm_episodes,
         collect_every=shape.collect_every,
-        heat=shape.heat,
         optimiser=TASK,
         stages=_stages_of(shape),
     )
@@ -134,14 +131,13 @@ def _truth(shape: Shape) -> Truth:
     strategy = Strategy(Search(np.zeros(settings.controller.size), shape.population, settings.sigma0, shape.run_seed))
     truth, counted, second = Truth([], [], {}, {}, 0), set(), False
     for number in range(shape.generations):
-        warm = scoring_params_at(number, settings, (), truth.evaluations.values()).spec.temperature
-        named: Named = (None if warm == settings.task.temperature else warm, None, None, None)
+        named: Named = (None, None, None, None)
         episodes, racing = shape.episodes, shape.racing
         if not second and _first_is_over(shape, number, truth.evaluations):
             second = True
             strategy = _second_search(shape, strategy) if shape.anew else strategy
         if second:
-            named, episodes, racing = (named[0], SECOND_HORIZON, SECOND_PATIENCE, None), episodes + 1, not racing
+            named, episodes, racing = (None, SECOND_HORIZON, SECOND_PATIENCE, None), episodes + 1, not racing
         vectors = tuple(row.astype("<f4").tobytes() for row in strategy.ask())
         seeds = [training_seed(shape.run_seed, number, episode) for episode in range(episodes)]
         scores = [[fitness_of(vector, seed, named) for seed in seeds] for vector in vectors]

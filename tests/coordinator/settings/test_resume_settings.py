@@ -11,7 +11,6 @@ from dreamfleet.common.transport.network import DEFAULT_ENDPOINT
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.settings.resume_settings import (
     choose_addresses,
-    resolve_strict,
     serving_facts,
     stored_limits,
     stored_network,
@@ -44,18 +43,12 @@ def test_limits_and_network_come_back_as_they_were(folder):
 
 
 @pytest.mark.parametrize(("kept", "strict"), [("{}", True), ('{"mixed": true}', False), ('{"strict": false}', False)])
-def test_a_run_from_before_runs_said_so_was_strict_unless_it_was_mixed_and_goes_on_so(folder, kept, strict):
+def test_an_older_run_without_strict_resumes_strict_unless_it_stored_mixed(folder, kept, strict):
     with RunFolder(folder) as run:
         assert (stored_limits(run), stored_network(run)) == ({}, {"strict": True})
     keep(folder, {"network": kept})
     with RunFolder(folder) as run:
         assert stored_network(run) == {"strict": strict}
-
-
-def test_mixed_loosens_a_strict_run_unless_strict_is_said_beside_it():
-    asked = NetworkConfig(strict=True, mixed=True)
-    assert resolve_strict(asked, said=False) == NetworkConfig()
-    assert resolve_strict(asked, said=True) == NetworkConfig(strict=True)
 
 
 def test_defaults_are_not_written_but_whether_a_run_is_strict():

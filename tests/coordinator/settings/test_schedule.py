@@ -110,7 +110,7 @@ def test_what_no_schedule_can_be_is_one_line(read, text, told):
             "[[stage]]\ngenerations = 2\nsteps = 128001\n" + NEXT,
             "stage 1 never ends by its steps: .* have 128000 at most",
         ),
-        ("[[stage]]\ngenerations = 2\nhorizon = 0\n" + NEXT, "stage 1: --horizon must be at least 1, not 0"),
+        ("[[stage]]\ngenerations = 2\nhorizon = 0\n" + NEXT, "stage 1: --horizon must be from 1 to 1000000, not 0"),
         ("[[stage]]\ngenerations = 2\n" + NEXT + "sigma0 = 0.0\n", "stage 2: --sigma0 must be a positive number"),
         ("[[stage]]\ngenerations = 2\n" + NEXT + "racing = true\nepisodes = 1\n", "stage 2: --racing needs at least 2"),
         ("[[stage]]\ngenerations = 2\n" + NEXT + "population = 2\n", "stage 2: cma needs a population of at least 3"),

@@ -1,3 +1,5 @@
+"""The temperature of older runs with `heat`, which no new run can have."""
+
 import dataclasses
 import itertools
 
@@ -6,8 +8,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.protocol.messages import MAX_TEMPERATURE
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation
-from dreamfleet.common.runs.scoring_params import scoring_params_at
-from dreamfleet.common.runs.temperature_schedule import TemperatureSchedule
+from dreamfleet.common.runs.scoring_params import ScheduleState, scoring_params_at
 from tests.support.samples import SPEC
 
 EVERY = 5
@@ -18,7 +19,7 @@ SETTINGS = RunSettings(
 
 
 def checks(*means):
-    """After generations 4, 9, ...; of standard error 10."""
+    """Evaluations after generations 4, 9, ... with standard error 10."""
     return [StoredEvaluation(EVERY * (index + 1) - 1, 16, mean, 40.0) for index, mean in enumerate(means)]
 
 
@@ -55,13 +56,8 @@ def test_a_generation_is_decided_by_checks_that_are_a_whole_block_old():
     found = [temperature(generation, checks(500.0, 400.0, 390.0)) for generation in range(20)]
     found = [None if each == SETTINGS.task.temperature else each for each in found]
     assert found == [None] * 15 + [1.5] * 5
-    assert [TemperatureSchedule(SETTINGS).required_evaluation(generation) for generation in (0, 9, 10, 14, 15)] == [
-        -6,
-        -1,
-        4,
-        4,
-        9,
-    ]
+    state = ScheduleState(SETTINGS)
+    assert [state.required_evaluation(generation) for generation in (0, 9, 10, 14, 15)] == [-1, -1, 4, 4, 9]
 
 
 def test_later_checks_and_those_off_the_schedule_and_the_order_of_arrival_change_nothing():
@@ -80,7 +76,7 @@ def test_without_heat_nothing_is_raised_or_waited_for():
     cold = dataclasses.replace(SETTINGS, heat=1.0)
     assert raised((500.0, 400.0, 300.0, 200.0), cold) is None
     never = dataclasses.replace(cold, evaluate_every=0)
-    assert [TemperatureSchedule(each).required_evaluation(50) for each in (cold, never)] == [-1, -1]
+    assert [ScheduleState(each).required_evaluation(50) for each in (cold, never)] == [-1, -1]
 
 
 def test_settings_and_digests_without_heat_are_what_they_were():
@@ -91,8 +87,3 @@ def test_settings_and_digests_without_heat_are_what_they_were():
     written = "32b5b1f8a6bee0b22ed62a5034cdf1657709a3c7b15707ad38a792110c7c9de4"  # by the version before heat
     assert SPEC.digest("score", b"x" * 32, (1,)).hex() == written
     assert SPEC.with_overrides(None).digest("score", b"x" * 32, (1,)).hex() == written
-
-
-def test_a_dream_that_nobody_evaluates_stays_as_warm_as_it_is():
-    settings = dataclasses.replace(SETTINGS, heat=1.0, evaluate_every=0)
-    assert temperature(5, [], settings) == settings.task.temperature
