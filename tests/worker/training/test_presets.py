@@ -19,8 +19,7 @@ from dreamfleet.worker.training.presets import PRESETS
 from dreamfleet.worker.training.teacher_forcing import teacher_force
 from dreamfleet.worker.training.train_config import TrainConfig
 from dreamfleet.worker.verbs import collect
-from dreamfleet.worker.verbs import train_mdnrnn as mdnrnn_verb
-from dreamfleet.worker.verbs import train_vae as vae_verb
+from dreamfleet.worker.verbs import train as verbs
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import NOTEBOOK, REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
@@ -30,7 +29,7 @@ from tests.support.drives import write_drive, write_drives
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
 SMALL = {64: VAEConfig(channels=(2, 2, 4, 4)), 96: VAEConfig(picture=96, channels=(2, 2, 4, 4))}
-VERBS = (collect, vae_verb, mdnrnn_verb)
+VERBS = (collect, verbs.VAE, verbs.MDNRNN)
 
 
 def ignore(_done, _note):
@@ -126,7 +125,7 @@ def test_every_flag_says_what_it_does(verb):
 
 @pytest.mark.parametrize(
     ("verb", "kinds"),
-    [(collect, (CollectConfig,)), (vae_verb, (TrainConfig, VAEConfig)), (mdnrnn_verb, (TrainConfig, MDNRNNConfig))],
+    [(collect, (CollectConfig,)), (verbs.VAE, (TrainConfig, VAEConfig)), (verbs.MDNRNN, (TrainConfig, MDNRNNConfig))],
 )
 def test_every_amount_and_layer_has_a_flag(verb, kinds):
     parser = argparse.ArgumentParser()
@@ -148,7 +147,7 @@ def test_a_later_verb_without_the_data_sets_preset_is_refused(tmp_path, capsys):
             call(verb, "--data", str(tmp_path))
         with pytest.raises(UsageError, match="--preset paper is another: give --preset article"):
             call(verb, "--data", str(tmp_path), "--preset", "paper")
-    assert call(vae_verb, "--data", str(tmp_path), "--preset", "article", "--summary") == 0
+    assert call(verbs.VAE, "--data", str(tmp_path), "--preset", "article", "--summary") == 0
     assert "2,115,971" in capsys.readouterr().out
 
 
