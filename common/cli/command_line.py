@@ -12,8 +12,9 @@ import difflib
 import errno
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points, version
 from typing import NoReturn, Protocol
 
@@ -46,6 +47,16 @@ class Verb(Configurable, Protocol):
 
     def run(self, args: argparse.Namespace) -> int:
         """Run the verb; returns the exit code."""
+
+
+@dataclass
+class SimpleVerb:
+    """A verb made of two functions, where one module offers several: its entry point is `module:NAME`."""
+
+    SUMMARY: str
+    configure: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+    EXTRAS: tuple[str, ...] = ()
 
 
 class Parser(argparse.ArgumentParser):
@@ -112,7 +123,7 @@ def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:
     name = ".".join(words[:2]) if ".".join(words[:2]) in points else "".join(words[:1])
     if name not in points:
         _show_overview(points, words)
-    verb = _load_verb(points[name])
+    verb = load_verb(points[name])
     args = build_parser(name, verb).parse_all(words[name.count(".") + 1 :])
     from dreamfleet.common.cli.global_config import complete_arguments
 
@@ -139,7 +150,8 @@ def build_parser(name: str, verb: Configurable) -> Parser:
     return parser
 
 
-def _load_verb(point: EntryPoint) -> Verb:
+def load_verb(point: EntryPoint) -> Verb:
+    """The verb of an entry point; `DreamfleetError` names its owner if it cannot be imported."""
     try:
         verb: Verb = point.load()
     except Exception as error:
@@ -188,7 +200,7 @@ def _help_parser(prog: str, names: Iterable[str], points: Mapping[str, EntryPoin
 
 def _summary(point: EntryPoint) -> str:
     try:
-        return _load_verb(point).SUMMARY
+        return load_verb(point).SUMMARY
     except DreamfleetError as error:
         return f"BROKEN: {error}"
 

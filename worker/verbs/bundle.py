@@ -1,4 +1,4 @@
-"""`dreamfleet bundle`: freeze a trained world model."""
+"""`dreamfleet bundle|unbundle`: freeze a trained world model into one file, and back."""
 
 from __future__ import annotations
 
@@ -6,33 +6,32 @@ import argparse
 from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import MAX_RECORDED_STATES
+from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
 
-SUMMARY = "freeze a trained world model into one file that workers fetch by its hash"
-EXTRAS = ("train",)
 RECORDED = 512  # states of the default layers are 0.6 MB
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the verb's arguments."""
+def configure_bundle(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `bundle`."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set and its trained models")
     parser.add_argument("--out", type=Path, required=True, help="the bundle to write, NAME.zip")
     parser.add_argument("--with-weights", action="store_true", help="keep the training weights in it")
     parser.add_argument(
         "--recorded", type=int, default=RECORDED, metavar="N",
-        help=f"moments of the drives at which dreams may begin, with the model's memory; 0: none (default {RECORDED})",
+        help=f"recorded states at which dreams may begin, with the model's memory (default {RECORDED}; 0: none)",
     )  # fmt: skip
     parser.add_argument(
         "--measured", type=Path, nargs="+", default=[], metavar="FILE",
-        help="figures to keep in its manifest, told by `inspect --json` (--probe, --losses, ...) of it without them",
+        help="answers of `inspect --json` (--probe, --losses, ...) about this world model, to keep in its manifest",
     )  # fmt: skip
     add_json_flag(parser)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Build the bundle and print its identity."""
+def write_bundle(args: argparse.Namespace) -> int:
+    """Write the bundle, and print its SHA-256."""
     from dreamfleet.worker.training.assemble import assemble
 
     if not 0 <= args.recorded <= MAX_RECORDED_STATES:
@@ -52,3 +51,37 @@ def run(args: argparse.Namespace) -> int:
     print_answer(args, text, bundle=bundle.path, bytes=bundle.path.stat().st_size, sha256=bundle.sha256,
            controller_parameters=parameters, recorded=states)  # fmt: skip
     return 0
+
+
+def configure_unbundle(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `unbundle`."""
+    parser.add_argument("bundle", metavar="BUNDLE", help="a file, or one that ships")
+    parser.add_argument(
+        "--data", type=Path, required=True, help="folder of a data set, for its models; made if missing"
+    )
+    add_json_flag(parser)
+
+
+def write_checkpoints(args: argparse.Namespace) -> int:
+    """Write both checkpoints, and print their paths."""
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.worker.training.unbundle import unbundle
+
+    bundle = find_bundle(args.bundle)
+    vae, mdnrnn = unbundle(bundle, args.data)
+    print_answer(args, f"{vae} and {mdnrnn}, of {bundle.sha256[:12]}", vae=vae, mdnrnn=mdnrnn, bundle=bundle.sha256)
+    return 0
+
+
+BUNDLE = SimpleVerb(
+    "freeze a trained world model into one file that workers fetch by its hash",
+    configure_bundle,
+    write_bundle,
+    EXTRAS=("train",),
+)
+UNBUNDLE = SimpleVerb(
+    "write a bundle's VAE and MDN-RNN as checkpoints that training can continue from",
+    configure_unbundle,
+    write_checkpoints,
+    EXTRAS=("train",),
+)

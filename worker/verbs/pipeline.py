@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 from contextlib import redirect_stdout
-from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.global_config import complete_arguments
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.cli.presets import preset_help_text
+from dreamfleet.common.cli.verb_runner import find_verb
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import interrupted_by_signals
 
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _parse_stage(name: str, words: Arguments) -> argparse.Namespace:
-    args = build_parser(name, _load_verb(name)).parse_all(words)
+    args = build_parser(name, find_verb(name)).parse_all(words)
     complete_arguments(args)
     return args
 
@@ -74,12 +74,8 @@ def _parse_stage(name: str, words: Arguments) -> argparse.Namespace:
 def _run_stage(name: str, args: argparse.Namespace, capture: bool) -> Any:
     """Run a stage, which prints its answer; or return it, where it is to be heard."""
     if not capture:
-        return _load_verb(name).run(args)
+        return find_verb(name).run(args)
     args.json = True
     with redirect_stdout(StringIO()) as said:
-        _load_verb(name).run(args)
+        find_verb(name).run(args)
     return json.loads(said.getvalue())
-
-
-def _load_verb(name: str) -> Any:
-    return import_module(f"dreamfleet.worker.verbs.{name.replace('.', '_')}")

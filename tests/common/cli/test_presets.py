@@ -14,7 +14,7 @@ from dreamfleet.coordinator.verbs import coordinator
 from dreamfleet.worker.baselines import presets as baselines
 from dreamfleet.worker.training import presets
 from dreamfleet.worker.training.config_flags import add_training_flags
-from dreamfleet.worker.verbs import baseline_train
+from dreamfleet.worker.verbs import baseline
 from tests.support.processes import ROOT
 
 
@@ -36,7 +36,7 @@ def test_a_name_of_the_other_kind_is_told_apart():
 def test_help_tells_each_presets_values():
     training, learning = argparse.ArgumentParser(), argparse.ArgumentParser()
     add_training_flags(training, "vae")
-    baseline_train.configure(learning)
+    baseline.configure_train(learning)
     told = " ".join(training.format_help().split())
     assert "(default 1500; notebook 30000; article 60000; attentive 19200; paper 1000000)" in told
     assert "0: never (default 0; attentive, paper 10)" in told

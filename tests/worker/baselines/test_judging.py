@@ -19,7 +19,7 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tools import agent_evaluator
 from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training.checkpoint import save_checkpoint
-from dreamfleet.worker.verbs import baseline_evaluate, baseline_record
+from dreamfleet.worker.verbs import baseline
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
@@ -54,7 +54,7 @@ def call(verb, *words):
 def test_a_judgement_is_a_controllers_and_the_same_again(name, trained, tmp_path, capsys):
     out, data = tmp_path / "figures.json", ("--data", trained) if name == DRQN else ()
     words = (name, *data, "--episodes", 2, "--first-seed", SEED, "--jobs", 1, "--json", "--out", out)
-    assert call(baseline_evaluate, *words) == 0
+    assert call(baseline.EVALUATE, *words) == 0
     printed = capsys.readouterr()
     assert "note:" not in printed.err
     found = read_evaluation_report(out)
@@ -62,7 +62,7 @@ def test_a_judgement_is_a_controllers_and_the_same_again(name, trained, tmp_path
     assert (found.world, found.bundle, found.results.seeds) == ("car-racing", "", (SEED, SEED + 1))
     assert {each.steps for each in found.drives} == {STEPS}
     assert all(each.speed is not None and each.braking is not None for each in found.drives)
-    assert call(baseline_evaluate, *words) == 0
+    assert call(baseline.EVALUATE, *words) == 0
     assert read_evaluation_report(out).drives == found.drives
 
 
@@ -82,7 +82,7 @@ def test_chance_is_the_episodes_and_within_the_world():
 
 def test_a_video_has_a_frame_a_step_and_the_drives_score(trained, tmp_path, capsys):
     out = tmp_path / "drive.mp4"
-    assert call(baseline_record, DRQN, "--data", trained, "--seed", SEED, "--steps", STEPS, "--out", out, "--json") == 0
+    assert call(baseline.RECORD, DRQN, "--data", trained, "--seed", SEED, "--steps", STEPS, "--out", out, "--json") == 0
     score = json.loads(capsys.readouterr().out)["score"]
     assert score == agent_evaluator.AgentEvaluator(find_baseline(DRQN, trained)).drive(SEED).score
     assert score == record(find_baseline(DRQN, trained), SEED, STEPS, out)

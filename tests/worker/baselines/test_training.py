@@ -20,7 +20,7 @@ from dreamfleet.worker.baselines.presets import LEARNING, NOTEBOOK
 from dreamfleet.worker.baselines.train import CHECKPOINT, CURVE, train_drqn
 from dreamfleet.worker.car_racing.agents import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights, save_checkpoint
-from dreamfleet.worker.verbs import baseline_train
+from dreamfleet.worker.verbs import baseline
 
 LAYERS = AgentConfig(channels=(2,), kernels=(8,), strides=(8,), hidden=4, frame_skip=3)
 SHORT = LearningConfig(
@@ -39,8 +39,8 @@ class KilledError(BaseException):
 
 def call(*words):
     parser = argparse.ArgumentParser()
-    baseline_train.configure(parser)
-    return baseline_train.run(parser.parse_args(list(map(str, words))))
+    baseline.configure_train(parser)
+    return baseline.train_baseline(parser.parse_args(list(map(str, words))))
 
 
 def state(folder):

@@ -1,7 +1,5 @@
 """The lower bounds of `bench policy` and `bench dream` ignore slow libraries and inherited settings."""
 
-import argparse
-import json
 import os
 
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 
 from dreamfleet.common.host.resource_limits import POOLS
 from dreamfleet.worker.bench.matrix_products import LIBRARIES, fastest, product_cases, product_graph
-from dreamfleet.worker.bench.measurement import print_figures
+from dreamfleet.worker.verbs.bench import measure_on_one_thread
 from dreamfleet.worker.worldmodel.inference import open_graph
 
 
@@ -18,14 +16,13 @@ def inherited(_bundle):
     return {name: value for name, value in os.environ.items() if "BLAS" in name or name.startswith("ATEN_")}
 
 
-def test_no_librarys_setting_reaches_a_measurement(monkeypatch, capsys):
+def test_no_librarys_setting_reaches_a_measurement(monkeypatch):
     settings = {"OPENBLAS_CORETYPE": "Prescott", "OPENBLAS_L2_SIZE": "1", "ATEN_CPU_CAPABILITY": "default"}
     for name, value in {**settings, **dict.fromkeys(POOLS, "2")}.items():
         monkeypatch.setenv(name, value)
-    print_figures(inherited, argparse.Namespace(bundle="tiny", json=True))
-    printed = json.loads(capsys.readouterr().out)
-    assert not settings.keys() & printed.keys()
-    assert printed["OPENBLAS_NUM_THREADS"] == "1"
+    environment = measure_on_one_thread(inherited, "tiny")
+    assert not settings.keys() & environment.keys()
+    assert environment["OPENBLAS_NUM_THREADS"] == "1"
 
 
 def test_a_floor_is_each_product_by_the_library_that_is_fastest_at_it():

@@ -16,7 +16,7 @@ from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.data.rollouts import load_rollouts
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import TrainConfig
-from dreamfleet.worker.verbs import train_vae as verb
+from dreamfleet.worker.verbs import train as verbs
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE
@@ -125,7 +125,7 @@ def test_flags_pass_through_an_iteration_to_the_training(trained, tmp_path):
     assert IterateConfig(vae_flags="--error-factor 4").vae_flags
     words = commands(vae_flags="--error-factor 4").train(1, "vae")
     parser = argparse.ArgumentParser()
-    verb.configure(parser)
+    verbs.VAE.configure(parser)
     given = [str(tmp_path) if word == "data/rounds/01" else word for word in words[2:]]
-    assert verb.run(parser.parse_args([*given, "--updates", "1", "--channels", "2", "2", "4", "4"])) == 0
+    assert verbs.VAE.run(parser.parse_args([*given, "--updates", "1", "--channels", "2", "2", "4", "4"])) == 0
     assert load_config(tmp_path / train_vae.CHECKPOINT, VAEConfig).error_factor == 4.0

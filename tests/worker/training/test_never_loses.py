@@ -18,7 +18,7 @@ from dreamfleet.worker.training.loss_curve import append_point
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.training_cli import run_training
 from dreamfleet.worker.training.training_state import numbered_path
-from dreamfleet.worker.verbs import train_vae as verb
+from dreamfleet.worker.verbs import train as verbs
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import write_drives
@@ -72,8 +72,8 @@ def test_a_training_goes_on_by_the_seed_that_it_was_begun_with(data):
 
 def call(*words):
     parser = argparse.ArgumentParser()
-    verb.configure(parser)
-    return verb.run(parser.parse_args([*map(str, words), *FLAGS]))
+    verbs.VAE.configure(parser)
+    return verbs.VAE.run(parser.parse_args([*map(str, words), *FLAGS]))
 
 
 def state(path):

@@ -17,8 +17,7 @@ from dreamfleet.worker.training.data.rollouts import Rollouts, load_rollouts, mo
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.verbs import collect
-from dreamfleet.worker.verbs import train_mdnrnn as mdnrnn_verb
-from dreamfleet.worker.verbs import train_vae as vae_verb
+from dreamfleet.worker.verbs import train as verbs
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import NOTEBOOK, REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
@@ -28,7 +27,7 @@ from tests.support.drives import write_drive, write_drives
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
 SMALL = {64: VAEConfig(channels=(2, 2, 4, 4)), 96: VAEConfig(picture=96, channels=(2, 2, 4, 4))}
-VERBS = (collect, vae_verb, mdnrnn_verb)
+VERBS = (collect, verbs.VAE, verbs.MDNRNN)
 
 
 def ignore(_done, _note):
@@ -124,7 +123,7 @@ def test_every_flag_says_what_it_does(verb):
 
 @pytest.mark.parametrize(
     ("verb", "kinds"),
-    [(collect, (CollectConfig,)), (vae_verb, (TrainConfig, VAEConfig)), (mdnrnn_verb, (TrainConfig, MDNRNNConfig))],
+    [(collect, (CollectConfig,)), (verbs.VAE, (TrainConfig, VAEConfig)), (verbs.MDNRNN, (TrainConfig, MDNRNNConfig))],
 )
 def test_every_amount_and_layer_has_a_flag(verb, kinds):
     parser = argparse.ArgumentParser()
@@ -146,7 +145,7 @@ def test_a_later_verb_without_the_data_sets_preset_is_refused(tmp_path, capsys):
             call(verb, "--data", str(tmp_path))
         with pytest.raises(UsageError, match="--preset paper is another: give --preset article"):
             call(verb, "--data", str(tmp_path), "--preset", "paper")
-    assert call(vae_verb, "--data", str(tmp_path), "--preset", "article", "--summary") == 0
+    assert call(verbs.VAE, "--data", str(tmp_path), "--preset", "article", "--summary") == 0
     assert "2,115,971" in capsys.readouterr().out
 
 

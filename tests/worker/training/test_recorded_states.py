@@ -14,7 +14,7 @@ from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import TrainConfig
-from dreamfleet.worker.verbs import bundle as verb
+from dreamfleet.worker.verbs import bundle as verbs
 from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -133,8 +133,8 @@ def test_equal_folders_record_equal_states_and_none_are_the_bundle_of_before(tra
 
 def call(capsys, folder, *flags):
     parser = argparse.ArgumentParser()
-    verb.configure(parser)
-    assert verb.run(parser.parse_args(["--data", str(folder), "--out", str(folder / "b.zip"), *flags])) == 0
+    verbs.configure_bundle(parser)
+    assert verbs.write_bundle(parser.parse_args(["--data", str(folder), "--out", str(folder / "b.zip"), *flags])) == 0
     return capsys.readouterr().out
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.training.checkpoint import load_config
-from dreamfleet.worker.verbs import collect, train_mdnrnn, train_vae
+from dreamfleet.worker.verbs import collect, train
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import write_drive, write_drives
 from tests.support.events import scalars
@@ -21,7 +21,7 @@ def call(verb, *arguments):
 def test_flags_change_what_a_preset_says(tmp_path, capsys):
     write_drives(tmp_path, episodes=3, steps=4)
     call(
-        train_vae, "--data", str(tmp_path), "--updates", "1", "--channels", "2", "2", "4", "4", "--no-batch-norm",
+        train.VAE, "--data", str(tmp_path), "--updates", "1", "--channels", "2", "2", "4", "4", "--no-batch-norm",
         "--padding", "same",
     )  # fmt: skip
     assert load_config(tmp_path / "vae.safetensors", VAEConfig) == VAEConfig(channels=(2, 2, 4, 4), padding="same")
@@ -30,7 +30,7 @@ def test_flags_change_what_a_preset_says(tmp_path, capsys):
 
 def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):
     write_drives(tmp_path, episodes=3, steps=4, picture=96)
-    call(train_vae, "--data", str(tmp_path), "--updates", "1", "--picture", "96", "--channels", "2", "2", "4", "4")
+    call(train.VAE, "--data", str(tmp_path), "--updates", "1", "--picture", "96", "--channels", "2", "2", "4", "4")
     assert load_config(tmp_path / "vae.safetensors", VAEConfig).picture == 96
     assert call(collect, "--data", str(tmp_path), "--episodes", "3", "--picture", "96") == 0
     assert "0 episodes, 0 frames new; 3 episodes in all" in capsys.readouterr().out
@@ -49,7 +49,7 @@ def test_a_set_that_has_more_than_is_asked_for_is_counted_whole(tmp_path, capsys
     assert "5/5" in printed.err
 
 
-@pytest.mark.parametrize(("verb", "count"), [(train_vae, "4,348,547"), (train_mdnrnn, "422,368")])
+@pytest.mark.parametrize(("verb", "count"), [(train.VAE, "4,348,547"), (train.MDNRNN, "422,368")])
 def test_a_summary_trains_nothing(tmp_path, capsys, verb, count):
     assert call(verb, "--data", str(tmp_path / "absent"), "--preset", "paper", "--summary") == 0
     assert count in capsys.readouterr().out
@@ -85,7 +85,7 @@ def test_losses_go_to_tensorboard_too_and_a_continued_training_adds_to_them(tmp_
     layers = ("--channels", "2", "2", "4", "4")
     flags = ("--data", str(data), *layers, "--validate-every", "1", "--tensorboard", str(events))
     for updates in ("1", "3"):
-        call(train_vae, *flags, "--updates", updates)
+        call(train.VAE, *flags, "--updates", updates)
     points = [json.loads(line) for line in (data / "vae.jsonl").read_text().splitlines()]
     found = scalars(events / "vae")
     assert [step for step, _ in found["loss/held_out"]] == [1, 2, 3]

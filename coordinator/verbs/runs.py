@@ -1,0 +1,250 @@
+"""`dreamfleet runs list|show|archive|backup|delete|export`: the runs on this disk."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.cli.command_line import SimpleVerb
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.monitoring.eta import format_duration
+from dreamfleet.common.printable import format_setting
+from dreamfleet.common.runs.records import RunSettings, StoredGeneration, best_evaluation, describe_score
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.runs.run_lock import run_lock
+from dreamfleet.common.runs.run_paths import ARCHIVE as ARCHIVE_FOLDER
+from dreamfleet.common.runs.run_paths import check_movable, reporting_folder_errors, run_paths
+from dreamfleet.common.runs.stages import begun_stages, describe_stages
+from dreamfleet.common.transport.network import SECURED_PREFIX
+
+DROP_ORDER = ("created", "classes", "task", "mean", "evaluated")  # columns that a narrow terminal leaves out first
+LAST_GENERATIONS = 20
+
+
+def add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of a verb about one run: its name, the folder of runs, `--json`."""
+    parser.add_argument("run_name", metavar="RUN", help="name of the run")
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
+
+
+def configure_list(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `runs list`."""
+    add_global_flags(parser, "runs_dir")
+    parser.add_argument("--archived", action="store_true", help="list the archived runs instead")
+    add_json_flag(parser)
+
+
+def list_runs(args: argparse.Namespace) -> int:
+    """Print one row per run; a run whose journal is damaged has the error as its state."""
+    runs_dir = args.runs_dir / ARCHIVE_FOLDER if args.archived else args.runs_dir
+    rows = [_run_row(path) for path in run_paths(runs_dir)]
+    if args.json:
+        print(json.dumps(rows, indent=2))
+        return 0
+    if not rows:
+        print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME", file=sys.stderr)
+        return 0
+    print_rows(rows, right=("generations", "mean", "evaluated", "confirmed", "classes"), drop_order=DROP_ORDER)
+    return 0
+
+
+def _run_row(path: Path) -> dict[str, object]:
+    try:
+        with RunFolder(path) as run:
+            history, evaluations, confirmed = run.history(), run.evaluations(), run.confirmation()
+            return {
+                "run": run.name,
+                "created": run.created,
+                "task": run.spec.task,
+                "generations": len(history),
+                "mean": round(history[-1].mean, 1) if history else None,
+                "evaluated": round(evaluations[-1].mean, 1) if evaluations else None,
+                "confirmed": round(confirmed.mean, 1) if confirmed else None,
+                "classes": run.classes.total,
+                "state": run.state,
+            }
+    except JournalError as error:
+        return {"run": path.name, "created": None, "task": None, "generations": None, "mean": None,
+                "evaluated": None, "confirmed": None, "classes": None, "state": str(error)}  # fmt: skip
+
+
+def show_run(args: argparse.Namespace) -> int:
+    """Print a run's settings and generations."""
+    with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
+        settings, history, evaluations = stored.settings, stored.history(), stored.evaluations()
+        confirmed, duration_seconds = stored.confirmation(), stored.duration_seconds
+        facts = {
+            "run": stored.name,
+            "run_uid": stored.uid,
+            "created": stored.created,
+            "ended": stored.ended,
+            "ended_at": stored.ended_at,
+            "lasted_seconds": duration_seconds,
+            "fingerprint": stored.fingerprint,
+        }
+        classes = stored.classes
+    begun = begun_stages(settings, history, evaluations) if settings.stages else ()
+    if args.json:
+        rows: dict[str, Any] = {"history": [asdict(each) for each in history]}
+        rows["evaluations"] = [asdict(each) for each in evaluations]
+        rows["stages"] = [{"number": each.stage.number, "since": each.since, "after": each.why} for each in begun]
+        reported = None if confirmed is None else {**asdict(confirmed), "error": confirmed.error}
+        rows["classes"] = asdict(classes)
+        print(json.dumps({**facts, "settings": asdict(settings), "confirmed": reported, **rows}, indent=2))
+        return 0
+    del facts["lasted_seconds"]
+    if duration_seconds is not None:
+        facts["ended_at"] = f"{facts['ended_at']}, {format_duration(duration_seconds)} after it began"
+    facts["hosts"] = classes.description
+    facts |= {f"class {name}": hosts for name, hosts in classes.rows}
+    facts["reported"] = describe_score(confirmed or best_evaluation(evaluations))
+    facts |= {"stage": f"{len(begun)} of {len(settings.stages)}"} if begun else {}
+    shown_settings = {**_flatten_settings(settings), **describe_stages(settings, begun)}
+    print_rows([{"": name, "value": value} for name, value in {**facts, **shown_settings}.items()])
+    print()
+    shown = history[-LAST_GENERATIONS:] if sys.stdout.isatty() else history
+    judged = {each.generation: each.mean for each in evaluations}
+    lines = [_generation_row(each, judged.get(each.number)) for each in shown]
+    if len(shown) < len(history):
+        print(f"the last {LAST_GENERATIONS} of {len(history)} generations; --json has all")
+    print_rows(lines, right=tuple(lines[0]) if lines else (), drop_order=("seconds", "worst", "steps", "std", "sigma"))
+    return 0
+
+
+def _flatten_settings(settings: RunSettings) -> dict[str, object]:
+    """Settings by name, those of task and controller among them, without the stages."""
+    flat: dict[str, object] = {}
+    plain = asdict(settings)
+    del plain["stages"]
+    for name, value in plain.items():
+        flat |= {name: value} if not isinstance(value, dict) else _prefix_names(name, value)
+    return {name: None if value in (None, "", ()) else format_setting(value) for name, value in flat.items()}
+
+
+def _prefix_names(name: str, parts: dict[str, object]) -> dict[str, object]:
+    return {part if part == name else f"{name}.{part}": value for part, value in parts.items() if value is not None}
+
+
+def _generation_row(each: StoredGeneration, evaluated: float | None) -> dict[str, object]:
+    return {
+        "generation": each.number, "mean": f"{each.mean:.1f}", "std": f"{each.std:.1f}", "best": f"{each.best:.1f}",
+        "worst": f"{each.worst:.1f}", "sigma": f"{each.sigma:.4f}", "steps": each.steps,
+        "seconds": f"{each.seconds:.1f}", "evaluated": "" if evaluated is None else f"{evaluated:.1f}",
+    }  # fmt: skip
+
+
+def archive_run(args: argparse.Namespace) -> int:
+    """Move the run's folder into the archive."""
+    open_run(args.runs_dir, args.run_name).close()
+    source, target = args.runs_dir / args.run_name, args.runs_dir / ARCHIVE_FOLDER / args.run_name
+    if target.exists():
+        raise JournalError(f"{target} exists; rename or delete it first")
+    check_movable(source)
+    with run_lock(source), reporting_folder_errors(source):
+        target.parent.mkdir(exist_ok=True)
+        source.rename(target)
+    print_answer(args, f"archived as {target}; move it back to use it again", run=args.run_name, archived=target)
+    return 0
+
+
+def configure_backup(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `runs backup`."""
+    parser.add_argument("--to", type=Path, required=True, help="the other folder of runs, best on another disk")
+    add_run_arguments(parser)
+
+
+def back_up_run(args: argparse.Namespace) -> int:
+    """Copy a run and read the copy; the run may be served meanwhile."""
+    from dreamfleet.coordinator.storage.backup import back_up
+
+    target = args.to / args.run_name
+    with open_run(args.runs_dir, args.run_name) as source:
+        back_up(source, target)
+    with open_run(args.to, args.run_name) as copy:
+        generations, results = len(copy.history()), copy.result_count()
+        network = stored_network(copy)
+    secured = any(each.startswith(SECURED_PREFIX) for each in (*network.get("listen", ()), *network.get("connect", ())))
+    join = args.global_config.join or ("FILE" if secured else None)
+    text = (
+        f"copied to {target}: {generations} closed generations, {results} results; should the run's own folder be "
+        f"lost, go on with: {resume_command(target, join)}"
+    )
+    print_answer(args, text, run=args.run_name, copy=target, generations=generations, results=results)
+    return 0
+
+
+def configure_delete(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `runs delete`."""
+    add_run_arguments(parser)
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+
+
+def delete_run(args: argparse.Namespace) -> int:
+    """Delete a run's folder once confirmed; exit 1 if it is kept."""
+    with open_run(args.runs_dir, args.run_name) as stored:
+        generations = len(stored.history())
+    if not args.yes:
+        if not sys.stdin.isatty():
+            raise UsageError("nobody is there to confirm: give --yes")
+        answer = input(f"delete run {args.run_name} with its {generations} generations? [y/N] ")
+        if answer.strip().lower() not in ("y", "yes"):
+            print_answer(args, "kept", run=args.run_name, deleted=None)
+            return 1
+    folder = args.runs_dir / args.run_name
+    check_movable(folder)
+    with run_lock(folder), reporting_folder_errors(folder):
+        shutil.rmtree(folder)
+    print_answer(args, f"deleted {folder}", run=args.run_name, deleted=folder)
+    return 0
+
+
+def configure_export(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `runs export`."""
+    kinds = parser.add_mutually_exclusive_group(required=True)
+    kinds.add_argument("--csv", dest="kind", action="store_const", const="csv", help="a CSV file a table")
+    kinds.add_argument("--parquet", dest="kind", action="store_const", const="parquet", help="a Parquet file a table")
+    kinds.add_argument("--tensorboard", dest="kind", action="store_const", const="tensorboard",
+                       help="an event file with curves over generations")  # fmt: skip
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder to write in (default RUN-csv and the like)")
+    add_run_arguments(parser)
+
+
+def export_run(args: argparse.Namespace) -> int:
+    """Write a run's journal as tables, and print the files' paths."""
+    from dreamfleet.coordinator.analysis.export import export_csv, export_parquet, export_tensorboard
+
+    kinds = {"csv": export_csv, "parquet": export_parquet, "tensorboard": export_tensorboard}
+    folder = args.out or Path(f"{args.run_name}-{args.kind}")
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"--out {folder} is no folder: name one")
+    with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
+        written = kinds[args.kind](stored, folder)
+    text = "\n".join(map(str, written)) if written else f"run {args.run_name} has no row yet: nothing was written"
+    print_answer(args, text, run=args.run_name, files=written)
+    return 0
+
+
+LIST = SimpleVerb("list the runs on this disk", configure_list, list_runs)
+SHOW = SimpleVerb("show one run from its journal: settings, history, evaluations", add_run_arguments, show_run)
+ARCHIVE = SimpleVerb("move a run that nobody serves into the archive", add_run_arguments, archive_run)
+BACKUP = SimpleVerb(
+    "copy a run, served or not, into another folder of runs, from which it can be resumed",
+    configure_backup,
+    back_up_run,
+)
+DELETE = SimpleVerb(
+    "delete a run that nobody serves, with its journal, controller and videos", configure_delete, delete_run
+)
+EXPORT = SimpleVerb(
+    "write a run's generations, candidates, evaluations and confirmed score as CSV, Parquet or TensorBoard events",
+    configure_export,
+    export_run,
+)
