@@ -20,7 +20,7 @@ from dreamfleet.common.runs.records import RunSettings, StoredGeneration, best_e
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import ARCHIVE as ARCHIVE_FOLDER
-from dreamfleet.common.runs.run_paths import check_movable, reporting_folder_errors, run_paths
+from dreamfleet.common.runs.run_paths import check_movable, reporting_folder_errors, resume_command, run_paths
 from dreamfleet.common.runs.stages import begun_stages, describe_stages
 from dreamfleet.common.transport.network import SECURED_PREFIX
 
@@ -163,6 +163,7 @@ def configure_backup(parser: argparse.ArgumentParser) -> None:
 
 def back_up_run(args: argparse.Namespace) -> int:
     """Copy a run and read the copy; the run may be served meanwhile."""
+    from dreamfleet.coordinator.settings.resume_settings import stored_network
     from dreamfleet.coordinator.storage.backup import back_up
 
     target = args.to / args.run_name
