@@ -34,7 +34,6 @@ RIDGE = 0.01  # relative to a feature's mean square, which is below 1 for h and 
 TANH_BOUND = 2.5  # tanh is 0.987 there; larger values change the action little
 BOUND_MARGIN = 0.3  # how far a value may lie beyond its action's bound, so that a search can still move it back
 
-Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 
