@@ -77,7 +77,7 @@ class DisturbedDrive:
 
 
 @dataclass
-class Notes:
+class DriveColumns:
     """The columns of a drive while it is recorded, one entry per step."""
 
     latent: list[Floats] = field(default_factory=list)
@@ -91,28 +91,29 @@ class DisturbedDriveRecorder(DisturbedPolicy):
     """A policy that disturbs an actor's actions, and records the true state and the world model's state."""
 
     def __init__(
-        self, mind: RecurrentState, actor: Actor, disturbance: Disturbance, truth: Callable[[], dict[str, float]]
+        self, recurrent: RecurrentState, actor: Actor, disturbance: Disturbance, truth: Callable[[], dict[str, float]]
     ) -> None:
-        super().__init__(actor, disturbance, mind)
-        self._mind, self._truth = mind, truth
-        self.notes, self.hidden = Notes(), mind.hidden
+        super().__init__(actor, disturbance, recurrent)
+        self._recurrent, self._truth = recurrent, truth
+        self.recorded, self.hidden = DriveColumns(), recurrent.hidden
 
     def on_action(self, action: Floats, push: Floats) -> None:
         """Record a step."""
-        notes, mind = self.notes, self._mind
-        notes.latent.append(mind.latent[0])
-        notes.state.append(mind.state[0])
-        notes.truth.append(self._truth())
-        notes.action.append(action[0])
-        notes.push.append(push[0])
+        recorded, recurrent = self.recorded, self._recurrent
+        recorded.latent.append(recurrent.latent[0])
+        recorded.state.append(recurrent.state[0])
+        recorded.truth.append(self._truth())
+        recorded.action.append(action[0])
+        recorded.push.append(push[0])
 
 
-def witness(
-    bundle: Bundle, mind: RecurrentState, hand_of: Callable[[int], Actor], config: DisturbedDriveConfig
+def record_disturbed_drives(
+    bundle: Bundle, recurrent: RecurrentState, actor_of: Callable[[int], Actor], config: DisturbedDriveConfig
 ) -> Iterator[DisturbedDrive]:
-    """Record drives without end, one per seed; `mind` is the bundle's state, `hand_of` gives the actor of a seed.
+    """Record drives without end, one per seed.
 
-    `UsageError` if the bundle's world gives no true state, or its actions are not continuous.
+    `recurrent` is the bundle's recurrent state, `actor_of` gives the actor of a seed. `UsageError` if the bundle's
+    world gives no true state, or its actions are not continuous.
     """
     assignment = Assignment.of(bundle.manifest.task, bundle)
     task = find_task(bundle.manifest.task)
@@ -125,8 +126,8 @@ def witness(
     try:
         for seed in count(config.first_seed):
             disturbance = Disturbance(seed, actions, config.noise)
-            witness = DisturbedDriveRecorder(mind, hand_of(seed), disturbance, lambda: task.truth(environment))
-            yield _drive(environment, witness, EpisodeConfig(seed, config.steps), config, begin_at(seed))
+            recorder = DisturbedDriveRecorder(recurrent, actor_of(seed), disturbance, lambda: task.truth(environment))
+            yield _drive(environment, recorder, EpisodeConfig(seed, config.steps), config, begin_at(seed))
     finally:
         environment.close()
 
@@ -140,24 +141,24 @@ def _random_begin(task: Task) -> Callable[[int], ResetHook]:
 
 def _drive(
     environment: gymnasium.Env[Any, Any],
-    witness: DisturbedDriveRecorder,
+    recorder: DisturbedDriveRecorder,
     episode_config: EpisodeConfig,
     config: DisturbedDriveConfig,
     begin: ResetHook | None,
 ) -> DisturbedDrive:
-    witness.begin()
-    notes, rewards, lost, off = witness.notes, [], None, 0
-    for moment in run_episode(environment, witness, episode_config, begin):
+    recorder.begin()
+    recorded, rewards, lost, off = recorder.recorded, [], None, 0
+    for moment in run_episode(environment, recorder, episode_config, begin):
         rewards.append(moment.reward)
-        off = off + 1 if notes.truth[-1].get(OFF) else 0
+        off = off + 1 if recorded.truth[-1].get(OFF) else 0
         if lost is None and off == config.lasting:
             lost = moment.step - config.lasting
         if lost is not None and moment.step >= lost + config.after:
             break
-    columns = {name: np.array([each[name] for each in notes.truth]) for name in notes.truth[0]}
-    latent, state, action, push = map(np.stack, (notes.latent, notes.state, notes.action, notes.push))
+    columns = {name: np.array([each[name] for each in recorded.truth]) for name in recorded.truth[0]}
+    latent, state, action, push = map(np.stack, (recorded.latent, recorded.state, recorded.action, recorded.push))
     return DisturbedDrive(
-        episode_config.seed, latent, state, witness.hidden, columns, action, push, np.array(rewards), lost
+        episode_config.seed, latent, state, recorder.hidden, columns, action, push, np.array(rewards), lost
     )
 
 

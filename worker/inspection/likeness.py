@@ -39,7 +39,7 @@ class RareFrequency:
     found: dict[str, Estimate]
 
 
-def compare(
+def compare_frequencies(
     drives: Sequence[DisturbedDrive], bundle: Bundle, controller: Controller, opening: int, dreams: int,
     temperature: float,
 ) -> list[RareFrequency]:  # fmt: skip
@@ -50,19 +50,19 @@ def compare(
     begun = [each for drive in drives if (each := _dream_segment(drive, opening)) is not None]
     if len(begun) < 2:
         raise UsageError(f"dreams are compared with two drives at least that stay on the road for {SHORTEST} steps")
-    imagination = DriveDreamer(bundle, controller, temperature, dreams)
+    dreamer = DriveDreamer(bundle, controller, temperature, dreams)
     if begun[0].drive.truth.keys() <= {OFF}:
         raise UsageError("the world's true state has no quantity to compare dreams with")
     names = [name for name in begun[0].drive.truth if name != OFF]
     truths = [np.stack([each.drive.truth[name][each.steps] for name in names], axis=1) for each in begun]
-    foreseen = [imagination.predict_next(each.drive)[0][each.steps] for each in begun]
+    foreseen = [dreamer.predict_next(each.drive)[0][each.steps] for each in begun]
     rare = np.quantile(np.abs(np.concatenate(truths)), RARE, axis=0)
     shares: list[dict[str, Floats]] = []
     for fold in folds(len(begun), most=FOLDS):
         rest = other_rows(fold, len(begun))
         probe = LinearProbe.fit(*(np.concatenate([each[row] for row in rest]) for each in (foreseen, truths)))
         for row in fold:
-            dreamt = _before_ends(imagination.dream(begun[row], own=True)[0])
+            dreamt = _before_ends(dreamer.dream(begun[row], own=True)[0])
             if not len(dreamt):
                 continue
             by_source = {

@@ -9,11 +9,19 @@ from itertools import islice
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDrive, DisturbedDriveConfig, witness
+from dreamfleet.worker.inspection.disturbed_rollouts import (
+    DisturbedDrive,
+    DisturbedDriveConfig,
+    record_disturbed_drives,
+)
 from dreamfleet.worker.inspection.knowledge import Knowledge, cross_validate_probes
-from dreamfleet.worker.inspection.likeness import RareFrequency
-from dreamfleet.worker.inspection.likeness import compare as alike
-from dreamfleet.worker.inspection.road_losses import RoadLossComparison, RoadLossConfig, collect_losing_drives, compare
+from dreamfleet.worker.inspection.likeness import RareFrequency, compare_frequencies
+from dreamfleet.worker.inspection.road_losses import (
+    RoadLossComparison,
+    RoadLossConfig,
+    collect_losing_drives,
+    compare_losses,
+)
 from dreamfleet.worker.scoring.actors import Actor, make_controller_actor, make_driver_actors
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
@@ -34,13 +42,13 @@ class DriverChoice:
             return bundle
         return bundle.for_controller(self.controller)
 
-    def hands(self, bundle: Bundle, mind: RecurrentState) -> Callable[[int], Actor]:
+    def actors(self, bundle: Bundle, recurrent: RecurrentState) -> Callable[[int], Actor]:
         """Return a function from a drive's seed to its actor."""
         if self.controller is None:
             return make_driver_actors(bundle, self.driver)
         if self.own is None:
             raise UsageError("this controller sees no world model: give one that was evolved with one")
-        actor = make_controller_actor(self.controller, self.own, bundle, mind)
+        actor = make_controller_actor(self.controller, self.own, bundle, recurrent)
         return lambda _seed: actor
 
 
@@ -63,7 +71,7 @@ def likeness(
     """Measure how often rare values occur in dreams, on `episodes` drives; errors as in `measure_dream_losses`."""
     controller = _dream_controller(bundle, driving)
     drives = _first_drives(bundle, driving, config, episodes, on_drive)
-    return alike(drives, bundle, controller, config.opening, dreams.dreams, dreams.temperature)
+    return compare_frequencies(drives, bundle, controller, config.opening, dreams.dreams, dreams.temperature)
 
 
 def measure_dream_losses(
@@ -76,7 +84,7 @@ def measure_dream_losses(
     """
     controller = _dream_controller(bundle, driving)
     drives = collect_losing_drives(_drives(bundle, driving, config), losses, config, on_loss)
-    return compare(drives, bundle, controller, losses, config), len(drives)
+    return compare_losses(drives, bundle, controller, losses, config), len(drives)
 
 
 def _dream_controller(bundle: Bundle, driving: DriverChoice) -> Controller:
@@ -91,8 +99,8 @@ def _dream_controller(bundle: Bundle, driving: DriverChoice) -> Controller:
 
 
 def _drives(bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig) -> Iterator[DisturbedDrive]:
-    mind = RecurrentState(driving.observing_model(bundle))
-    return witness(bundle, mind, driving.hands(bundle, mind), config)
+    recurrent = RecurrentState(driving.observing_model(bundle))
+    return record_disturbed_drives(bundle, recurrent, driving.actors(bundle, recurrent), config)
 
 
 def _first_drives(

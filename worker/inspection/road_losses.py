@@ -121,7 +121,7 @@ def collect_losing_drives(
     )
 
 
-def compare(
+def compare_losses(
     drives: Sequence[DisturbedDrive],
     bundle: Bundle,
     controller: Controller,
@@ -129,22 +129,22 @@ def compare(
     driven: DisturbedDriveConfig,
 ) -> list[RoadLossComparison]:
     """Compare losses, and stretches without one, with dreams begun there, by probes fitted on other folds' drives."""
-    imagination = DriveDreamer(bundle, controller, config.temperature, config.dreams)
-    foreseen = [imagination.predict_next(drive) for drive in drives]
-    judges = dict[int, RoadProbe]()
+    dreamer = DriveDreamer(bundle, controller, config.temperature, config.dreams)
+    foreseen = [dreamer.predict_next(drive) for drive in drives]
+    probes = dict[int, RoadProbe]()
     for fold in folds(len(drives), most=FOLDS):
         rest = other_rows(fold, len(drives))
-        judge = RoadProbe([drives[row] for row in rest], [foreseen[row][0] for row in rest], driven.opening)
-        judges |= dict.fromkeys(fold, judge)
+        probe = RoadProbe([drives[row] for row in rest], [foreseen[row][0] for row in rest], driven.opening)
+        probes |= dict.fromkeys(fold, probe)
     found = []
     for name, beginnings in _dream_segments(drives, config, driven):
-        courses = [_outcomes(each, foreseen[row], imagination, judges[row]) for row, each in beginnings.items()]
-        found.append(RoadLossComparison(name, len(courses), _average(courses, driven.lasting)))
+        outcomes = [_outcomes(each, foreseen[row], dreamer, probes[row]) for row, each in beginnings.items()]
+        found.append(RoadLossComparison(name, len(outcomes), _average(outcomes, driven.lasting)))
     return found
 
 
-def _average(courses: Sequence[dict[str, RoadOutcome]], lasting: int) -> dict[str, dict[str, Estimate]]:
-    summaries = [{where: outcome.summarise(lasting) for where, outcome in each.items()} for each in courses]
+def _average(outcomes: Sequence[dict[str, RoadOutcome]], lasting: int) -> dict[str, dict[str, Estimate]]:
+    summaries = [{where: outcome.summarise(lasting) for where, outcome in each.items()} for each in outcomes]
     return {
         figure: {where: Estimate.of([each[where][figure] for each in summaries]) for where in summaries[0]}
         for figure in summaries[0]["reality"]
@@ -152,16 +152,16 @@ def _average(courses: Sequence[dict[str, RoadOutcome]], lasting: int) -> dict[st
 
 
 def _outcomes(
-    begun: DreamSegment, foreseen: tuple[Floats, Doubles], imagination: DriveDreamer, judge: RoadProbe
+    begun: DreamSegment, foreseen: tuple[Floats, Doubles], dreamer: DriveDreamer, probe: RoadProbe
 ) -> dict[str, RoadOutcome]:
     drive, steps = begun.drive, begun.steps
     off, offset, reward = (each[None, steps] for each in (drive.truth[OFF], drive.truth[OFFSET], drive.reward))
     held, foretold = foreseen
     return {
         "reality": RoadOutcome(off > 0, np.abs(offset), reward),
-        "foreseen": judge.outcome(held[None, steps], foretold[None, steps]),
-        "dream": judge.outcome(*imagination.dream(begun, own=True)),
-        "same_actions": judge.outcome(*imagination.dream(begun, own=False)),
+        "foreseen": probe.outcome(held[None, steps], foretold[None, steps]),
+        "dream": probe.outcome(*dreamer.dream(begun, own=True)),
+        "same_actions": probe.outcome(*dreamer.dream(begun, own=False)),
     }
 
 

@@ -82,27 +82,9 @@ def assemble(
     `measured` are files of `inspect --json` on the same bundle without them; `DatasetError` if on another bundle.
     """
     measurements = [(path, *_load_measurements(path)) for path in measured]
-    vae = load_weights(folder / train_vae.CHECKPOINT)
-    rnn = load_weights(folder / train_mdnrnn.CHECKPOINT)
-    configs = (
-        load_config(folder / train_vae.CHECKPOINT, VAEConfig),
-        load_config(folder / train_mdnrnn.CHECKPOINT, MDNRNNConfig),
-    )
-    for checkpoint, arrays in ((train_vae.CHECKPOINT, vae), (train_mdnrnn.CHECKPOINT, rnn)):
-        if not all(np.isfinite(array).all() for array in arrays.values()):
-            raise DatasetError(f"{folder / checkpoint} holds NaN or infinity; delete it and train again")
-    if configs[0].latent != configs[1].latent:
-        raise DatasetError(f"the VAE has {configs[0].latent} latents, the MDN-RNN {configs[1].latent}: train it again")
-    if train_mdnrnn.mdnrnn_vae_hash(folder) != latents_encoder_hash(folder):
-        raise DatasetError(f"the MDN-RNN in {folder} was trained on another VAE: train it again before you bundle")
-    quality = folder / QUALITY
-    provenance = {
-        "episodes": len(episode_paths(folder)),
-        "frames": sum(len(load_arrays(path, "reward")["reward"]) for path in episode_paths(folder)),
-        "held_out_episodes": len(split_held_out(episode_paths(folder))[1]),
-        "quality": json.loads(quality.read_text()) if quality.exists() else {},
-        "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
-    }
+    vae, rnn, vae_config, rnn_config = _load_models(folder)
+    configs = vae_config, rnn_config
+    provenance = _make_provenance(folder)
     parts = export_graphs(vae, rnn, initial_latents(folder), *configs)
     if recorded:
         found = compute_recorded_states(folder, recorded)
@@ -126,6 +108,33 @@ def assemble(
         provenance["measured"] = [figures for *_, figures in measurements]
     with explain_write_errors(out):
         return write_bundle(out, make_manifest(name, provenance, *configs), parts)
+
+
+def _load_models(folder: Path) -> tuple[Weights, Weights, VAEConfig, MDNRNNConfig]:
+    """The weights and configurations of a folder's models; `DatasetError` unless they belong together."""
+    paths = folder / train_vae.CHECKPOINT, folder / train_mdnrnn.CHECKPOINT
+    vae, rnn = (load_weights(path) for path in paths)
+    vae_config, rnn_config = load_config(paths[0], VAEConfig), load_config(paths[1], MDNRNNConfig)
+    for path, arrays in zip(paths, (vae, rnn), strict=True):
+        if not all(np.isfinite(array).all() for array in arrays.values()):
+            raise DatasetError(f"{path} holds NaN or infinity; delete it and train again")
+    if vae_config.latent != rnn_config.latent:
+        raise DatasetError(f"the VAE has {vae_config.latent} latents, the MDN-RNN {rnn_config.latent}: train it again")
+    if train_mdnrnn.mdnrnn_vae_hash(folder) != latents_encoder_hash(folder):
+        raise DatasetError(f"the MDN-RNN in {folder} was trained on another VAE: train it again before you bundle")
+    return vae, rnn, vae_config, rnn_config
+
+
+def _make_provenance(folder: Path) -> dict[str, Any]:
+    """What a bundle's manifest says of its data, the quality of its models, and the packages that trained them."""
+    paths, quality = episode_paths(folder), folder / QUALITY
+    return {
+        "episodes": len(paths),
+        "frames": sum(len(load_arrays(path, "reward")["reward"]) for path in paths),
+        "held_out_episodes": len(split_held_out(paths)[1]),
+        "quality": json.loads(quality.read_text()) if quality.exists() else {},
+        "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
+    }
 
 
 def _load_measurements(path: Path) -> tuple[object, dict[str, Any]]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
@@ -84,11 +85,18 @@ def load_progress(path: Path) -> dict[str, Any]:
 
 
 def _read_metadata(path: Path) -> Mapping[str, str]:
+    with _open_checkpoint(path) as file:
+        return file.metadata() or {}
+
+
+@contextmanager
+def _open_checkpoint(path: Path) -> Iterator[Any]:
+    """Open a checkpoint for NumPy; `DatasetError` if it is missing, or damaged where it is read."""
     if not path.exists():
         raise DatasetError(f"no {path}: train it first with `dreamfleet train {path.stem}`")
     try:
         with safe_open(path, "np") as file:
-            return file.metadata() or {}
+            yield file
     except (OSError, SafetensorError) as error:
         raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
 
@@ -127,14 +135,9 @@ def check_config(path: Path, config: Any, extensible: frozenset[str] = frozenset
 
 def load_weights(path: Path) -> dict[str, NDArray[np.float32]]:
     """Load a checkpoint's weights as arrays; `DatasetError` if it is missing or damaged."""
-    if not path.exists():
-        raise DatasetError(f"no {path}: train it first with `dreamfleet train {path.stem}`")
-    try:
-        with safe_open(path, "np") as file:
-            names = [name for name in file.keys() if name.startswith("model.")]  # noqa: SIM118 - no mapping
-            return {name.removeprefix("model."): file.get_tensor(name) for name in names}
-    except (OSError, SafetensorError) as error:
-        raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
+    with _open_checkpoint(path) as file:
+        names = [name for name in file.keys() if name.startswith("model.")]  # noqa: SIM118 - no mapping
+        return {name.removeprefix("model."): file.get_tensor(name) for name in names}
 
 
 def _restore_adam(optimiser: torch.optim.Adam, tensors: dict[str, torch.Tensor]) -> None:

@@ -104,15 +104,15 @@ class LeastSquaresSums:
 
 
 class SplitSums:
-    """Sums over drives in two parts: `used` to fit, and `others`, every fifth drive, to measure R²."""
+    """Sums over drives in two parts: `fit`, and `held_out`, every fifth drive, to measure R²."""
 
     def __init__(self) -> None:
-        self.used: LeastSquaresSums | None = None
-        self.others: LeastSquaresSums | None = None
+        self.fit: LeastSquaresSums | None = None
+        self.held_out: LeastSquaresSums | None = None
 
     def add(self, number: int, sums: LeastSquaresSums) -> None:
         """Add the sums of drive `number`, counted from 0."""
-        side = "others" if number % HELD_OUT_EVERY == HELD_OUT_EVERY - 1 else "used"
+        side = "held_out" if number % HELD_OUT_EVERY == HELD_OUT_EVERY - 1 else "fit"
         so_far = getattr(self, side)
         setattr(self, side, sums if so_far is None else so_far + sums)
 

@@ -112,34 +112,34 @@ def find_subspace(
     check_drives(paths, bundle.manifest.preprocessing)
     extractor = FeatureExtractor(bundle)
     targets = make_targets(find_task(bundle.manifest.task).world, bundle.manifest.actions)
-    halves, later = SplitSums(), SplitSums()
+    split, later = SplitSums(), SplitSums()
     for first, drives in load_in_batches(paths, bundle.manifest.actions):
         features = extractor.features(drives, extractor.encode_drives(drives))
         for row, drive in enumerate(drives):
             on, wanted = _mask_and_targets(drive, targets)
             seen = features[row, : len(on)]
-            halves.add(first + row, LeastSquaresSums.of(seen[on], wanted[on]))
+            split.add(first + row, LeastSquaresSums.of(seen[on], wanted[on]))
             if views and on.any():
                 both = np.concatenate([seen[on], seen[np.flatnonzero(on) + VIEW_STEPS]], axis=1)
                 later.add(first + row, LeastSquaresSums.of(both, np.zeros((len(both), 0))))
         on_progress(first + len(drives))
-    used, others = halves.used, halves.others
-    counted = [0 if each is None else each.steps for each in (used, others)]
-    if used is None or others is None or sum(counted) < LEAST_STEPS or not all(counted):
+    fit, held_out = split.fit, split.held_out
+    counted = [0 if each is None else each.steps for each in (fit, held_out)]
+    if fit is None or held_out is None or sum(counted) < LEAST_STEPS or not all(counted):
         raise UsageError(
             f"{len(paths)} drives of {sum(counted)} steps that count are too few: it takes {HELD_OUT_EVERY} drives and "
             f"{LEAST_STEPS} steps; the first {FIRST_START} of a drive, its last {ACTION_WINDOWS[-1][1]} and those "
             "off the road do not count: `dreamfleet collect` drives more"
         )
-    r_squared = others.r_squared(used.solve(RIDGE))
+    r_squared = held_out.r_squared(fit.solve(RIDGE))
     predictable = [index for index, each in enumerate(r_squared) if each >= MIN_R_SQUARED]
     if not predictable:
         raise UsageError(f"{bundle.manifest.name} predicts nothing of these {len(paths)} drives: give others")
-    whole = used + others
+    whole = fit + held_out
     solved, names = whole.solve(RIDGE)[:, predictable], [targets[each].name for each in predictable]
     scores = [float(r_squared[each]) for each in predictable]
-    if later.used and later.others:
-        ahead, correlated = _canonical_features(later.used, later.others, views)
+    if later.fit and later.held_out:
+        ahead, correlated = _canonical_features(later.fit, later.held_out, views)
         solved, scores = np.concatenate([solved, ahead], axis=1), scores + correlated
         names += [
             _feature_name(f"view {number}", (VIEW_STEPS, VIEW_STEPS + 1)) for number in range(1, len(correlated) + 1)
@@ -157,16 +157,16 @@ def _mask_and_targets(drive: DriveArrays, targets: Sequence[PredictionTarget]) -
     return on, np.stack([each.values(sums) for each in targets], axis=1)
 
 
-def _canonical_features(used: LeastSquaresSums, others: LeastSquaresSums, count: int) -> tuple[Doubles, list[float]]:
+def _canonical_features(fit: LeastSquaresSums, held_out: LeastSquaresSums, count: int) -> tuple[Doubles, list[float]]:
     """The maps `(inputs + 1, found)` of at most `count` views, and their R² on held-out drives.
 
     The sums are over [z, h] now and later, side by side.
     """
-    spread, shared, later = _covariances(used)
+    spread, shared, later = _covariances(fit)
     whitened = [_whitening(each) for each in (spread, later)]
     left, _, right = np.linalg.svd(whitened[0] @ shared @ whitened[1])
     now, then = whitened[0] @ left[:, :count], whitened[1] @ right[:count].T
-    spread, shared, later = _covariances(others)
+    spread, shared, later = _covariances(held_out)
     sizes = (now * (spread @ now)).sum(axis=0) * (then * (later @ then)).sum(axis=0)
     correlated = (now * (shared @ then)).sum(axis=0) ** 2 / sizes
     kept = correlated >= MIN_R_SQUARED

@@ -34,7 +34,6 @@ RIDGE = 0.01  # relative to a feature's mean square, which is below 1 for h and 
 TANH_BOUND = 2.5  # tanh is 0.987 there; larger values change the action little
 BOUND_MARGIN = 0.3  # how far a value may lie beyond its action's bound, so that a search can still move it back
 
-Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 
@@ -66,26 +65,26 @@ def refit(
     )
     old, new = FeatureExtractor(own.for_controller(controller)), FeatureExtractor(fitted)
     lowest, highest = output_bounds(controller, own)
-    same_eyes = own.read(ENCODER) == bundle.read(ENCODER)
+    same_encoder = own.read(ENCODER) == bundle.read(ENCODER)
     (weights, biases), *above = controller.shape.unpack(controller.parameters)
-    halves = SplitSums()
+    split = SplitSums()
     for first, drives in load_in_batches(paths, own.manifest.actions):
         latent = old.encode_drives(drives)
         before, after = (
             old.features(drives, latent),
-            new.features(drives, latent if same_eyes else new.encode_drives(drives)),
+            new.features(drives, latent if same_encoder else new.encode_drives(drives)),
         )
         for row, drive in enumerate(drives):
             on = on_road_mask(drive.reward)
             wanted = before[row, : len(on)][on].astype(np.float64) @ weights.T.astype(np.float64) + biases
             sums = LeastSquaresSums.of(after[row, : len(on)][on], np.clip(wanted, lowest, highest))
-            halves.add(first + row, sums)
+            split.add(first + row, sums)
         on_progress(first + len(drives))
-    used, others = halves.used, halves.others
-    if used is None or not used.steps:
+    fit, held_out = split.fit, split.held_out
+    if fit is None or not fit.steps:
         raise UsageError(f"none of the {len(paths)} drives keeps to its road: there is nothing to fit a controller to")
-    r_squared = others.r_squared(used.solve(RIDGE)) if others and others.steps else np.full(len(biases), np.nan)
-    whole = used + others if others else used
+    r_squared = held_out.r_squared(fit.solve(RIDGE)) if held_out and held_out.steps else np.full(len(biases), np.nan)
+    whole = fit + held_out if held_out else fit
     solved = whole.solve(RIDGE)
     parts = [solved[:-1].T, solved[-1], *(part for layer in above for part in layer)]
     parameters = np.concatenate([part.ravel() for part in parts]).astype(np.float32)

@@ -40,8 +40,8 @@ def test_help_tells_each_presets_values():
     told = " ".join(training.format_help().split())
     assert "(default 1500; notebook 30000; article 60000; attentive 19200; paper 1000000)" in told
     assert "0: never (default 0; attentive, paper 10)" in told
-    assert "else what leads to the picture's size (notebook 5 5 6 6)" in told
-    assert "else the encoder's from behind --" in told
+    assert "else such that the picture's size results (notebook 5 5 6 6)" in told
+    assert "else the encoder's in reverse --" in told
     assert "(default 2000; notebook 500)" in " ".join(learning.format_help().split())
 
 

@@ -8,7 +8,12 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import write_bundle
 from dreamfleet.common.errors import ControllerError, UsageError
-from dreamfleet.worker.inspection.disturbed_rollouts import OFF, DisturbedDriveConfig, first_sustained, witness
+from dreamfleet.worker.inspection.disturbed_rollouts import (
+    OFF,
+    DisturbedDriveConfig,
+    first_sustained,
+    record_disturbed_drives,
+)
 from dreamfleet.worker.scoring.actors import ControllerActor, make_controller_actor, make_driver_actors
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment
@@ -20,9 +25,11 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 
 
-def drive(bundle, hands, **config):
-    mind = RecurrentState(bundle)
-    return next(witness(bundle, mind, lambda seed: hands(mind, seed), DisturbedDriveConfig(**config)))
+def drive(bundle, actors, **config):
+    recurrent = RecurrentState(bundle)
+    return next(
+        record_disturbed_drives(bundle, recurrent, lambda seed: actors(recurrent, seed), DisturbedDriveConfig(**config))
+    )
 
 
 def test_without_noise_a_controller_drives_as_its_policy_does(tiny, controller):
@@ -31,7 +38,9 @@ def test_without_noise_a_controller_drives_as_its_policy_does(tiny, controller):
     policy.begin(controller.parameters)
     moments = list(run_episode(environment, policy, EpisodeConfig(20_002, 60)))
     environment.close()
-    seen = drive(tiny, lambda mind, _: ControllerActor(controller, tiny, mind), noise=0, steps=60, first_seed=20_002)
+    seen = drive(
+        tiny, lambda recurrent, _: ControllerActor(controller, tiny, recurrent), noise=0, steps=60, first_seed=20_002
+    )
     np.testing.assert_allclose(seen.action, [each.action for each in moments], atol=1e-5)
     assert seen.reward.tolist() == [each.reward for each in moments]
     assert seen.features.shape == (60, 32 + 256)
@@ -50,16 +59,18 @@ def test_a_drive_ends_behind_its_loss_and_is_a_function_of_its_seed(tiny):
 
 
 def drivers(name, bundle):
-    hands = make_driver_actors(bundle, name)
-    return lambda _mind, seed: hands(seed)
+    actors = make_driver_actors(bundle, name)
+    return lambda _recurrent, seed: actors(seed)
 
 
 def test_a_controller_of_another_world_model_drives_by_its_own(tiny, controller, tmp_path):
     small = VAEConfig(latent=5, channels=(4, 4, 4, 8))
     watching = write_random_bundle(tmp_path / "small.zip", vae=small, rnn=MDNRNNConfig(latent=5, hidden=8))
     config = {"noise": 0.1, "steps": 30}
-    watched = drive(watching, lambda mind, _: make_controller_actor(controller, tiny, watching, mind), **config)
-    driven = drive(tiny, lambda mind, _: make_controller_actor(controller, tiny, tiny, mind), **config)
+    watched = drive(
+        watching, lambda recurrent, _: make_controller_actor(controller, tiny, watching, recurrent), **config
+    )
+    driven = drive(tiny, lambda recurrent, _: make_controller_actor(controller, tiny, tiny, recurrent), **config)
     assert watched.features.shape == (30, 13)
     assert np.array_equal(watched.action, driven.action)
     whole = VAEConfig(picture=96, padding="same", latent=5, channels=(2, 2, 2, 2))
@@ -87,9 +98,14 @@ def test_a_road_is_lost_where_the_car_is_off_it_for_long_enough(off, first):
 
 
 def test_tracks_follow_each_other(tiny):
-    hands = make_driver_actors(tiny, "held")
+    actors = make_driver_actors(tiny, "held")
     drives = list(
-        islice(witness(tiny, RecurrentState(tiny), hands, DisturbedDriveConfig(steps=3, first_seed=20_007)), 2)
+        islice(
+            record_disturbed_drives(
+                tiny, RecurrentState(tiny), actors, DisturbedDriveConfig(steps=3, first_seed=20_007)
+            ),
+            2,
+        )
     )
     assert [each.seed for each in drives] == [20_007, 20_008]
     assert not np.array_equal(drives[0].latent, drives[1].latent)
@@ -110,4 +126,4 @@ def test_a_world_without_true_state_is_reported(tmp_path):
     parts = {name: ours.read(name) for name in ours.manifest.parts}
     poles = write_bundle(tmp_path / "poles.zip", replace(ours.manifest, task="gym:CartPole-v1"), parts)
     with pytest.raises(UsageError, match=r"gym:CartPole-v1 gives no true state .*docs/tasks.md"):
-        next(witness(poles, RecurrentState(poles), lambda _seed: None, DisturbedDriveConfig()))
+        next(record_disturbed_drives(poles, RecurrentState(poles), lambda _seed: None, DisturbedDriveConfig()))

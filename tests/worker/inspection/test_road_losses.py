@@ -7,7 +7,7 @@ import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.inspection import likeness, probe
-from dreamfleet.worker.inspection.disturbed_rollouts import OFF, DisturbedDriveConfig, witness
+from dreamfleet.worker.inspection.disturbed_rollouts import OFF, DisturbedDriveConfig, record_disturbed_drives
 from dreamfleet.worker.inspection.drive_dreams import DreamSegment, DriveDreamer
 from dreamfleet.worker.inspection.knowledge import cross_validate_probes
 from dreamfleet.worker.inspection.road_losses import (
@@ -16,7 +16,7 @@ from dreamfleet.worker.inspection.road_losses import (
     RoadOutcome,
     RoadProbe,
     collect_losing_drives,
-    compare,
+    compare_losses,
 )
 from dreamfleet.worker.inspection.tables import knowledge_rows, loss_rows
 from dreamfleet.worker.scoring.actors import ControllerActor
@@ -27,9 +27,9 @@ CONFIG, DRIVEN = RoadLossConfig(losses=6, before=(20, 0), dreams=2), DisturbedDr
 
 @pytest.fixture(scope="module")
 def drives(tiny, controller):
-    mind = RecurrentState(tiny)
-    hand = ControllerActor(controller, tiny, mind)
-    return collect_losing_drives(witness(tiny, mind, lambda _seed: hand, DRIVEN), CONFIG, DRIVEN)
+    recurrent = RecurrentState(tiny)
+    actor = ControllerActor(controller, tiny, recurrent)
+    return collect_losing_drives(record_disturbed_drives(tiny, recurrent, lambda _seed: actor, DRIVEN), CONFIG, DRIVEN)
 
 
 def test_as_many_losses_are_gathered_as_are_wanted(drives):
@@ -50,7 +50,7 @@ def test_too_few_losses_are_reported(drives):
 
 
 def test_reality_loses_the_road_and_the_probe_sees_it_and_nothing_where_all_is_calm(drives, tiny, controller):
-    compared = {each.begun: each for each in compare(drives, tiny, controller, CONFIG, DRIVEN)}
+    compared = {each.begun: each for each in compare_losses(drives, tiny, controller, CONFIG, DRIVEN)}
     assert list(compared) == ["20 steps before", "0 steps before", CALM]
     for begun in ("20 steps before", "0 steps before"):
         lost = compared[begun].figures["lost"]
@@ -64,14 +64,14 @@ def test_reality_loses_the_road_and_the_probe_sees_it_and_nothing_where_all_is_c
 
 
 def test_a_dream_begins_at_its_real_step_and_is_a_function_of_seed_and_step(drives, tiny, controller):
-    imagination, begun = DriveDreamer(tiny, controller, 1.0, 3), DreamSegment(drives[0], 120, 15)
-    features, rewards = imagination.dream(begun, own=True)
+    dreamer, begun = DriveDreamer(tiny, controller, 1.0, 3), DreamSegment(drives[0], 120, 15)
+    features, rewards = dreamer.dream(begun, own=True)
     assert features.shape == (3, 15, 288)
     assert rewards.shape == (3, 15)
     assert (features[:, 0] == drives[0].features[120]).all()
     assert not np.array_equal(features[0, 1:], features[1, 1:])
-    assert np.array_equal(features, imagination.dream(begun, own=True)[0])
-    assert not np.array_equal(features, imagination.dream(DreamSegment(drives[0], 121, 15), own=True)[0])
+    assert np.array_equal(features, dreamer.dream(begun, own=True)[0])
+    assert not np.array_equal(features, dreamer.dream(DreamSegment(drives[0], 121, 15), own=True)[0])
 
 
 def test_in_a_dream_of_the_same_actions_nobody_chooses(drives, tiny, controller):
@@ -84,8 +84,8 @@ def test_in_a_dream_of_the_same_actions_nobody_chooses(drives, tiny, controller)
 
 def test_the_controllers_dream_is_pushed_as_reality_was(drives, tiny, controller):
     calm = replace(drives[0], push=np.zeros_like(drives[0].push))
-    imagination = DriveDreamer(tiny, controller, 1.0, 2)
-    found = [imagination.dream(DreamSegment(each, 120, 15), own=True)[0] for each in (drives[0], calm)]
+    dreamer = DriveDreamer(tiny, controller, 1.0, 2)
+    found = [dreamer.dream(DreamSegment(each, 120, 15), own=True)[0] for each in (drives[0], calm)]
     assert not np.array_equal(*found)
 
 
@@ -100,10 +100,10 @@ def test_what_is_foreseen_has_the_memory_of_reality(drives, tiny, controller):
 
 
 def test_a_probe_estimates_off_the_road_from_features(drives, tiny, controller):
-    imagination = DriveDreamer(tiny, controller, 1.0, 1)
-    foreseen = [imagination.predict_next(each)[0] for each in drives]
-    judge = RoadProbe(drives[:-1], foreseen[:-1], DRIVEN.opening)
-    outcome = judge.outcome(foreseen[-1][None, 50:], drives[-1].reward[None, 50:])
+    dreamer = DriveDreamer(tiny, controller, 1.0, 1)
+    foreseen = [dreamer.predict_next(each)[0] for each in drives]
+    road_probe = RoadProbe(drives[:-1], foreseen[:-1], DRIVEN.opening)
+    outcome = road_probe.outcome(foreseen[-1][None, 50:], drives[-1].reward[None, 50:])
     off = drives[-1].truth[OFF][50:] > 0
     assert outcome.off[0][off].mean() > 0.5
     assert outcome.off[0][~off].mean() < 0.1
@@ -129,7 +129,9 @@ def test_a_world_model_knows_yaw_from_what_it_remembers_not_from_a_picture(drive
 
 
 def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
-    found = {each.quantity: each for each in likeness.compare(drives, tiny, controller, DRIVEN.opening, 2, 1.0)}
+    found = {
+        each.quantity: each for each in likeness.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
+    }
     assert OFF not in found
     for each in found.values():
         assert each.found["reality"].value == pytest.approx(0.1, abs=0.05)  # over drives of unequal lengths
@@ -137,13 +139,13 @@ def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
     assert found["yaw_rate"].found["foreseen"].value == pytest.approx(0.1, abs=0.05)
     assert found["speed"].rare > 20
     with pytest.raises(UsageError, match="two drives at least that stay on the road for 100 steps"):
-        likeness.compare(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
+        likeness.compare_frequencies(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
 
 
 def test_dreams_that_all_end_as_they_begin_are_refused(drives, tiny, controller, monkeypatch):
     monkeypatch.setattr(likeness, "_before_ends", lambda features: features[0, :0])
     with pytest.raises(UsageError, match="end as they begin"):
-        likeness.compare(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
+        likeness.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
 
 
 def test_steps_behind_a_dreams_end_do_not_count():

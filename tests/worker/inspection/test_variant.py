@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.car_racing_variants import Variant
-from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDriveConfig, witness
+from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDriveConfig, record_disturbed_drives
 from dreamfleet.worker.inspection.drive_dreams import DreamSegment, DriveDreamer
 from dreamfleet.worker.inspection.measurements import DriverChoice
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
@@ -17,8 +17,10 @@ VARIANT = Variant(pedals="one", pedal_shift=0.25, decide_every=3, feedback="last
 def witnessed(observing_model, own, noise):
     """A drive of eleven steps by a controller of `own`, observed by `watching`."""
     driving = DriverChoice(controller_of(own.with_controllers(None, VARIANT)), own)
-    mind = RecurrentState(driving.observing_model(observing_model))
-    drives = witness(observing_model, mind, driving.hands(observing_model, mind), DisturbedDriveConfig(noise, steps=11))
+    recurrent = RecurrentState(driving.observing_model(observing_model))
+    drives = record_disturbed_drives(
+        observing_model, recurrent, driving.actors(observing_model, recurrent), DisturbedDriveConfig(noise, steps=11)
+    )
     drive = next(drives)
     drives.close()
     return drive, driving.controller
@@ -37,8 +39,8 @@ def test_a_choice_is_held_whatever_is_pushed_meanwhile(random_bundle, noise):
 
 def test_a_dream_that_begins_between_two_choices_holds_on_to_the_one_before(random_bundle):
     drive, controller = witnessed(random_bundle, random_bundle, 0.0)
-    imagination, begun = DriveDreamer(random_bundle, controller, 1.0, 2), DreamSegment(drive, 4, 6)
-    own, same = (imagination.dream(begun, own=each)[0] for each in (True, False))
+    dreamer, begun = DriveDreamer(random_bundle, controller, 1.0, 2), DreamSegment(drive, 4, 6)
+    own, same = (dreamer.dream(begun, own=each)[0] for each in (True, False))
     assert np.array_equal(own[:, :3], same[:, :3]), "steps 4 and 5 do what step 3 chose"
     assert not np.array_equal(own[:, 4:], same[:, 4:])
 

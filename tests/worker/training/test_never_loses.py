@@ -58,7 +58,7 @@ def train(data, config=SHORT, report=ignore, **more):
 def test_a_vae_that_is_worse_than_the_mean_picture_logs_a_warning(data, caplog):
     figures = train(data)
     assert figures["reconstruction_error"] > figures["mean_picture_error"]
-    assert "it holds nothing to evolve on yet; give it more --updates" in caplog.text
+    assert "it is not good enough to evolve on; give it more --updates" in caplog.text
 
 
 def test_a_training_goes_on_by_the_seed_that_it_was_begun_with(data):
