@@ -59,5 +59,5 @@ def test_an_environment_without_its_python_is_not_listed(tmp_path, there):
     (folder / "bin").mkdir(parents=True)
     (folder / COMPLETE).touch()
     (folder / "bin" / "python").symlink_to(os.devnull if there else tmp_path / "gone")
-    found = agent.inspect_host({"root": str(tmp_path)}, Channel())
+    found = agent.inspect_host(HostFolder(str(tmp_path), Channel()))
     assert found["environments"] == (["one"] if there else [])
