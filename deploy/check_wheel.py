@@ -1,4 +1,4 @@
-"""Build the sdist and from it the wheel, install each alone, and see that only `dreamfleet` came, and starts anywhere.
+"""Build the sdist and its wheel, install each alone, and check that only `dreamfleet` is installed and starts.
 
 Whatever lies in the current folder, a `worker.py`, a `common/`, a `coordinator.py`, must not be imported for ours.
 """
@@ -29,7 +29,7 @@ NAMES = (
 
 
 def main() -> int:
-    """Exit code 0 when both are whole."""
+    """Exit code 0 if both are complete."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         run(sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT))
@@ -57,7 +57,7 @@ def main() -> int:
 
 
 def try_out(environment: Path, archive: Path, folder: Path) -> str:
-    """Install an archive alone and start verbs in a folder of modules named as ours are; what is wrong, or nothing."""
+    """Install an archive and start verbs beside modules named like ours; return the problem, or an empty text."""
     venv.create(environment, with_pip=True)
     python = str(environment / "bin" / "python")
     run(python, "-m", "pip", "install", "--quiet", "--constraint", str(ROOT / "constraints.txt"), str(archive))
@@ -70,7 +70,7 @@ def try_out(environment: Path, archive: Path, folder: Path) -> str:
 
 
 def files_of(archive: Path) -> list[str]:
-    """Names of an archive's files; links count as missing."""
+    """Names of the files in an archive, without links."""
     if archive.suffix == ".whl":
         with zipfile.ZipFile(archive) as wheel:
             return wheel.namelist()
@@ -79,20 +79,20 @@ def files_of(archive: Path) -> list[str]:
 
 
 def complain(text: str) -> int:
-    """Say what is wrong; exit code 1."""
+    """Report a problem; exit code 1."""
     print(text, file=sys.stderr)
     return 1
 
 
 def run(*command: str, cwd: Path | None = None) -> None:
-    """Run quietly; show what was said if it fails."""
+    """Run a command; print its output if it fails."""
     done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise SystemExit(f"{' '.join(command)}:\n{done.stdout}{done.stderr}")
 
 
 def capture(*command: str, cwd: Path) -> str:
-    """What a command prints."""
+    """The output of a command."""
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=True).stdout
 
 

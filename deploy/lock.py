@@ -1,4 +1,4 @@
-"""Write deploy/*.lock: exact versions, each with the hashes of all its files, of what stands in an image.
+"""Write deploy/*.lock: exact versions of the packages in an image, with the hashes of all their files.
 
 python lock.py, in an environment with pip-tools; `make lock`. Versions are those that the tests run with.
 """
@@ -16,20 +16,20 @@ QUIET = ("--no-header", "--no-annotate", "--no-emit-options", "--no-emit-index-u
 
 
 def main() -> None:
-    """Write them all."""
-    told = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    own, extras = told["project"]["dependencies"], told["project"]["optional-dependencies"]
+    """Write all locks."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    own, extras = project["project"]["dependencies"], project["project"]["optional-dependencies"]
     for name, wanted in (
         ("coordinator", own),
         ("worker", [*own, *extras["worker"]]),
-        ("build", told["build-system"]["requires"]),
+        ("build", project["build-system"]["requires"]),
     ):
         (HERE / f"{name}.lock").write_text(HEAD.format(*sys.version_info) + resolve(wanted))
         print(f"deploy/{name}.lock")
 
 
 def resolve(wanted: list[str]) -> str:
-    """The lines of a lock."""
+    """The text of a lock."""
     with tempfile.TemporaryDirectory() as name:
         given, found = Path(name) / "wanted.in", Path(name) / "found.txt"
         given.write_text("\n".join(wanted))

@@ -1,4 +1,4 @@
-"""Have the run again that a controller came from, here: `dreamfleet repeat` and one worker a core.
+"""Re-run the evolution of a controller on this host: `dreamfleet repeat` and one worker a core.
 
 Ctrl-C leaves the run open, and the same command goes on with it. Exits with 0 if the same controller is reported, to
 the bit.

@@ -1,4 +1,4 @@
-"""Drive natively under AddressSanitizer with the wildest actions; `make sanitize` builds the module for it.
+"""Drive the native renderer under AddressSanitizer with extreme actions; `make sanitize` builds it.
 
 python sanitize.py MODULE STEPS
 """
@@ -13,7 +13,7 @@ NAME = "dreamfleet.worker.car_racing._native"
 
 
 def use(path: str) -> None:
-    """Let the environment draw with the module at `path`."""
+    """Make the environment use the renderer at `path`."""
     loader = ExtensionFileLoader(NAME, path)
     spec = spec_from_file_location(NAME, path, loader=loader)
     assert spec is not None
@@ -23,13 +23,13 @@ def use(path: str) -> None:
 
 
 def wild(random):
-    """Now held, now shaken, far beyond what the action space allows."""
+    """Actions far beyond the action space, sometimes held, sometimes random."""
     size = random.choice([0.0, 1.0, 3.0, 1e3, 1e30])
     return lambda: random.choice([-size, size, random.uniform(-1, 1)], 3)
 
 
 def drive(steps: int) -> None:
-    """`steps` environment steps; episodes go on for a while after they leave the field."""
+    """Make `steps` environment steps; episodes continue for a while after the car leaves the field."""
     import numpy as np
 
     from dreamfleet.worker.car_racing.environment import CarRacing, _native

@@ -1,4 +1,4 @@
-"""Install a worker into an empty environment and print what takes its room, as a table for docs/."""
+"""Install a worker into an empty environment and print the size of its parts as a table for docs/."""
 
 import subprocess
 import tempfile
@@ -10,7 +10,7 @@ SHOWN = 14
 
 
 def main() -> None:
-    """Print Markdown."""
+    """Print the table as Markdown."""
     with tempfile.TemporaryDirectory() as folder:
         environment = Path(folder) / "environment"
         venv.create(environment, with_pip=True)
@@ -26,7 +26,7 @@ def main() -> None:
 
 
 def size(path: Path) -> int:
-    """Bytes of a file or a folder."""
+    """The size of a file or folder in bytes."""
     if path.is_symlink():
         return 0
     return path.stat().st_size if path.is_file() else sum(size(each) for each in path.iterdir())

@@ -1,9 +1,9 @@
-"""An agent of one's own: a double DQN that learns in the dream alone and is judged on real tracks.
+"""Train your own agent: a double DQN that learns only in the dream and is evaluated on real tracks.
 
     python docs/own_agent.py --steps 3000000 --episodes 32
 
-It chooses one of gymnasium's five actions of CarRacing and holds it for four steps. It observes [z, h]: a latent alone
-does not tell how fast the car is. Needs `pip install '.[train]'`.
+It chooses one of gymnasium's five CarRacing actions and holds it for four steps. It observes [z, h], since the latent z
+alone does not show the car's speed. Needs `pip install '.[train]'`.
 """
 
 import argparse
@@ -25,25 +25,25 @@ DREAM = "dreamfleet.worker.dream:dreamfleet/CarRacingDream-v0"
 REALITY = "dreamfleet.worker.car_racing:dreamfleet/CarRacingLatent-v0"
 ACTIONS = np.array(FIVE_CHOICES.choices, np.float32)  # nothing, right, left, gas, brake
 HOLD = 4  # steps
-DREAMS, HORIZON, TEMPERATURE = 64, 400, 1.25  # side by side; steps; above 1 a dream is harder to exploit
+DREAMS, HORIZON, TEMPERATURE = 64, 400, 1.25  # parallel dreams; steps; above 1, dreams are harder to exploit
 BATCH, REPLAY, UPDATES, RATE, GAMMA, FOLLOW = 256, 300_000, 2, 3e-4, 0.98, 0.005
-LEAST, SETTLED = 0.05, 0.3  # the share of random choices in the end, and the part of the learning until then
-FIRST, REPORT = 2560, 1000  # choices before it learns; choices in each dream between two reports
+LEAST, SETTLED = 0.05, 0.3  # final share of random choices, and the fraction of training until it is reached
+FIRST, REPORT = 2560, 1000  # choices before learning starts; choices in each dream between reports
 
 
 class Held(NamedTuple):
-    """What came of a choice that was held, a row a world."""
+    """The outcome of a held choice, a row for each world."""
 
-    after: Any  # observations where the choice, or the episode before it, ended
+    after: Any  # observations at the end of the choice, or of the episode if that ended first
     reward: Any
-    failed: Any  # the world itself ended the episode, and not its horizon
+    failed: Any  # the world ended the episode, not the horizon
     over: Any
-    now: Any  # observations of now: where an episode was over early, of the next one
-    last: Any  # it was over with the last step: the next one begins anew, whatever is chosen
+    now: Any  # current observations; of the next episode if one ended early
+    last: Any  # the episode ended at the last step: the next choice only resets the world
 
 
 def hold(worlds: gymnasium.vector.VectorEnv[Any, Any, Any], choices: Any) -> Held:
-    """Do `choices` `(N,)` for `HOLD` steps."""
+    """Hold `choices` `(N,)` for `HOLD` steps."""
     reward, failed, over = (np.zeros(worlds.num_envs, kind) for kind in (float, bool, bool))
     after = np.zeros(worlds.observation_space.shape or (), np.float32)
     for _ in range(HOLD):
@@ -57,28 +57,28 @@ def hold(worlds: gymnasium.vector.VectorEnv[Any, Any, Any], choices: Any) -> Hel
 
 
 def make_network(inputs: int) -> nn.Module:
-    """What each choice is worth `(N, 5)`, by observations `(N, inputs)`."""
+    """A network from observations `(N, inputs)` to the value of each choice `(N, 5)`."""
     layers = nn.Linear(inputs, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, len(ACTIONS))
     return nn.Sequential(nn.LayerNorm(inputs), *layers)
 
 
 def best(network: nn.Module, seen: Any) -> Any:
-    """The choices of most worth `(N,)`."""
+    """The choices with the highest value `(N,)`."""
     with torch.no_grad():
         return network(torch.from_numpy(seen)).argmax(dim=1).numpy()
 
 
 def loss_of(network: nn.Module, target: nn.Module, batch: Sequence[Tensor]) -> Tensor:
-    """Huber's, of double Q-learning: the network chooses what its target tells the worth of (van Hasselt 2016)."""
+    """The Huber loss of double Q-learning: the target network values the network's choice (van Hasselt 2016)."""
     seen, choices, rewards, goes_on, after = batch
     with torch.no_grad():
         worth = target(after).gather(1, network(after).argmax(dim=1, keepdim=True))[:, 0]
-    told = network(seen).gather(1, choices[:, None])[:, 0]
-    return nn.functional.smooth_l1_loss(told, rewards + GAMMA * goes_on * worth)
+    predicted = network(seen).gather(1, choices[:, None])[:, 0]
+    return nn.functional.smooth_l1_loss(predicted, rewards + GAMMA * goes_on * worth)
 
 
 def learn(dreams: gymnasium.vector.VectorEnv[Any, Any, Any], steps: int, seed: int) -> nn.Module:
-    """A network that has lived through so many dreamt steps."""
+    """Train a network on `steps` dreamt steps."""
     random, size = np.random.default_rng(seed), dreams.single_observation_space.shape or (0,)
     network = make_network(*size)
     target, optimiser = deepcopy(network), torch.optim.Adam(network.parameters(), RATE)
@@ -111,13 +111,13 @@ def learn(dreams: gymnasium.vector.VectorEnv[Any, Any, Any], steps: int, seed: i
         if done % REPORT == 0 or done == rounds:
             mean = np.mean(earned)
             earned.clear()
-            told = f"{done * DREAMS * HOLD} steps, {time.monotonic() - began:.0f} s"
-            print(f"{told}: {mean:.3f} a dreamt step", flush=True)
+            progress = f"{done * DREAMS * HOLD} steps, {time.monotonic() - began:.0f} s"
+            print(f"{progress}: {mean:.3f} a dreamt step", flush=True)
     return target
 
 
 def judge(tracks: gymnasium.vector.VectorEnv[Any, Any, Any], choose: Callable[[Any], Any], seed: int) -> float:
-    """The score of a whole episode in reality, in the one world of `tracks`."""
+    """The score of a whole real episode; `tracks` has one world."""
     seen, _ = tracks.reset(seed=seed)
     score, over = 0.0, False
     while not over:
@@ -127,14 +127,14 @@ def judge(tracks: gymnasium.vector.VectorEnv[Any, Any, Any], choose: Callable[[A
 
 
 def main() -> None:
-    """Learn, then drive beside an agent that chooses by chance."""
+    """Train, then evaluate beside an agent that chooses at random."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--steps", type=int, default=3_000_000, help="steps to dream (default 3000000)")
-    parser.add_argument("--episodes", type=int, default=32, help="real tracks to be judged on (default 32)")
-    parser.add_argument("--seed", type=int, default=0, help="of the learning (default 0)")
-    parser.add_argument("--bundle", default="tiny", help="the world model: a file, or one that ships (default tiny)")
+    parser.add_argument("--steps", type=int, default=3_000_000, help="dreamt steps to train for (default 3000000)")
+    parser.add_argument("--episodes", type=int, default=32, help="real tracks to evaluate on (default 32)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the training (default 0)")
+    parser.add_argument("--bundle", default="tiny", help="world model: a file or a shipped name (default tiny)")
     args = parser.parse_args()
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # nothing opens a window
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # open no window
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
     both = {"bundle": args.bundle, "features": "zh"}
@@ -151,8 +151,8 @@ def main() -> None:
             print(f"{name}: {scores[0]:.1f} on one real track", flush=True)
             continue
         error = scores.std(ddof=1) / np.sqrt(len(scores))
-        told = f"{scores.mean():.1f} ± {error:.1f} on {len(scores)} real tracks"
-        print(f"{name}: {told} ({scores.min():.0f} to {scores.max():.0f})", flush=True)
+        summary = f"{scores.mean():.1f} ± {error:.1f} on {len(scores)} real tracks"
+        print(f"{name}: {summary} ({scores.min():.0f} to {scores.max():.0f})", flush=True)
     tracks.close()
 
 

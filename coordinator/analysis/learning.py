@@ -14,8 +14,6 @@ from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.settings.start import total_effort
 
-CAR_RACING = "car-racing"
-
 
 @dataclass(frozen=True)
 class Point:

@@ -29,18 +29,12 @@ from dreamfleet.coordinator.dashboard.sse import event
 from dreamfleet.coordinator.dashboard.stored_runs import read_quartiles
 
 ANSWER_TIMEOUT = 1.5  # seconds to wait for answers
-PATIENCE = 5.0  # seconds of slow answers after which a silent run counts as lost; after fast answers at once
+PATIENCE = 5.0  # seconds of slow answers after which a silent run is lost; if others answer fast, at once
 MOST_RUNS = 32  # followed at a time
 MOST_ROWS = 100_000  # generations, evaluations or workers fetched of a run
 
 T = TypeVar("T")
-UNREADABLE = (
-    MalformedError,
-    LookupError,
-    TypeError,
-    ValueError,
-    ArithmeticError,
-)  # raised by documents of other versions
+UNREADABLE = (MalformedError, LookupError, TypeError, ValueError, ArithmeticError)  # of other versions' documents
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ def _tiles(status: Status, eta: Eta, link: str) -> list[dict[str, str]]:
     spent = status.throughput
     pace = "" if eta.pace is None else f"{format_duration(eta.pace)} each"
     last = status.last
-    workers, slots = _plural(status.workers.present, "worker"), _plural(status.slots, "slot")
+    workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
     return [
         _tile("generation", f"{status.generation.number:,}", pace),
         _tile("last generation", NONE if last is None else f"{last.mean:,.1f}", _last_generation_caption(last)),
@@ -196,15 +196,11 @@ def _problems(status: Status) -> list[str]:
     return [printable(each) for each in found]
 
 
-def _plural(count: int, noun: str) -> str:
-    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
-
-
 def _fleet(status: Status, link: str) -> str:
     counts = status.workers
     lost = counts.lost or 0
     silent = counts.known - counts.present - lost
-    text = f"{counts.present} present, {_plural(status.slots, 'slot')}"
+    text = f"{counts.present} present, {plural(status.slots, 'slot')}"
     text += "".join(f", {count} {state}" for count, state in ((silent, "silent"), (lost, "lost")) if count > 0)
     text = text if link == LIVE else f"at the last: {text}"
     return f"{text}; {status.classes.description}" if status.classes.total else text

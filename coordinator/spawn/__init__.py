@@ -1,1 +1,1 @@
-"""Workers on other hosts, by one command: over the system's ssh, each into a folder of its own there."""
+"""Start workers on other hosts over ssh, each in its own folder there."""

@@ -1,8 +1,8 @@
-"""What runs on a host while workers are spawned there: it looks, installs, starts, shows logs and ends.
+"""The agent on a remote host: inspects it, installs and starts workers, shows their logs and ends them.
 
-This text is sent over ssh and run by a Python that is found there, so that it imports the standard library alone. It is
-asked by lines of JSON on stdin, each followed by the files that it names, and answers by lines behind `MARK` on stdout:
-`say` or `line` while it works, then `ok` or `failed`. Nothing that changes a host is done to it twice at once.
+This file is sent over ssh and run by the Python found there, so it imports the standard library only. A request is a
+line of JSON on stdin, followed by the files that it names. An answer is lines on stdout that begin with `MARK`: `say`
+or `line` as it works, then `ok` or `failed`. A lock keeps two commands from changing a host at the same time.
 """
 
 from __future__ import annotations
@@ -27,36 +27,38 @@ from pathlib import Path
 from typing import Any
 
 MARK = "dreamfleet-host "
-TICK = 0.1  # seconds between looks
-START_TIMEOUT = 60.0  # seconds that a worker may take to say anything
-DRAIN_TIMEOUT = 900.0  # seconds that a drain is waited for
-STOP_AT_ONCE = ((signal.SIGTERM, 1.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 30.0))  # each with what it may take
+TICK = 0.1  # seconds between polls
+START_TIMEOUT = 60.0  # seconds until a started worker must have logged something
+DRAIN_TIMEOUT = 900.0  # seconds that a draining worker may take
+STOP_AT_ONCE = ((signal.SIGTERM, 1.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 30.0))  # each with its timeout
 STOP_DRAINED = ((signal.SIGTERM, DRAIN_TIMEOUT),)
-LEAST_FREE = 700_000_000  # bytes that an environment takes while it is made
-LONGEST_TAIL = 8192  # bytes of a log in which its last line is looked for
+LEAST_FREE = 700_000_000  # bytes needed while an environment is made
+LONGEST_TAIL = 8192  # bytes read from the end of a log for its last line
 JOIN, LOG, STATE, COMPLETE, CREATED = "join", "log", "worker.json", "whole", "made"
 FOLDERS = ("environments", "workers", "cache")  # under the root
-JOIN_HERE = "{join}"  # a word that stands for the join file's path
-_LOG_PREFIX = re.compile(r"^\S+ \S+ [A-Z]+ dreamfleet[\w.]*: |^dreamfleet: ")  # of a line of the log, or of a last word
-_LOG_RECORD = re.compile(rb"(?m)^(\d{4}-\S+ \S+ [A-Z]+ dreamfleet|\{)")  # a line of its log, as text or JSON
+JOIN_HERE = "{join}"  # placeholder for the join file's path
+_LOG_PREFIX = re.compile(
+    r"^\S+ \S+ [A-Z]+ dreamfleet[\w.]*: |^dreamfleet: "
+)  # before the text of a log line or an error
+_LOG_RECORD = re.compile(rb"(?m)^(\d{4}-\S+ \S+ [A-Z]+ dreamfleet|\{)")  # the start of a log line, as text or JSON
 
 
 class FailedError(Exception):
-    """What cannot be done here; the text says why and what to do."""
+    """A request failed; the text says why and what to do."""
 
 
 class DisconnectedError(Exception):
-    """Whoever asked is not there any more."""
+    """The other side closed the connection."""
 
 
 class Channel:
-    """Questions on stdin, which is never read further than was sent, and answers on stdout."""
+    """Requests on stdin and answers on stdout."""
 
     def __init__(self) -> None:
         self._waiting = b""
 
     def request(self) -> dict[str, Any]:
-        """The next question; an empty line asks nothing but to be heard."""
+        """The next request; empty for an empty line, which only interrupts `follow`."""
         while b"\n" not in self._waiting:
             self._read()
         text, _, self._waiting = self._waiting.partition(b"\n")
@@ -64,22 +66,22 @@ class Channel:
         return request
 
     def file(self, size: int) -> bytes:
-        """A file of so many bytes that follows a question."""
+        """Read a file of `size` bytes that follows a request."""
         while len(self._waiting) < size:
             self._read()
         data, self._waiting = self._waiting[:size], self._waiting[size:]
         return data
 
     def wait_for_request(self, seconds: float = TICK) -> bool:
-        """Wait for a request; whether one came. `DisconnectedError` if the other side has closed the connection."""
+        """Wait for a request; whether one came. `DisconnectedError` if the connection is closed."""
         if not self._waiting and select.select([0], [], [], seconds)[0]:
             self._read()
         return bool(self._waiting)
 
-    def send(self, kind: str, told: Any) -> None:
-        """Answer; nobody may be there to read it."""
+    def send(self, kind: str, content: Any) -> None:
+        """Send a message or an answer; ignored if the connection is closed."""
         with suppress(BrokenPipeError):
-            print(MARK + json.dumps({kind: told}), flush=True)  # noqa: T201 - the answer
+            print(MARK + json.dumps({kind: content}), flush=True)  # noqa: T201 - the answer
 
     def _read(self) -> None:
         data = os.read(0, 1 << 20)
@@ -89,57 +91,57 @@ class Channel:
 
 
 class HostFolder:
-    """The folder in which everything of a fleet's lies on this host."""
+    """The folder on this host that holds environments, workers and caches."""
 
     def __init__(self, text: str, channel: Channel) -> None:
         self.root = Path(text).expanduser().absolute()
-        self._line = channel
+        self.channel = channel
 
     @property
     def caches(self) -> dict[str, str]:
-        """Variables that keep what others would leave in the user's home in here, too."""
+        """Environment variables that keep caches in this folder instead of the user's home."""
         return {"DREAMFLEET_CACHE": str(self.root / "cache"), "XDG_CACHE_HOME": str(self.root / "cache")}
 
     @property
     def is_ours(self) -> bool:
-        """Whether a command of ours has worked here: else what has our folders' names is somebody's own."""
+        """Whether this program created the folder; otherwise its content belongs to somebody else."""
         return (self.root / CREATED).exists() or any(self.root.glob(f"workers/*/{STATE}"))
 
     def environment(self, name: str) -> Path:
-        """Where an environment lies; it is whole when it holds `WHOLE`."""
+        """The folder of an environment."""
         return self.root / "environments" / name
 
     def is_complete(self, name: str) -> bool:
-        """Whether an environment can be used: the Python that it was made of may be gone since."""
+        """Whether an environment is installed and its Python still exists."""
         folder = self.environment(name)
         return (folder / COMPLETE).exists() and (folder / "bin" / "python").exists()
 
     def worker(self, name: str) -> Path:
-        """Where a worker's state, log and join file lie."""
+        """The folder of a worker's state, log and join file."""
         return self.root / "workers" / name
 
     def names(self, kind: str) -> list[str]:
-        """The environments or workers that are there."""
+        """The names of all `environments` or `workers`."""
         with suppress(FileNotFoundError):
             return sorted(each.name for each in (self.root / kind).iterdir())
         return []
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Inside, no other command changes anything here; one that is at work is waited for."""
+        """Hold the folder's lock, which every command that changes it takes; create the folder if needed."""
         while True:
             self._create()
             with (self.root / "lock").open("w") as lock:
                 self._acquire(lock.fileno())
                 held = False
-                with suppress(FileNotFoundError):  # who held it may have removed it all
+                with suppress(FileNotFoundError):  # the last holder may have removed the folder
                     held = os.path.samestat(os.fstat(lock.fileno()), (self.root / "lock").stat())
                 if held:
                     yield
                     return
 
     def remove(self) -> None:
-        """Leave nothing behind; a folder with other things in it stays, with these."""
+        """Remove everything of ours; folders with other content stay."""
         made = [self.root]
         with suppress(FileNotFoundError):
             made = [Path(each) for each in json.loads((self.root / CREATED).read_text())]
@@ -166,13 +168,13 @@ class HostFolder:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
             if not said:
-                self._line.send("say", "another command is at work there: waiting for it")
+                self.channel.send("say", "another command is at work there: waiting for it")
             said = True
-            self._line.wait_for_request()
+            self.channel.wait_for_request()
 
 
 def process_start(pid: int) -> str:
-    """When the process of this number began, by which it is told from a later one; empty where none runs."""
+    """When the process began, to detect a reused process id; empty if it does not run."""
     try:
         facts = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
@@ -180,14 +182,14 @@ def process_start(pid: int) -> str:
         if Path("/proc/self/stat").exists():
             return ""
         words = ("ps", "-o", "stat=,lstart=", "-p", str(pid))
-        told = subprocess.run(words, capture_output=True, text=True, check=False)
-        state, _, began = told.stdout.strip().partition(" ")
+        listed = subprocess.run(words, capture_output=True, text=True, check=False)
+        state, _, began = listed.stdout.strip().partition(" ")
         return "" if state.startswith("Z") else began.strip()
     return "" if facts[0] in "ZX" else f"{boot} {facts[19]}"  # proc_pid_stat(5): state, and the start in ticks
 
 
 class WorkerProcess:
-    """A worker's state as it was written, and whether it still runs."""
+    """A worker's stored state, and whether it still runs."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -197,35 +199,35 @@ class WorkerProcess:
 
     @property
     def is_elsewhere(self) -> bool:
-        """Whether another host that shares this folder started it."""
+        """Whether another host with the same shared folder started it."""
         return bool(self.state) and self.state["node"] != platform.node()
 
     @property
     def is_alive(self) -> bool:
-        """Whether this very process runs."""
+        """Whether the process that was started still runs."""
         with suppress(ChildProcessError):
-            os.waitpid(-1, os.WNOHANG)  # of our own: one that ended is none
+            os.waitpid(-1, os.WNOHANG)  # reap our own children
         return bool(self.state) and not self.is_elsewhere and process_start(self.state["pid"]) == self.state["birth"]
 
     @property
     def tunnel_pid(self) -> int:
-        """The process by whose tunnel it lives, as long as that runs; else 0."""
+        """The agent process that holds the worker's tunnel; 0 if there is none or it ended."""
         pid, began = self.state.get("holder", (0, ""))
         return pid if pid and process_start(pid) == began else 0
 
     def describe(self) -> dict[str, Any]:
-        """What is told of it."""
+        """Its state, as sent to the other side."""
         running = self.is_alive
         age = time.time() - self.state["since"] if running else None
         return {"name": self.folder.name, "running": running, "slots": self.state.get("slots"), "age": age,
                 "digest": self.state.get("digest"), "last": last_line(self.folder / LOG)}  # fmt: skip
 
     def end(self, channel: Channel, steps: tuple[tuple[signal.Signals, float], ...]) -> None:
-        """Ask it to leave, and wait until it has."""
+        """Send it the signals of `steps` in turn, each with its timeout; `FailedError` if it still runs."""
         for number, seconds in steps:
             if not self.is_alive:
                 return
-            with suppress(ProcessLookupError):  # it leads a group, with the children that score for it
+            with suppress(ProcessLookupError):  # it leads a group with its scoring processes
                 (os.killpg if number == signal.SIGKILL else os.kill)(self.state["pid"], number)
             deadline = time.monotonic() + seconds
             while self.is_alive and time.monotonic() < deadline:
@@ -235,7 +237,7 @@ class WorkerProcess:
 
 
 def last_line(log: Path) -> str:
-    """What a worker said last, without its time."""
+    """The last log line of a worker, without its time."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - LONGEST_TAIL))
@@ -246,9 +248,8 @@ def last_line(log: Path) -> str:
     return _LOG_PREFIX.sub("", said[-1]) if said else ""
 
 
-def inspect_host(request: dict[str, Any], channel: Channel) -> dict[str, Any]:
-    """What is there; nothing is changed."""
-    host_folder = HostFolder(request["root"], channel)
+def inspect_host(host_folder: HostFolder) -> dict[str, Any]:
+    """Describe the host, its environments and workers; changes nothing."""
     there = next(each for each in (host_folder.root, *host_folder.root.parents) if each.exists())
     installed = None
     with suppress(importlib.metadata.PackageNotFoundError):
@@ -268,22 +269,22 @@ def inspect_host(request: dict[str, Any], channel: Channel) -> dict[str, Any]:
     }
 
 
-def install(request: dict[str, Any], files: dict[str, bytes], channel: Channel) -> dict[str, Any]:
-    """An environment of this name that is whole: it is made unless it is there."""
-    host_folder = HostFolder(request["root"], channel)
+def install(host_folder: HostFolder, request: dict[str, Any], files: dict[str, bytes]) -> dict[str, Any]:
+    """Make the environment of this name unless it is complete; return its Python."""
     folder = host_folder.environment(request["environment"])
     with host_folder.locked():
         if host_folder.is_complete(request["environment"]):
             return {"python": str(folder / "bin" / "python")}
-        shutil.rmtree(folder, ignore_errors=True)  # an attempt that was interrupted
+        shutil.rmtree(folder, ignore_errors=True)  # left by an interrupted attempt
         parcel = folder / "parcel"
         parcel.mkdir(parents=True)
         for name, data in files.items():
             (parcel / Path(name).name).write_bytes(data)
-        channel.send("say", "makes its environment")
+        host_folder.channel.send("say", "makes its environment")
         _call(host_folder, sys.executable, "-m", "venv", str(folder))
         python = str(folder / "bin" / "python")
-        channel.send("say", "installs the worker" + ("" if request["offline"] else ", from the package index"))
+        origin = "" if request["offline"] else ", from the package index"
+        host_folder.channel.send("say", f"installs the worker{origin}")
         source = ("--no-index", "--find-links", ".") if request["offline"] else ("--constraint", "pins.txt")
         flags = ("--quiet", "--no-cache-dir", "--disable-pip-version-check", *source)
         _call(host_folder, python, "-m", "pip", "install", *flags, f"./{request['wheel']}[worker]", inside=parcel)
@@ -293,9 +294,15 @@ def install(request: dict[str, Any], files: dict[str, bytes], channel: Channel) 
 
 
 def _call(host_folder: HostFolder, *command: str, inside: Path | None = None) -> None:
-    environment = {**os.environ, **host_folder.caches}
+    """Run a command of the installation; `FailedError` with the reason and a remedy."""
     done = subprocess.run(
-        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, cwd=inside, env=environment
+        command,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=inside,
+        env={**os.environ, **host_folder.caches},
     )
     if done.returncode == 0:
         return
@@ -312,9 +319,8 @@ def _call(host_folder: HostFolder, *command: str, inside: Path | None = None) ->
     )
 
 
-def start(request: dict[str, Any], files: dict[str, bytes], channel: Channel) -> dict[str, Any]:
-    """Start a worker, unless the same one runs; another one of its name is drained first."""
-    host_folder = HostFolder(request["root"], channel)
+def start(host_folder: HostFolder, request: dict[str, Any], files: dict[str, bytes]) -> dict[str, Any]:
+    """Start a worker unless the same one runs; a different one of its name is drained first."""
     folder = host_folder.worker(request["name"])
     with host_folder.locked():
         found = WorkerProcess(folder)
@@ -328,17 +334,17 @@ def start(request: dict[str, Any], files: dict[str, bytes], channel: Channel) ->
                 "a name of its own, or end that one first"
             )
         outcome = "replaced" if found.is_alive else "started"
-        found.end(channel, STOP_DRAINED)
+        found.end(host_folder.channel, STOP_DRAINED)
         folder.mkdir(parents=True, exist_ok=True)
         for name, data in files.items():
             _write_private(folder / name, data)
         began = _launch(host_folder, folder, request)
-    _wait_for_log(began, folder, channel)
+    _wait_for_log(began, folder, host_folder.channel)
     return {**WorkerProcess(folder).describe(), "outcome": outcome}
 
 
 def _write_private(path: Path, data: bytes) -> None:
-    """Write a file that is whole or not there, for this user alone: no umask is trusted."""
+    """Write a file atomically, readable by this user only whatever the umask."""
     aside = path.with_name(f".{path.name}")
     with open(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
         file.write(data)
@@ -349,25 +355,19 @@ def _write_private(path: Path, data: bytes) -> None:
 def _launch(host_folder: HostFolder, folder: Path, request: dict[str, Any]) -> subprocess.Popen[bytes]:
     log = folder / LOG
     log.unlink(missing_ok=True)
-    state = {
-        "digest": request["digest"],
-        "slots": request["slots"],
-        "since": time.time(),
-        "node": platform.node(),
-    }
-    if request["held"]:
-        state["holder"] = [os.getpid(), process_start(os.getpid())]
-    _write_private(folder / STATE, b"{}")  # a disk that is full is so before anything runs
+    _write_private(folder / STATE, b"{}")  # a full disk must fail before anything runs
     words = [request["python"], *(str(folder / JOIN) if each == JOIN_HERE else each for each in request["words"])]
     with log.open("xb") as out:
         began = subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True, cwd=folder,
             env={**os.environ, **host_folder.caches, **request["env"]},
         )  # fmt: skip
+    state = {"digest": request["digest"], "slots": request["slots"], "since": time.time(), "node": platform.node(),
+             "pid": began.pid, "birth": process_start(began.pid)}  # fmt: skip
+    if request["held"]:
+        state["holder"] = [os.getpid(), process_start(os.getpid())]
     try:
-        _write_private(
-            folder / STATE, json.dumps({**state, "pid": began.pid, "birth": process_start(began.pid)}).encode()
-        )
+        _write_private(folder / STATE, json.dumps(state).encode())
     except OSError:
         began.kill()
         raise
@@ -375,7 +375,7 @@ def _launch(host_folder: HostFolder, folder: Path, request: dict[str, Any]) -> s
 
 
 def _wait_for_log(began: subprocess.Popen[bytes], folder: Path, channel: Channel) -> None:
-    """Until its log has begun, which a usage or a traceback does not; `FailedError` if it ended instead."""
+    """Wait for a proper log line, unlike a usage text or traceback; `FailedError` if the worker failed instead."""
     deadline = time.monotonic() + START_TIMEOUT
     while began.poll() is None and not _LOG_RECORD.search((folder / LOG).read_bytes()) and time.monotonic() < deadline:
         channel.wait_for_request()
@@ -384,9 +384,9 @@ def _wait_for_log(began: subprocess.Popen[bytes], folder: Path, channel: Channel
         raise FailedError(f"its worker ended at once: {why}")
 
 
-def follow(request: dict[str, Any], channel: Channel) -> dict[str, Any]:
-    """A worker's log from its beginning, line by line, until it ended or something else is asked."""
-    found = WorkerProcess(HostFolder(request["root"], channel).worker(request["name"]))
+def follow(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
+    """Send a worker's log line by line until the worker ends or the next request comes."""
+    channel, found = host_folder.channel, WorkerProcess(host_folder.worker(request["name"]))
     rest = b""
     with (found.folder / LOG).open("rb") as log:
         while True:
@@ -398,9 +398,9 @@ def follow(request: dict[str, Any], channel: Channel) -> dict[str, Any]:
                 return {**found.describe(), "ended": over}
 
 
-def end(request: dict[str, Any], channel: Channel) -> dict[str, Any]:
-    """End one worker, or all, with what belongs to them; unless told to keep it, the rest too when none is left."""
-    host_folder, ended = HostFolder(request["root"], channel), list[dict[str, Any]]()
+def end(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
+    """End and remove the named workers, or all; remove the whole folder after the last one unless `keep` is set."""
+    channel, ended = host_folder.channel, list[dict[str, Any]]()
     if not host_folder.is_ours:
         return {"ended": ended}
     with host_folder.locked():
@@ -419,18 +419,18 @@ def end(request: dict[str, Any], channel: Channel) -> dict[str, Any]:
 
 
 def handle_request(request: dict[str, Any], channel: Channel) -> None:
-    """Do what is asked, and answer."""
+    """Do what a request says, and answer."""
     files = {name: channel.file(size) for name, size in request.get("files", [])}
-    tasks: dict[str, Callable[[], dict[str, Any]]] = {
-        "look": lambda: inspect_host(request, channel),
-        "install": lambda: install(request, files, channel),
-        "start": lambda: start(request, files, channel),
-        "follow": lambda: follow(request, channel),
-        "end": lambda: end(request, channel),
+    host_folder, where = HostFolder(request["root"], channel), request["root"]
+    actions: dict[str, Callable[[], dict[str, Any]]] = {
+        "look": lambda: inspect_host(host_folder),
+        "install": lambda: install(host_folder, request, files),
+        "start": lambda: start(host_folder, request, files),
+        "follow": lambda: follow(host_folder, request),
+        "end": lambda: end(host_folder, request),
     }
-    where = request["root"]
     try:
-        channel.send("ok", tasks[request["do"]]())
+        channel.send("ok", actions[request["do"]]())
     except FailedError as error:
         channel.send("failed", str(error))
     except OSError as error:
@@ -443,7 +443,7 @@ def handle_request(request: dict[str, Any], channel: Channel) -> None:
 
 
 def main() -> None:
-    """Answer until nobody asks; a worker that lives by this connection then ends with it."""
+    """Answer requests until the connection closes, then end the workers that used its tunnel."""
     os.umask(0o077)
     channel, held = Channel(), list[dict[str, Any]]()
     channel.send("ok", {})
@@ -456,9 +456,10 @@ def main() -> None:
             handle_request(request, channel)
     except DisconnectedError:
         for each in held:
-            if WorkerProcess(HostFolder(each["root"], channel).worker(each["name"])).tunnel_pid == os.getpid():
+            host_folder = HostFolder(each["root"], channel)
+            if WorkerProcess(host_folder.worker(each["name"])).tunnel_pid == os.getpid():
                 with suppress(FailedError, OSError):
-                    end({**each, "names": [each["name"]], "now": True, "keep": True}, channel)
+                    end(host_folder, {"names": [each["name"]], "now": True, "keep": True})
 
 
 if __name__ == "__main__":

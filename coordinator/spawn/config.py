@@ -1,4 +1,4 @@
-"""Which hosts there are, and how a worker is brought to each: settings, their checks, and what follows from them."""
+"""The hosts, and the settings with which a worker is started on each."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from dreamfleet.common.protocol.keys import check_worker_name
 from dreamfleet.common.transport.network import is_loopback
 
 HOSTS = "host"  # [[host]] in a file
-RESERVED_FLAGS = ("--name", "--slots", "--connect", "--join")  # flags of a worker that are ours to give
+RESERVED_FLAGS = ("--name", "--slots", "--connect", "--join")  # set by spawn itself
 MOST_SLOTS = 1024
 _ADDRESS = re.compile(r"(ssh://)?([^@\s]+@)?(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^@:\s/]+)(:\d+)?/?")
 
 
 @dataclass(frozen=True)
 class SpawnConfig:
-    """How a worker is brought to a host; a host's own table says what differs there."""
+    """How a worker is started on a host; a `[[host]]` table overrides these settings."""
 
     slots: int = option(0, "scoring processes of each worker; 0: one a core")
     worker_flags: str = option("", 'further flags of each `worker`, as one text: "--run night --exit-when-done"')
@@ -58,7 +58,7 @@ class SpawnConfig:
 
 @dataclass(frozen=True)
 class HostConfig:
-    """One [[host]] of a file."""
+    """Address and name in a [[host]] table."""
 
     address: str = field(metadata={"help": "as ssh takes it: user@host, a name of ~/.ssh/config, or ssh://host:port"})
     name: str = option("", "of host and worker (default the address without user)")
@@ -66,7 +66,7 @@ class HostConfig:
 
 @dataclass(frozen=True)
 class Host:
-    """One host, and how a worker is brought there."""
+    """A host, and how a worker is started there."""
 
     name: str
     address: str
@@ -79,23 +79,24 @@ class Host:
 
     @property
     def flags(self) -> list[str]:
-        """Further flags of its worker."""
+        """Further flags for its worker."""
         return _split_flags("worker-flags", self.spawn.worker_flags)
 
     @property
     def ssh(self) -> list[str]:
-        """The ssh client with the user's own flags."""
+        """The ssh command with the user's flags."""
         return _split_flags("ssh", self.spawn.ssh)
 
     @property
     def environment(self) -> dict[str, str]:
-        """Variables that its worker is given."""
+        """Environment variables for its worker."""
         return dict(each.partition("=")[::2] for each in self.spawn.env)
 
     def forwards(self, connect: Iterable[str], *, joins: bool) -> tuple[str, ...]:
-        """HOST:PORT of each endpoint that its worker reaches through a tunnel: by default where all are loopback's.
+        """HOST:PORT of each endpoint to reach through a tunnel; empty without one.
 
-        `joins`: a join file says where to connect, unless endpoints are given too.
+        By default there is a tunnel if all endpoints are loopback addresses. With `joins` there is none by default,
+        since a join file names the endpoints.
         """
         endpoints = tuple(connect)
         wanted = self.spawn.tunnel
@@ -109,7 +110,7 @@ class Host:
 
 
 def read_hosts(rows: Sequence[Mapping[str, Any]], sources: Mapping[str, Any]) -> list[Host]:
-    """The hosts of [[host]] tables; what one says is stronger than [spawn], and weaker than environment and flags."""
+    """The hosts of [[host]] tables, which override [spawn]; environment variables and flags override them."""
     hosts = []
     for number, row in enumerate(rows, start=1):
         where = f"[[{HOSTS}]] number {number}"
@@ -127,7 +128,7 @@ def read_hosts(rows: Sequence[Mapping[str, Any]], sources: Mapping[str, Any]) ->
 
 
 def check_unique(hosts: list[Host]) -> list[Host]:
-    """The same hosts; `UsageError` where there is none, or two of one name."""
+    """The same hosts; `UsageError` if there are none or a name is used twice."""
     if not hosts:
         raise UsageError(f"no host is named: give user@host, or a file with [[{HOSTS}]] tables")
     names = [each.name for each in hosts]
@@ -139,7 +140,7 @@ def check_unique(hosts: list[Host]) -> list[Host]:
 
 
 def default_name(address: str) -> str:
-    """What a host is called that is given by its address alone."""
+    """The name of a host without a given one, from its address."""
     found = _ADDRESS.fullmatch(address)
     return re.sub(r"[^A-Za-z0-9.-]+", "-", found["host"] if found else address).strip("-.")[:63] or "worker"
 

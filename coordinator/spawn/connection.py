@@ -1,4 +1,4 @@
-"""One ssh connection: the agent that runs behind it is asked, and answers; a tunnel may go the other way."""
+"""An ssh connection to a host's agent, with an optional tunnel back, and explanations of ssh's errors."""
 
 from __future__ import annotations
 
@@ -15,29 +15,48 @@ from typing import Any
 
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
 from dreamfleet.coordinator.spawn.agent import MARK
-from dreamfleet.coordinator.spawn.ssh_errors import NO_PYTHON, explain
 
-# The user's own flags stand before these, and ssh takes the first of each. Nobody is there to be asked for a password.
+# The user's flags come first, and ssh takes the first value of each option. BatchMode: nobody can type a password.
 OPTIONS = ("-T", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10", "-o", "ServerAliveInterval=15",
            "-o", "ServerAliveCountMax=4", "-o", "LogLevel=INFO")  # fmt: skip
-# A connection that others share would keep the tunnel after this command.
+# A shared connection would keep the tunnel open after this command.
 TUNNEL = ("-o", "ControlMaster=no", "-o", "ControlPath=none", "-o", "ExitOnForwardFailure=yes")
 PYTHONS = ("python3", "python3.14", "python3.13", "python3.12", "python3.11", "python")
-KEPT_LINES = 50  # of what ssh says
-PATIENCE = 5.0  # seconds that ssh may take to end
-FORWARD = 30.0  # seconds until ssh says which port it was given, once the other side runs
+KEPT_LINES = 50  # of ssh's messages
+PATIENCE = 5.0  # seconds for ssh to exit
+FORWARD = 30.0  # seconds for ssh to report the tunnel's port once the agent runs
 _PORT = re.compile(r"Allocated port (\d+) for remote forward to (\S+)")
+NO_PYTHON = "dreamfleet-no-python"  # printed by the remote shell before the version found
+_SSH_ERRORS = (
+    (r"Could not resolve hostname", "no such host: look at its address, or at HostName in ~/.ssh/config"),
+    (r"REMOTE HOST IDENTIFICATION HAS CHANGED|Host key for .* has changed",
+     "its host key is not the one that is known: if it was set up anew, remove the old one with `ssh-keygen -R HOST`, "
+     "and connect once by hand; else somebody stands between"),
+    (r"Host key verification failed|host key is known",
+     "its host key is not known here: connect once by hand, compare what is shown, and accept it"),
+    (r"Permission denied \(", "it refuses this user and key: try `ssh {address}` by hand; no password is asked for "
+     "here, so load the key into ssh-agent, or name it with --ssh \"ssh -i KEY\""),
+    (r"Connection refused", "nothing answers ssh at this address: start sshd there, or give its port: "
+     "ssh://HOST:PORT"),
+    (r"timed out|No route to host|Network is unreachable|Host is down",
+     "it cannot be reached: is it on, and is its network reachable from here?"),
+    (r"remote port forwarding failed|administratively prohibited",
+     "its sshd allows no tunnel: set AllowTcpForwarding there, or let the coordinator --listen where hosts reach it"),
+    (r"Bad configuration option|Bad owner or permissions|terminating, \d+ bad configuration",
+     "the ssh client refuses its configuration"),
+)  # fmt: skip
+_SSH_NOISE = re.compile(r"Warning: Permanently added|^Allocated port|^\s*$|^@+$")
 
 OnMessage = Callable[[str, str], None]
-"""What the agent says while it works: `say` or `line`, and the text."""
+"""Takes a message of the working agent: its kind, `say` or `line`, and the text."""
 
 
 def _ignore_message(_kind: str, _text: str) -> None:
-    """Nobody listens."""
+    """Ignore a message."""
 
 
 class Connection:
-    """A host's agent; where none answers, `ConnectionFailedError` says why, and what to do."""
+    """A connection to a host's agent; `ConnectionFailedError` says why it failed and what to do."""
 
     def __init__(self, ssh: Sequence[str], address: str, python: str = "", forwards: Sequence[str] = ()) -> None:
         self._address = address
@@ -68,24 +87,24 @@ class Connection:
         self._program = program
 
     def start_agent(self) -> None:
-        """Have the agent run, which may be waited for: whoever waits can be ended by `close`."""
+        """Start the agent and wait for it; `close` from another thread ends the wait."""
         self._send(self._program)
         self._answer(_ignore_message)
 
     def ask(
         self, do: str, on_message: OnMessage = _ignore_message, sent: Mapping[str, bytes] | None = None, **facts: Any
     ) -> Any:
-        """Have one thing done; `DreamfleetError` if it cannot be."""
+        """Send a request and return its answer; `DreamfleetError` if it failed."""
         names = [(name, len(data)) for name, data in (sent or {}).items()]
         self._send(json.dumps({"do": do, "files": names, **facts}).encode() + b"\n", *(sent or {}).values())
         return self._answer(on_message)
 
     def interrupt(self) -> None:
-        """End a `follow` that is under way. From any thread."""
+        """End a running `follow`. From any thread."""
         self._send(b"\n")
 
     def ports(self, forwards: Sequence[str]) -> list[int]:
-        """The ports there of the tunnel's ends, in order."""
+        """The ports on the remote side of the tunnel, in the order of `forwards`."""
         with self._changed:
             if not self._changed.wait_for(lambda: self._ports.keys() >= set(forwards) or self._ended, FORWARD):
                 raise ConnectionFailedError("ssh did not say which port its tunnel was given")
@@ -94,7 +113,7 @@ class Connection:
         return [self._ports[each] for each in forwards]
 
     def close(self) -> None:
-        """End it, and with it what lives by its tunnel. From any thread."""
+        """Close the connection, which ends workers that use its tunnel. From any thread."""
         with suppress(OSError):
             self._popen.terminate()
         try:
@@ -109,23 +128,23 @@ class Connection:
 
     def _send(self, *data: bytes) -> None:
         assert self._popen.stdin is not None
-        with suppress(BrokenPipeError, ValueError):  # what is answered, or not, says why
+        with suppress(BrokenPipeError, ValueError):  # `_answer` reports why
             for each in data:
                 self._popen.stdin.write(each)
             self._popen.stdin.flush()
 
     def _answer(self, on_message: OnMessage) -> Any:
-        """The next answer; lines without our mark are of the other side's shell."""
+        """The next answer; skips lines without our mark, which the remote shell prints."""
         assert self._popen.stdout is not None
         for line in self._popen.stdout:
             if not line.startswith(MARK.encode()):
                 continue
-            ((kind, told),) = json.loads(line[len(MARK) :]).items()
+            ((kind, content),) = json.loads(line[len(MARK) :]).items()
             if kind == "ok":
-                return told
+                return content
             if kind == "failed":
-                raise DreamfleetError(told)
-            on_message(kind, told)
+                raise DreamfleetError(content)
+            on_message(kind, content)
         raise self._failure()
 
     def _failure(self) -> ConnectionFailedError:
@@ -148,9 +167,9 @@ class Connection:
 
 
 def _remote_command(python: str, size: int) -> str:
-    """For whatever shell is there: run the agent, of so many bytes on stdin, in the first Python that is new enough.
+    """A command for any login shell: run the agent, `size` bytes on stdin, in the first Python that is new enough.
 
-    No line break and no exclamation mark, which a C shell would take for its own.
+    It holds no line break or exclamation mark, which a C shell would interpret.
     """
     wanted = [python.removeprefix("~/")] if python else list(PYTHONS)
     script = (
@@ -160,3 +179,16 @@ def _remote_command(python: str, size: int) -> str:
         f'echo "{NO_PYTHON} $("${{p:-python3}}" --version 2>&1)" >&2; exit 127'
     )
     return f"exec /bin/sh -c {shlex.quote(script)}"
+
+
+def explain(said: list[str], code: int | None, address: str) -> str:
+    """Why a connection ended and what to do, in one line, from ssh's messages and exit code. Pure."""
+    text = "\n".join(said)
+    if found := re.search(rf"{NO_PYTHON} (Python [\w.+]+)?", text):
+        there = f" (there is {found[1]})" if found[1] else ""
+        return f"no Python of 3.11 or newer there{there}: install one, or name it with --remote-python"
+    for pattern, remedy in _SSH_ERRORS:
+        if re.search(pattern, text):
+            return remedy.format(address=address)
+    last = next((each.strip() for each in reversed(said) if not _SSH_NOISE.search(each)), "")
+    return f"the ssh connection ended{f' ({last})' if last else f', exit code {code}'}: try `ssh {address}` by hand"

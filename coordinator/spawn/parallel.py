@@ -1,4 +1,4 @@
-"""All hosts at once: each in a thread of its own, what fails is its row, and Ctrl-C is heard meanwhile."""
+"""All hosts in parallel: a thread each, a failure is a row of the table, and Ctrl-C stops them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dreamfleet.coordinator.spawn.config import Host
 from dreamfleet.coordinator.spawn.remote_host import FAILED, FleetAddress, HostStatus, RemoteHost
 
 log = logging.getLogger(__name__)
-POLL_INTERVAL = 0.2  # seconds between looks at whether to stop
+POLL_INTERVAL = 0.2  # seconds between checks for a stop
 
 OnStatuses = Callable[[Sequence[HostStatus]], None]
 OnLogLine = Callable[[str, str], None]
@@ -22,21 +22,21 @@ OnLogLine = Callable[[str, str], None]
 
 
 def check(hosts: Sequence[Host], fleet_address: FleetAddress) -> list[HostStatus]:
-    """How each host is; nothing is changed there."""
+    """Describe each host; changes nothing."""
     return _run_on_all(hosts, fleet_address, RemoteHost.check)
 
 
 def end(hosts: Sequence[Host], *, all_workers: bool, now: bool, keep: bool) -> list[HostStatus]:
-    """End the worker of each host, or all that are there, and what belongs to them."""
+    """End the worker of each host, or all workers there, and remove their files."""
     return _run_on_all(hosts, FleetAddress(()), partial(RemoteHost.end, all_workers=all_workers, now=now, keep=keep))
 
 
 def bring_up(
     hosts: Sequence[Host], fleet_address: FleetAddress, on_statuses: OnStatuses, on_log_line: OnLogLine | None
 ) -> list[HostStatus]:
-    """Have a worker run on each host; with `on_log_line`, or where it lives by a tunnel, until it ends or Ctrl-C.
+    """Start a worker on each host. With `on_log_line` or a tunnel, return only when they end or at Ctrl-C.
 
-    `on_statuses` is given the rows when all are up, `on_log_line` lines of their logs.
+    Calls `on_statuses` when all are up and when they ended, `on_log_line` for each line of a log.
     """
     with stop_on_signals() as stop, ExitStack() as stack:
         remote_hosts = _open_remote_hosts(hosts, fleet_address, stack, on_log_line or _ignore_line)
@@ -63,7 +63,7 @@ def bring_up(
 
 
 def _follow_until_ended(remote_host: RemoteHost) -> HostStatus:
-    """Until the worker ends, or somebody wants to leave: then one that lives by our tunnel leaves first."""
+    """Follow a worker until it ends or the command stops, which ends a worker that uses our tunnel."""
     row = remote_host.follow()
     if row is None and not remote_host.forwards:
         return HostStatus(remote_host.host.name, "running", "goes on without this command; `dreamfleet down` ends it")
@@ -101,7 +101,7 @@ def _run_in_threads(
     stop: Stop,
     leave: Callable[[RemoteHost], None],
 ) -> list[HostStatus]:
-    """What `do` says of each; at the first Ctrl-C each is told to `leave`, at the second all connections end."""
+    """The status of `do` for each host. The first Ctrl-C calls `leave` for each, the second closes all connections."""
     left = False
     with ThreadPoolExecutor(max(len(remote_hosts), 1)) as pool:
         futures = [pool.submit(_status_of, remote_host, do) for remote_host in remote_hosts]
@@ -126,4 +126,4 @@ def _status_of(remote_host: RemoteHost, do: Callable[[RemoteHost], HostStatus]) 
 
 
 def _ignore_line(_host: str, _line: str) -> None:
-    """Nobody wants to see it."""
+    """Drop a line of a log."""

@@ -1,7 +1,7 @@
-"""What is installed on a host: this very dreamfleet as a wheel, and what decides which packages stand beside it.
+"""What is installed on a host: this dreamfleet as a wheel, and the versions of the packages that it needs.
 
-The wheel is packed from the files that are installed here: no checkout, build or network is needed, and a worker runs
-the code that its coordinator's host has.
+The wheel is packed from the installed files. This needs no checkout, build or network, and remote workers run the same
+code as this host.
 """
 
 from __future__ import annotations
@@ -38,31 +38,31 @@ class Wheel:
 
     @cached_property
     def sha256(self) -> str:
-        """Of its bytes."""
+        """Hash of its bytes."""
         return hashlib.sha256(self.data).hexdigest()
 
 
 @dataclass(frozen=True)
 class Parcel:
-    """What a host is sent to make an environment of; without a wheelhouse the rest comes from a package index."""
+    """The files for an environment; without a wheelhouse, dependencies come from a package index."""
 
     wheel: Wheel
     pins: str
     wheelhouse: Path | None = None
 
     def environment(self, python: tuple[int, ...], machine: str) -> str:
-        """The name of the environment: another one for whatever may make it differ."""
+        """The name of the environment, with a hash of everything that it depends on."""
         house = [f"{each.name} {each.stat().st_size}" for each in self._wheels()]
         text = "\n".join([self.wheel.sha256, self.pins if not house else "", *house, *map(str, python), machine])
         return f"{version(NAME)}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
     def files(self) -> dict[str, bytes]:
-        """Every file that is sent, by name."""
+        """The files to send, by name."""
         house = {each.name: each.read_bytes() for each in self._wheels()}
         return {**house, "pins.txt": self.pins.encode(), self.wheel.name: self.wheel.data}
 
     def check_fits(self, machine: str) -> None:
-        """`DreamfleetError` where the wheelhouse is one for other processors alone."""
+        """`DreamfleetError` if the wheelhouse has wheels for other processors only."""
         tags = {each.stem.rpartition("-")[2] for each in self._wheels()} - {"any"}
         if tags and not any(machine in tag or "universal2" in tag for tag in tags):
             raise DreamfleetError(
@@ -78,18 +78,18 @@ class Parcel:
 def pack(wheelhouse: Path | None, *, native: bool) -> Parcel:
     """This installation, packed once a process.
 
-    `native`: with the picture that was compiled here, which runs on the same processors alone.
+    `native` includes the compiled renderer, which runs only on the same kind of processor.
     """
     return Parcel(pack_wheel(native=native), pins(), wheelhouse)
 
 
 def runs_here(system: str, machine: str) -> bool:
-    """Whether what was compiled here may run there."""
+    """Whether code compiled here runs on that host."""
     return (system, machine) == (platform.system(), platform.machine()) == ("Linux", machine)
 
 
 def pack_wheel(*, native: bool) -> Wheel:
-    """A wheel of the files of this installation, an editable one too; the same bytes for the same files."""
+    """A wheel of this installation, editable or not; equal files give equal bytes."""
     found = _distribution()
     head = f"{NAME}-{found.version}"
     about = f"{head}.dist-info"
@@ -110,7 +110,7 @@ def pack_wheel(*, native: bool) -> Wheel:
 
 
 def pins() -> str:
-    """The versions that a worker's packages have here, as pip's constraints: hosts shall compute equal bits."""
+    """The versions of a worker's packages here, as pip constraints, so that hosts compute equal bits."""
     lines = []
     for each in _distribution().requires or ():
         found = _REQUIREMENT.match(each)
@@ -126,7 +126,7 @@ def pins() -> str:
 def _modules(native: bool) -> list[tuple[str, bytes]]:
     root = Path(str(resources(NAME)))
     found = []
-    for folder, folders, names in os.walk(root, followlinks=True):  # a checkout's rooms are links
+    for folder, folders, names in os.walk(root, followlinks=True):  # in a checkout, these folders are links
         folders[:] = sorted(each for each in folders if each != "__pycache__")
         for name in sorted(names):
             path = Path(folder, name)

@@ -1,4 +1,4 @@
-"""What is done on one host, in order: connect, look, install, start, show the log, end."""
+"""The steps on one host: connect, inspect, install, start, follow the log, end."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FAILED = "failed"
 
 @dataclass(frozen=True)
 class FleetAddress:
-    """How the workers find their coordinator: endpoints, a join file, or both."""
+    """Where workers find their coordinator: endpoints, a join file's bytes, or both."""
 
     connect: tuple[str, ...]
     join: bytes = field(default=b"", repr=False)
@@ -30,7 +30,7 @@ class FleetAddress:
 
 @dataclass(frozen=True)
 class HostStatus:
-    """How a host is: of its worker, the slots (`None` where there is none), and seconds since it began."""
+    """A row of the table of hosts; `slots` and `since` (seconds) are its worker's, `None` without one."""
 
     host: str
     state: str
@@ -40,7 +40,7 @@ class HostStatus:
 
 
 class RemoteHost:
-    """One host's connection and what is done through it; every method raises `DreamfleetError` with why it failed."""
+    """A host and the connection to it; every method raises `DreamfleetError` if it fails."""
 
     def __init__(self, host: Host, fleet_address: FleetAddress, on_progress: OnText, on_log_line: OnText) -> None:
         self.host = host
@@ -53,7 +53,7 @@ class RemoteHost:
         self.forwards = host.forwards(fleet_address.connect, joins=bool(fleet_address.join))
 
     def check(self) -> HostStatus:
-        """How the host is, and what would be done; nothing is changed there."""
+        """Describe the host and what `bring_up` would do; changes nothing."""
         found = self._inspect(())
         mine = next((each for each in found["workers"] if each["name"] == self.host.name and each["running"]), None)
         if mine:
@@ -68,7 +68,7 @@ class RemoteHost:
         )
 
     def bring_up(self) -> HostStatus:
-        """Have the worker run there, in an environment that is made if it lacks."""
+        """Start the worker, in an environment that is made if it is missing."""
         found = self._inspect(self.forwards)
         python = self._python(found)
         connect = self._endpoints()
@@ -84,17 +84,17 @@ class RemoteHost:
         return self._status(started["outcome"], started)
 
     def follow(self) -> HostStatus | None:
-        """Show the worker's log until it ends, which is told; `None` if `stop_following` was called meanwhile."""
+        """Pass on the worker's log until it ends; `None` if `stop_following` ended this first."""
         followed = self._ask("follow", name=self.host.name)
         return self._status("ended", followed) if followed["ended"] else None
 
     def stop_following(self) -> None:
-        """End a `follow` that is under way. From any thread."""
+        """End a running `follow`. From any thread."""
         if self._connection is not None:
             self._connection.interrupt()
 
     def end(self, *, all_workers: bool, now: bool, keep: bool) -> HostStatus:
-        """End its worker, or all that are there, and remove what belongs to them."""
+        """End its worker, or all workers there, and remove their files."""
         if self._connection is None:
             self._connect(())
         names = None if all_workers else [self.host.name]
@@ -105,7 +105,7 @@ class RemoteHost:
         return HostStatus(self.host.name, "nothing", "no worker runs there")
 
     def close(self) -> None:
-        """End the connection, and with it what lives by its tunnel. From any thread."""
+        """Close the connection, which ends a worker that uses its tunnel. From any thread."""
         self._closed.set()
         if self._connection is not None:
             self._connection.close()
@@ -139,13 +139,13 @@ class RemoteHost:
         pack_for(self.host.spawn.wheelhouse, found).check_fits(found["machine"])
 
     def _environment(self, found: Mapping[str, Any]) -> str | None:
-        """The name of the environment that the worker runs in; `None` where it is installed in its Python."""
+        """The worker's environment; `None` if dreamfleet is installed in the Python that the user named."""
         if self.host.spawn.remote_python and found["installed"]:
             return None
         return pack_for(self.host.spawn.wheelhouse, found).environment(tuple(found["python"]), found["machine"])
 
     def _python(self, found: Mapping[str, Any]) -> str:
-        """The Python that the worker runs in, once it is installed."""
+        """Install the worker if needed; the path of its Python."""
         name = self._environment(found)
         if name is None:
             return str(found["executable"])
@@ -158,7 +158,7 @@ class RemoteHost:
         return str(made["python"])
 
     def _endpoints(self) -> list[str]:
-        """Where the worker connects: what it is told, or the tunnel's ends on its own side."""
+        """The endpoints that the worker connects to: those given, or the remote ends of the tunnel."""
         if not self.forwards:
             return list(self._fleet_address.connect)
         assert self._connection is not None
@@ -171,10 +171,10 @@ class RemoteHost:
     def _on_message(self, kind: str, text: str) -> None:
         (self._on_log_line if kind == "line" else self._on_progress)(text)
 
-    def _status(self, state: str, told: Mapping[str, Any]) -> HostStatus:
-        return HostStatus(self.host.name, state, told["last"], told["slots"] or None, told["age"])
+    def _status(self, state: str, worker: Mapping[str, Any]) -> HostStatus:
+        return HostStatus(self.host.name, state, worker["last"], worker["slots"] or None, worker["age"])
 
 
 def pack_for(wheelhouse: Path | None, found: Mapping[str, Any]) -> Parcel:
-    """What is sent to a host of this system and processor."""
+    """The parcel for the system and processor of a host."""
     return pack(wheelhouse, native=runs_here(found["system"], found["machine"]))

@@ -1,4 +1,4 @@
-"""Workers as other systems start them: the real scripts, a real run, and a drain at the end."""
+"""Workers started by batch systems: the real scripts, a real run, and a drain at the end."""
 
 import os
 import signal
@@ -25,13 +25,13 @@ def coordinator(processes, random_bundle):
 
 @pytest.fixture
 def cluster_environment(processes, monkeypatch):
-    """What a cluster's processes are started with, and our workers by them."""
+    """The environment of a cluster's processes, in which they find our package."""
     monkeypatch.setenv("PYTHONPATH", environment(processes.cache)["PYTHONPATH"])
 
 
 @pytest.fixture
 def start(processes):
-    """A script in this environment; what it says is read with its end."""
+    """A function that starts a script, with environment variables as keywords."""
     with ExitStack() as stack:
 
         def begin(*words, **variables):
@@ -57,7 +57,7 @@ def slots(processes):
 
 
 def drained(begun):
-    """Ask a script to leave, and what it said; its workers must have left by themselves."""
+    """Signal a script to leave and return its output; its workers must have left by themselves."""
     begun.send_signal(signal.SIGTERM)
     said, _ = begun.communicate(timeout=DEADLINE)
     assert begun.returncode == 0, said
@@ -69,16 +69,16 @@ def worker_words(processes):
 
 
 def test_slurm_starts_a_worker_that_drains_before_its_limit(processes, coordinator, start):
-    """As `--signal=B:TERM` does it: the batch shell alone is told."""
-    told = {"SLURM_CPUS_PER_TASK": "2", "SLURM_ARRAY_TASK_ID": "7", "SLURMD_NODENAME": "node3"}
-    begun = start(DEPLOY / "slurm" / "workers.sh", *worker_words(processes), **told)
+    """As with `--signal=B:TERM`, only the batch shell gets the signal."""
+    variables = {"SLURM_CPUS_PER_TASK": "2", "SLURM_ARRAY_TASK_ID": "7", "SLURMD_NODENAME": "node3"}
+    begun = start(DEPLOY / "slurm" / "workers.sh", *worker_words(processes), **variables)
     coordinator.wait_for("generation 1: mean")
     assert slots(processes) == 2
     assert processes.statuses()[0].worker_list[0].worker.startswith("node3-7/")
     drained(begun)
     wait_until(lambda: slots(processes) == 0)
     near = {"SLURM_JOB_END_TIME": str(int(time.time()) + 95)}
-    assert start(DEPLOY / "slurm" / "workers.sh", *worker_words(processes), **told, **near).wait(DEADLINE) == 0
+    assert start(DEPLOY / "slurm" / "workers.sh", *worker_words(processes), **variables, **near).wait(DEADLINE) == 0
 
 
 @pytest.mark.slow

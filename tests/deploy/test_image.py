@@ -33,7 +33,7 @@ pytestmark = [
 
 @dataclass
 class Stage:
-    """One stage: its root, and what it says of the processes in it."""
+    """A stage: its root, and the settings of its processes."""
 
     root: Path
     variables: dict[str, str] = field(default_factory=dict)
@@ -46,7 +46,7 @@ class Stage:
         return Stage(root, dict(self.variables), self.folder, self.user)
 
     def command(self, *words, read_only=False, mounts=(), **variables):
-        """A command line that runs words inside, with nothing of this process's surroundings."""
+        """A command that runs words inside, isolated from this process's environment."""
         root = shlex.quote(str(self.root))
         script = [f"mount --rbind {root} {root}", *([f"mount -o remount,bind,ro {root}"] if read_only else [])]
         script += [f"mount --rbind /dev {root}/dev", f"mount -t proc proc {root}/proc"]
@@ -61,7 +61,7 @@ class Stage:
 
 
 class Build:
-    """Carries out a Containerfile, stage by stage; of each instruction what this project's file uses."""
+    """Executes a Containerfile stage by stage, as far as this project's file needs."""
 
     def __init__(self, base, folder, wheels):
         self._base, self._folder, self._wheels = base, folder, wheels
@@ -77,7 +77,7 @@ class Build:
         return [line for line in re.split(r"(?<!\\)\n", kept) if line.strip()]
 
     def _arg(self, rest):
-        assert rest.startswith("PYTHON=python:3.11-")  # Debian's own is of that version too
+        assert rest.startswith("PYTHON=python:3.11-")  # the version in Debian
 
     def _from(self, rest):
         origin, _, name = rest.split()
@@ -100,7 +100,7 @@ class Build:
         there = self.now.root / (Path(self.now.folder) / target).as_posix().lstrip("/")
         for name in names:
             path = source / name.lstrip("/")
-            if path.is_dir():  # its content, as an image's builder copies it
+            if path.is_dir():  # its content, as image builders do
                 shutil.copytree(path, there, symlinks=True, dirs_exist_ok=True, ignore=None if found else
                                 shutil.ignore_patterns("__pycache__", "*.so"))  # fmt: skip
             else:
@@ -125,7 +125,7 @@ class Build:
         assert (self.now.root / rest.lstrip("/")).is_dir()
 
     def _ignored(self, rest):
-        """What tells engines something and does nothing."""
+        """Ignore instructions that only inform container engines."""
 
     _expose = _cmd = _ignored
 
@@ -184,6 +184,8 @@ def test_two_images_make_a_run_on_a_read_only_root(images, tmp_path):
         finally:
             for process in (one, other):
                 with suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)  # what is inside is another user's and outlives its parent
+                    os.killpg(
+                        process.pid, signal.SIGKILL
+                    )  # processes inside belong to another user and outlive their parent
             other.communicate()
     assert (runs / "night" / "controller.npz").is_file()

@@ -1,4 +1,4 @@
-"""What stands in an image: exact versions with hashes, whole, and those that the tests run with."""
+"""The locks of images: complete, with exact versions and hashes, and equal to the tested versions."""
 
 import json
 import re
@@ -23,7 +23,7 @@ def pins(path):
 
 
 def closure(name, extras=()):
-    """Every distribution that one needs here, with itself: name to the requirements of it."""
+    """A distribution and all that it depends on here: requirements by name."""
     seen, waiting = {}, [(name, frozenset(extras))]
     while waiting:
         name, extras = waiting.pop()
@@ -68,9 +68,9 @@ def test_a_lock_has_the_versions_that_are_tested(name):
 @pytest.mark.timeout(1200)
 def test_the_bill_of_materials_is_the_lock_and_an_audit_says_whether_it_ran():
     subprocess.run(["make", "sbom"], cwd=ROOT, check=True, capture_output=True)
-    told = json.loads((ROOT / "build" / "worker.cdx.json").read_text())
-    assert told["metadata"]["component"]["name"] == "dreamfleet"
-    found = {canonicalize_name(each["name"]): each["version"] for each in told["components"]}
+    document = json.loads((ROOT / "build" / "worker.cdx.json").read_text())
+    assert document["metadata"]["component"]["name"] == "dreamfleet"
+    found = {canonicalize_name(each["name"]): each["version"] for each in document["components"]}
     assert found == pins(DEPLOY / "worker.lock")
     done = subprocess.run(["make", "audit"], cwd=ROOT, check=False, capture_output=True, text=True)
     assert "known vulnerabilities" in done.stdout if "not audited" not in done.stderr else done.returncode == 2

@@ -1,4 +1,4 @@
-"""Nothing that another party could write is unpickled or run: what a loader may execute stands in no module of ours.
+"""No module uses a loader that could execute the files of another party.
 
 `multiprocessing` pickles what passes between a process and the children that it started itself; nobody else reaches
 those pipes. A task's or an optimiser's module is code that was installed here, or named on this host's command line.
@@ -14,12 +14,12 @@ FOLDERS = ("common", "coordinator", "worker", "deploy", "dreamfleet")
 MODULES = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "shelve", "marshal", "joblib"}
 CALLS = {"eval", "exec", "yaml.load", "yaml.full_load", "yaml.unsafe_load", "torch.jit.load", "pandas.read_pickle"}
 SAFE = {"torch.load": ("weights_only", True), "numpy.load": ("allow_pickle", False), "np.load": ("allow_pickle", False)}
-DEFAULTS = {"numpy.load", "np.load"}  # safe where nothing is said
-EXCEPTIONS: dict[str, str] = {}  # a module's path, and why what it loads is nobody else's
+DEFAULTS = {"numpy.load", "np.load"}  # safe by default
+EXCEPTIONS: dict[str, str] = {}  # a module's path, and why its files are our own
 
 
 def unsafe(source):
-    """What in this source could run what it reads: (line, name)."""
+    """Calls in a source that could execute their input: (line, name)."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             names = [each.name for each in node.names]

@@ -1,4 +1,4 @@
-"""Recipes under the tools that read them: linters, schemas, systemd, and our own command line."""
+"""Deployment recipes, checked by linters, schemas, systemd and our own command line."""
 
 import dataclasses
 import os
@@ -27,11 +27,11 @@ DEPLOY = ROOT / "deploy"
 BIN = Path(sys.executable).parent
 KUBERNETES = "1.31"
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
-EXPOSURE = 2.0  # of ten: what systemd-analyze calls OK ends at 5
+EXPOSURE = 2.0  # of 10; systemd-analyze rates up to 5 as OK
 
 
 def checked(*words, **more):
-    """What a tool says; it must be content."""
+    """Run a tool, which must succeed; return its output."""
     done = subprocess.run([str(each) for each in words], capture_output=True, text=True, check=False, **more)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout + done.stderr
@@ -42,7 +42,7 @@ def documents(path):
 
 
 def understood(verb, words):
-    """Whether the verb knows these words; an unknown one exits."""
+    """Parse the words as the verb does; it exits for an unknown one."""
     (point,) = (each for each in entry_points(group=command_line.GROUP) if each.name == verb)
     command_line.build_parser(verb, point.load()).parse_all([str(each) for each in words])
 
@@ -54,8 +54,8 @@ def test_the_linters_are_content():
 
 
 def test_compose_starts_what_our_verbs_know():
-    (told,) = documents(DEPLOY / "compose.yaml")
-    services = told["services"]
+    (compose,) = documents(DEPLOY / "compose.yaml")
+    services = compose["services"]
     understood("coordinator", ["--run", *services["coordinator"]["command"]])
     understood("worker", services["worker"]["command"])
     stages = set(re.findall(r"^FROM \S+ AS (\S+)", (DEPLOY / "Containerfile").read_text(), re.MULTILINE))
@@ -63,7 +63,7 @@ def test_compose_starts_what_our_verbs_know():
         assert service["build"]["target"] in stages
         assert service["read_only"]
         assert service["environment"]["DREAMFLEET_JOIN"] == f"/run/secrets/{service['secrets'][0]}"
-        assert service["secrets"][0] in told["secrets"]
+        assert service["secrets"][0] in compose["secrets"]
 
 
 def test_the_cluster_takes_what_the_kustomization_lists():
@@ -100,9 +100,9 @@ def test_workers_are_scaled_by_metrics_that_are_there():
     query = scaled["spec"]["triggers"][0]["metadata"]["query"]
     promql_parser.parse(query)
     names = set(re.findall(r"dreamfleet_[a-z_]+", query))
-    told = exposition(dataclasses.replace(STATUS, run="night"))
+    text = exposition(dataclasses.replace(STATUS, run="night"))
     assert names
-    assert all(f'{name}{{run="night"}}' in told for name in names)
+    assert all(f'{name}{{run="night"}}' in text for name in names)
 
 
 @pytest.mark.needs_programs("systemd-analyze")
@@ -121,20 +121,20 @@ def test_systemd_takes_the_units_and_finds_them_shut(unit, tmp_path):
 
 
 def test_the_spot_machine_runs_the_unit():
-    (told,) = documents(DEPLOY / "cloud-init" / "worker.yaml")
-    written = {each["path"]: each for each in told["write_files"]}
+    (document,) = documents(DEPLOY / "cloud-init" / "worker.yaml")
+    written = {each["path"]: each for each in document["write_files"]}
     unit = written["/etc/systemd/system/dreamfleet-worker.service"]["content"]
     own = (DEPLOY / "systemd" / "dreamfleet-worker.service").read_text()
     assert unit == own[own.index("[Unit]") :]
     assert written["/etc/dreamfleet/worker.join"]["permissions"] == "0600"
-    for words in told["runcmd"]:
+    for words in document["runcmd"]:
         if words[0].endswith("/dreamfleet"):
             understood(words[1], words[2:])
 
 
 @pytest.mark.long
 def test_cloud_init_takes_the_user_data(tmp_path):
-    """By cloud-init's own schema: that of an installed one, else of Debian's package."""
+    """Checked with cloud-init's schema, installed or from Debian's package."""
     schema = "usr/lib/python3/dist-packages/cloudinit/config/schemas/schema-cloud-config-v1.json"
     where = Path("/", schema)
     if not where.exists():
@@ -148,7 +148,7 @@ def test_cloud_init_takes_the_user_data(tmp_path):
 
 
 def test_one_command_begins_a_run_and_goes_on_with_it(processes, random_bundle):
-    """As a container or a unit is started again after every stop."""
+    """Restarted after every stop, as a container or unit is."""
     settings = ("--bundle", random_bundle.path, "--task", tasks.TOY, "--population", 4, "--episodes", 1,
                 "--evaluate-every", 0, "--generations", 3, "--listen", processes.endpoint)  # fmt: skip
     surroundings = environment(processes.cache) | {

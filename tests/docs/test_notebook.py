@@ -1,4 +1,4 @@
-"""The notebook is executed whole, as a reader would."""
+"""Execute the whole notebook."""
 
 import os
 import socket
@@ -12,7 +12,7 @@ from tests.support.processes import DEADLINE, ROOT
 
 
 def port_of_nobody():
-    """A free port below those that the system hands out: the notebook's own kernel takes some of them meanwhile."""
+    """A free port below the ephemeral ones, which the notebook's kernel uses."""
     for port in range(20_000 + os.getpid() % 5000, 32_000):
         with socket.socket() as probe, suppress(OSError):
             probe.bind(("127.0.0.1", port))

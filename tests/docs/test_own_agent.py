@@ -1,4 +1,4 @@
-"""The script that trains an agent of one's own in the dream runs to its end, and holds a choice as it says."""
+"""The example script that trains an agent in the dream runs to its end and holds choices."""
 
 import os
 import re

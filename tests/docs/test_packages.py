@@ -1,4 +1,4 @@
-"""Programs that tests need: one list, from which README's line and CI's installation are."""
+"""README and CI install the programs of one list."""
 
 import pytest
 

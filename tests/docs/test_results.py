@@ -1,4 +1,4 @@
-"""What is recorded of the shipped controllers is of these controllers, and what the page says is what was recorded."""
+"""Recorded results belong to the shipped controllers, and the page repeats them."""
 
 import subprocess
 
@@ -13,7 +13,7 @@ RECORDS = sorted((ROOT / "docs" / "results").glob("*.json"))
 
 
 @pytest.mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
-def test_a_record_is_of_a_controller_that_ships_and_the_page_tells_it(path, tmp_path):
+def test_a_record_is_of_a_shipped_controller_and_the_page_has_its_figures(path, tmp_path):
     found = read_evaluation_report(path)
     controller, _ = find_controller(found.name, tmp_path)
     assert (found.name, found.controller) == (path.stem, controller.sha256)
@@ -31,7 +31,7 @@ def test_a_record_is_of_a_controller_that_ships_and_the_page_tells_it(path, tmp_
         (("reproduce-evolution", "REPRODUCE=real"), "reproduce_evolution.py real"),
     ],
 )
-def test_make_names_what_is_had_again(words, said):
+def test_make_names_the_run_to_reproduce(words, said):
     done = subprocess.run(
         ["make", "--dry-run", *words], cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE, check=True
     )

@@ -1,4 +1,4 @@
-"""The commands with which docs/security.md begins let a worker in, as they stand there."""
+"""The first commands of docs/security.md work as written."""
 
 import shlex
 import sys
@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.processes import ROOT, free_port
 
-HOST = "127.0.0.2"  # which no certificate names by itself
+HOST = "127.0.0.2"  # in no certificate by default
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have one loopback address")

@@ -1,4 +1,4 @@
-"""A fleet with join files: an authority, and a coordinator and workers that have one."""
+"""A fleet with join files: an authority, a coordinator and workers."""
 
 import time
 

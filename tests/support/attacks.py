@@ -1,7 +1,7 @@
-"""Somebody who wants to harm a run named `test`: what they do, again and again, for as long as it is there.
+"""An attacker of a run named `test`, whose attacks repeat for as long as the run lasts.
 
-They know all that can be known: names, lives, nonces, batches and fingerprints, as an open port tells everybody. At a
-secured one a session that may hear everything tells it to them, so that nothing is refused for want of knowledge.
+It knows all names, lives, nonces, batches and fingerprints, which an open port shows to everybody. At a secured port it
+gets them from a session with the right to hear everything, so that no attack fails for lack of knowledge.
 """
 
 import json
@@ -33,12 +33,12 @@ RUN, GENERATIONS, POPULATION = "test", 4, 4
 FORGED = ("f", "a guess")  # fingerprints
 SETTINGS = ("--task", tasks.SLOW_TOY, "--population", POPULATION, "--episodes", 1, "--evaluate-every", 0,
             "--generations", GENERATIONS, "--seed", 5)  # fmt: skip
-CLAIMED = (keys.live_coordinator(RUN, "f" * 16), keys.live_worker(RUN, "own.1/0badc0de"))  # tokens of who is not there
-ASKED = 5  # seconds that a question stays open: nobody waits for it
+CLAIMED = (keys.live_coordinator(RUN, "f" * 16), keys.live_worker(RUN, "own.1/0badc0de"))  # liveliness tokens of nobody
+ASKED = 5  # seconds that a query stays open; nothing waits for it
 
 
 class Guest:
-    """A worker that the attacker has the run welcome; with a `capacity` it is given jobs, which it never does."""
+    """A worker that the attacker lets join; with a `capacity` it gets jobs, which it never runs."""
 
     def __init__(self, identity, capacity):
         self.identity, self.capacity = identity, capacity
@@ -53,41 +53,44 @@ class Guest:
 
 
 class Attacker:
-    """A raw `session`, and `ears`: one that hears everything; what it tells is of the schema, as the sources have it.
+    """Sends valid messages through a raw `session`, and overhears everything through the session `ears`.
 
-    `seat` is that of its join file, in which its guests' names end.
+    `seat` is the seat of its join file; the names of its guests end in it.
     """
 
     def __init__(self, session, ears, seat=None):
         self.session, self.seat = session, seat
-        self.jobs = {}  # that were given to anybody, by digest
-        self.head = None  # of the last batch that it overheard
-        self.worker = None  # whom that was for
+        self.jobs = {}  # of all workers, by digest
+        self.head = None  # the last overheard batch
+        self.worker = None  # the recipient of that batch
         self.fingerprint = None
-        self.dropped = {}  # as the coordinator told it when it left
-        self.steered = []  # by its words
-        self.overheard, self.asked = [], []  # keys that its own session heard, or was asked at
-        self.seen = set()  # tokens
+        self.dropped = {}  # from the coordinator's last status
+        self.steered = []  # keys of accepted control requests
+        self.overheard, self.asked = [], []  # keys of samples and queries that reached its own session
+        self.seen = set()  # liveliness tokens
         end = "" if seat is None else f".{seat}"
-        self.teller, self.holder = Guest(f"teller{end}/0badc0de", 0), Guest(f"holder{end}/0badc0de", 1)
+        self.reporter, self.holder = Guest(f"reporter{end}/0badc0de", 0), Guest(f"holder{end}/0badc0de", 1)
         self._held = [
             ears.declare_subscriber(keys.all_workers("job", RUN), direct(self._overhear_batch)),
             ears.declare_subscriber(keys.all_workers("result", RUN), direct(self._overhear_results)),
             ears.declare_subscriber(keys.event_status(RUN), direct(self._overhear_farewell)),
             ears.liveliness().declare_subscriber(
-                f"{keys.ROOT}/**", direct(lambda told: self.seen.add(str(told.key_expr)))
+                f"{keys.ROOT}/**", direct(lambda token: self.seen.add(str(token.key_expr)))
             ),
         ]
 
     def pose(self, session):
-        """Stand where a coordinator stands, and listen to what is not for it; in a session that says nothing itself."""
+        """Pose as a coordinator and subscribe to all messages, in a session that sends none."""
         whole = f"{keys.ROOT}/**"
         answered = (keys.hello(RUN), f"{keys.hello(RUN)}/**", keys.status(RUN), f"{keys.status(RUN)}/**",
                     keys.bundle(RUN, "*"), keys.claim(RUN, "*"), keys.control(RUN, "*"))  # fmt: skip
-        told = direct(lambda heard: self.overheard.append(str(heard.key_expr)))
+        record = direct(lambda heard: self.overheard.append(str(heard.key_expr)))
         kinds = ("job", "result", "beat", "upload")
-        self._held += [session.declare_subscriber(keys.all_workers(kind, RUN), told) for kind in kinds]
-        self._held += [session.declare_subscriber(whole, told), session.liveliness().declare_subscriber(whole, told)]
+        self._held += [session.declare_subscriber(keys.all_workers(kind, RUN), record) for kind in kinds]
+        self._held += [
+            session.declare_subscriber(whole, record),
+            session.liveliness().declare_subscriber(whole, record),
+        ]
         self._held += [self.session.liveliness().declare_token(key) for key in CLAIMED]
         self._held += [session.declare_queryable(key, direct(self._answer)) for key in answered]
 
@@ -98,7 +101,7 @@ class Attacker:
 
     def _overhear_batch(self, sample):
         batch, worker = decode(JobBatch, sample.payload.to_bytes()), keys.worker_from_key(str(sample.key_expr))
-        for guest in (self.teller, self.holder):
+        for guest in (self.reporter, self.holder):
             if worker == guest.identity:
                 guest.take(batch)
         if worker.startswith("own") and batch.nonce != "forged":
@@ -113,14 +116,14 @@ class Attacker:
         self.dropped = json.loads(sample.payload.to_bytes())["dropped"]
 
     def hello(self, worker):
-        """Greet as this worker."""
+        """Send hello as this worker."""
         request = replace(JSON["hello-request"], worker=worker, fingerprint=self.fingerprint or FORGED[0], slots=1,
                           tasks=(tasks.SLOW_TOY,), protocol_min=2, protocol_max=2)  # fmt: skip
         where = keys.hello(RUN) if self.seat is None else keys.secured_hello(RUN, worker)
         self.session.get(where, lambda _: None, payload=encode_json(request), timeout=ASKED)
 
     def steer(self, where):
-        """Ask for this; what accepts it is remembered."""
+        """Send a control request; remember it if it is accepted."""
 
         def answered(reply):
             if reply.ok is not None and b'"accepted"' in (said := reply.ok.payload.to_bytes()):
@@ -129,7 +132,7 @@ class Attacker:
         self.session.get(where, answered, timeout=ASKED)
 
     def join(self, guest, steps):
-        """Have a guest welcomed; it tells that it runs all that it was given, and has made so many steps."""
+        """Let a guest join; its beat claims to run all jobs that it got, at so many steps."""
         if self.fingerprint is None or self.head is None:
             return
         self.hello(guest.identity)
@@ -141,14 +144,14 @@ class Attacker:
         )  # fmt: skip
         self.session.put(keys.beat(RUN, guest.identity), encode(beat))
 
-    def tell(self, worker, *results, fingerprint=None):
+    def report(self, worker, *results, fingerprint=None):
         if self.head is not None:
             batch = ResultBatch(run_uid=self.head.run_uid, incarnation=self.head.incarnation, results=results,
                                 fingerprint=fingerprint or self.fingerprint or FORGED[0])  # fmt: skip
             self.session.put(keys.result(RUN, worker), encode(batch))
 
     def forge(self, **changes):
-        """A batch to the worker that it overheard."""
+        """Send a forged batch to the overheard worker."""
         if self.head is not None:
             batch = replace(self.head, **{"vectors": (), "jobs": (), "cancels": (), "verdicts": (), **changes})
             self.session.put(keys.job(RUN, self.worker), encode(batch))
@@ -166,32 +169,32 @@ def fail(digest):
     return Result(digest, None, 0, 0.1, "forged", None)
 
 
-def tells_results_of_everybodys_jobs(evil, _round):
+def reports_results_of_all_jobs(evil, _round):
     for worker in ("stranger/00000001", "another/00000002"):
-        evil.tell(worker, *map(lie, list(evil.jobs)[-32:]))
+        evil.report(worker, *map(lie, list(evil.jobs)[-32:]))
 
 
-def tells_failures_of_everybodys_jobs(evil, _round):
+def reports_failures_of_all_jobs(evil, _round):
     for worker in ("stranger/00000001", "another/00000002"):
-        evil.tell(worker, *map(fail, list(evil.jobs)[-32:]))
+        evil.report(worker, *map(fail, list(evil.jobs)[-32:]))
 
 
-def tells_in_a_workers_name_what_is_not_of_its_host(evil, _round):
+def reports_a_foreign_fingerprint_as_a_worker(evil, _round):
     if evil.worker is not None:
-        evil.tell(evil.worker, *map(lie, list(evil.jobs)[-32:]), fingerprint=FORGED[1])
+        evil.report(evil.worker, *map(lie, list(evil.jobs)[-32:]), fingerprint=FORGED[1])
 
 
-def joins_and_tells_what_others_were_given(evil, _round):
-    evil.join(evil.teller, 0)
+def joins_and_reports_others_jobs(evil, _round):
+    evil.join(evil.reporter, 0)
     others = list(evil.jobs)[-16:]
-    evil.tell(evil.teller.identity, *map(lie, others), *map(fail, others))
+    evil.report(evil.reporter.identity, *map(lie, others), *map(fail, others))
 
 
 def joins_and_holds_its_jobs_by_growing_steps(evil, number):
     evil.join(evil.holder, 10**12 + number)
 
 
-def greets_as_the_worker_that_works(evil, _round):
+def greets_as_the_working_worker(evil, _round):
     if evil.worker is not None:
         evil.hello(evil.worker)
 
@@ -208,7 +211,7 @@ def sends_a_worker_batches_that_nobody_counted(evil, number):
         evil.forge(number=2**40 + number)
         evil.forge(nonce="forged", number=number + 1)
         evil.forge(incarnation=99)
-        if number < 2:  # numbers used up: of each numbering once, for who does nothing else keeps a worker idle
+        if number < 2:  # uses up numbers; once in each numbering, since more would keep a worker idle
             evil.forge(number=evil.head.number + 1)
 
 
@@ -220,16 +223,16 @@ def fills_a_workers_memory(evil, number):
             evil.forge(number=2**41 + 100 * number + each, vectors=(rubbish,))
 
 
-# What nothing but certificates holds off.
+# Attacks that only certificates prevent.
 
 
-def tells_as_the_worker_that_works(evil, _round):
+def reports_as_the_working_worker(evil, _round):
     if evil.worker is not None:
         others = list(evil.jobs)[-16:]
-        evil.tell(evil.worker, *map(lie, others), *map(fail, others))
+        evil.report(evil.worker, *map(lie, others), *map(fail, others))
 
 
-def beats_as_the_worker_that_works(evil, _round):
+def beats_as_the_working_worker(evil, _round):
     if evil.worker is not None:
         guest = Guest(evil.worker, 1)
         evil.join(guest, 10**12)
@@ -253,29 +256,29 @@ def steers_by_name(evil, _round):
 
 
 OPEN = [
-    tells_results_of_everybodys_jobs, tells_failures_of_everybodys_jobs,
-    tells_in_a_workers_name_what_is_not_of_its_host, joins_and_tells_what_others_were_given,
-    joins_and_holds_its_jobs_by_growing_steps, greets_as_the_worker_that_works, steers_by_wildcards,
+    reports_results_of_all_jobs, reports_failures_of_all_jobs,
+    reports_a_foreign_fingerprint_as_a_worker, joins_and_reports_others_jobs,
+    joins_and_holds_its_jobs_by_growing_steps, greets_as_the_working_worker, steers_by_wildcards,
     sends_a_worker_batches_that_nobody_counted, fills_a_workers_memory,
 ]  # fmt: skip
-SECURED = [*OPEN, tells_as_the_worker_that_works, beats_as_the_worker_that_works, sends_a_worker_home,
+SECURED = [*OPEN, reports_as_the_working_worker, beats_as_the_working_worker, sends_a_worker_home,
            says_that_the_run_is_over]  # fmt: skip
 
 
 def outcome(processes):
-    """Every fitness of every candidate, the reported controller, and who scored."""
+    """Every fitness of every candidate, the reported controller, and the names of scoring workers."""
     with open_run(processes.runs, RUN) as run:
         fitness = [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
-        told = {each.worker.partition("/")[0].partition(".")[0] for g in range(GENERATIONS) for i in range(POPULATION)
-                for each in run.results(g, i)}  # fmt: skip
-        return fitness, np.load(run.controller_path)["parameters"].tobytes(), told
+        results = [each for g in range(GENERATIONS) for i in range(POPULATION) for each in run.results(g, i)]
+        scorers = {each.worker.partition("/")[0].partition(".")[0] for each in results}
+        return fitness, np.load(run.controller_path)["parameters"].tobytes(), scorers
 
 
 @contextmanager
 def attacking(network, *actions, ears=None):
-    """While this is on, each of these is done again and again, for as long as the run is there.
+    """Repeat these attacks within the context, for as long as the run lasts.
 
-    With `ears`, a network whose session may hear everything, the attacker is one with a join file, and poses too.
+    With `ears`, a network that may subscribe to everything, the attacker has a join file and also poses.
     """
     over, failed = threading.Event(), []
     with ExitStack() as stack:

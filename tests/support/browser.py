@@ -1,4 +1,4 @@
-"""A real browser, where there is one: Debian's Chromium without a screen."""
+"""A real headless browser: Debian's Chromium."""
 
 from contextlib import contextmanager
 
@@ -12,7 +12,7 @@ PATIENCE = 1000 * DEADLINE  # milliseconds
 
 @contextmanager
 def chromium():
-    """One browser; the test is skipped without one."""
+    """A browser; the test is skipped without one."""
     require_programs("chromium")
     with sync_playwright() as started:
         browser = started.chromium.launch(executable_path=find_program("chromium"), args=["--no-sandbox"])
@@ -22,7 +22,7 @@ def chromium():
 
 @contextmanager
 def tab(browser, **options):
-    """A page in which nothing may go wrong unseen: what its console says fails the test."""
+    """A page whose console messages fail the test."""
     context = browser.new_context(**{"viewport": {"width": 1280, "height": 900}, **options})
     context.set_default_timeout(PATIENCE)
     page, said = context.new_page(), []

@@ -1,4 +1,4 @@
-"""World models with random weights: everything but knowledge."""
+"""World models with random weights."""
 
 import io
 
@@ -17,7 +17,7 @@ def random_models(seed=0, vae=PAPER, rnn=REWARDED):
     torch.manual_seed(seed)
     models = VAE(vae), MDNRNN(rnn)
     for name, values in models[0].state_dict().items():
-        if "running" in name:  # as if it had been trained
+        if "running" in name:  # as after training
             values.uniform_(0.5, 1.5)
     return models[0].eval(), models[1].eval()
 
@@ -33,7 +33,7 @@ def weights(model):
 
 
 def states(count, vae=PAPER, rnn=REWARDED, seed=0):
-    """So many made-up moments of drives, as a bundle holds them."""
+    """So many made-up recorded states, as a bundle holds them."""
     return np.random.default_rng(seed).uniform(-1, 1, (count, 2 * vae.latent + rnn.state)).astype(np.float16)
 
 

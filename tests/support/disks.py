@@ -1,4 +1,4 @@
-"""Small disks of their own, which a test can fill: where this process may mount one."""
+"""Small disks that a test can fill, if this process may mount them."""
 
 import os
 import subprocess
@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 
 class SmallDisk:
-    """So many megabytes at `path`."""
+    """A disk of so many megabytes at `path`."""
 
     def __init__(self, path, megabytes):
         self.path = path
@@ -19,7 +19,7 @@ class SmallDisk:
         return self._ballast.exists()
 
     def fill(self):
-        """Leave no byte."""
+        """Use every byte."""
         with self._ballast.open("wb") as file:
             for step in (1 << 24, 1 << 16, 1 << 12):
                 try:
@@ -29,7 +29,7 @@ class SmallDisk:
                     continue
 
     def free(self):
-        """Give back what `fill` took."""
+        """Free the bytes that `fill` used."""
         self._ballast.unlink(missing_ok=True)
 
     def remove(self):
@@ -38,7 +38,7 @@ class SmallDisk:
 
 @contextmanager
 def small_disk(path, megabytes):
-    """A disk, or `None` where this process may not mount one."""
+    """A disk, or `None` if this process may not mount one."""
     try:
         disk = SmallDisk(path, megabytes)
     except (OSError, subprocess.CalledProcessError):

@@ -1,10 +1,10 @@
-"""What stands in TensorBoard's event files."""
+"""Read TensorBoard's event files."""
 
 from tensorboardX.proto.event_pb2 import Event
 
 
 def scalars(folder):
-    """By the name of each scalar its steps and values, over all event files in a folder, in their order."""
+    """Steps and values of each scalar, by name, from all event files in a folder."""
     found = {}
     for path in sorted(folder.glob("events.out.tfevents.*")):
         for record in _records(path.read_bytes()):
@@ -16,7 +16,7 @@ def scalars(folder):
 
 
 def _records(data):
-    """Of TensorFlow's record format: a length, its checksum, the bytes, their checksum."""
+    """The records of TensorFlow's format: a length, its checksum, the bytes, their checksum."""
     while data:
         size = int.from_bytes(data[:8], "little")
         yield data[12 : 12 + size]

@@ -1,4 +1,4 @@
-"""A fleet without processes, clock or network: the real `Fleet`, and hosts that take as long as a test says."""
+"""A simulated fleet: the real `Fleet`, and hosts with simulated time and network."""
 
 import heapq
 from dataclasses import dataclass, field
@@ -13,33 +13,33 @@ from tests.support.samples import HEAD, SPEC
 
 TICK = 0.05
 JOB_BYTES = 300
-SILENT_BEATS = 5  # after which an idle worker says hello again
+SILENT_BEATS = 5  # after which an idle worker sends hello again
 
 
 @dataclass
 class Host:
-    """One worker with one slot; `turn` seconds for a turn, and `row` for each of its jobs."""
+    """A worker with one slot; a turn takes `turn` seconds, and `row` more for each job."""
 
     name: str
     width: int = 1
     turn: float = 0.0
     row: float = 0.05
     delay: float = 0.0005  # seconds each way
-    bandwidth: float = 1e8  # bytes a second, towards it
-    lives: float = 0.0  # seconds until it is killed, and started again a second later; 0: for good
+    bandwidth: float = 1e8  # bytes a second, to the host
+    lives: float = 0.0  # seconds until it is killed and, a second later, restarted; 0: never
     identity: str = ""
     seen: set[int] = field(default_factory=set)
     queued: dict[bytes, None] = field(default_factory=dict)
     running: list[bytes] = field(default_factory=list)
     unacked: dict[bytes, None] = field(default_factory=dict)
     heard: float = 0.0
-    busy_until: float = 0.0  # its link
+    busy_until: float = 0.0  # its network link
     joins: int = 0
-    until: float = 0.0  # its turn ends
+    until: float = 0.0  # the end of its turn
 
 
 class Played:
-    """A run of so many generations; `seconds` says how long each took."""
+    """A simulated run; `seconds` lists how long each generation took."""
 
     def __init__(self, *hosts, population=16, episodes=4, size=64, beat=1.0):
         self.fleet = Fleet(beat)
@@ -53,7 +53,7 @@ class Played:
             self._at(0.0, self._start, host)
 
     def play(self, generations, within=10_000.0):
-        """Until so many generations are closed; the seconds of each."""
+        """Run until so many generations are closed; return the seconds of each."""
         self._at(self.now, self._tick)
         while len(self.seconds) < generations:
             self.now, _, action, arguments = heapq.heappop(self._events)
@@ -182,7 +182,7 @@ class Played:
         self._at(self.now + self._beat, self._beat_of, host, identity)
 
     def _steps(self, host):
-        """Of the ten that an episode has."""
+        """Steps made of the episode's ten."""
         left = host.until - self.now
         return max(0, int(10 * (1 - left / (host.turn + host.row * len(host.running)))))
 

@@ -1,4 +1,4 @@
-"""A coordinator driven by hand: a real router, the real codec, and no rule but the test's."""
+"""A coordinator that a test drives by hand, with a real router and codec."""
 
 import hashlib
 import json
@@ -34,27 +34,27 @@ WHOLE = VectorPart(id=samples.VECTOR_ID, dtype="<f4", shape=(16,), offset=0, dat
 
 
 class Hand:
-    """Answers hello and bundle queries; everything that a worker says is in one queue, in order."""
+    """Answers hello and bundle queries, and queues all messages of workers in order."""
 
     def __init__(self, port, bundle, task, run="test", beside=None):
         self.run = run
         self.spec = TaskSpec(task=task, bundle=bundle.sha256, horizon=100, patience=0)
         self.nonce, self.incarnation, self.run_uid = FIRST, 1, samples.UID
-        self.numbering = 0  # of its batches; each welcome begins one
+        self.numbering = 0  # of its batches; each accepted hello begins one
         self.intervals = Intervals(beat=0.1, repeat=0.1)
         self.refusal = None
-        self.packages = NUMERIC_PACKAGES  # that its run's fingerprint names
-        self.classes = True  # whether it knows classes of hosts
+        self.packages = NUMERIC_PACKAGES  # in the run's fingerprint
+        self.classes = True  # whether it supports host classes
         self.worker = None
-        self.slots = 0  # that its status shows
-        self.offsets = queue.SimpleQueue()  # of the bundle's parts that were asked for
-        self.damage = lambda offset, data: data  # what becomes of a bundle's part; `None`: no answer
+        self.slots = 0  # in its status
+        self.offsets = queue.SimpleQueue()  # of the requested parts of the bundle
+        self.damage = lambda offset, data: data  # changes a part of the bundle; `None`: no answer
         self._held = []
         self._bundle = bundle.path.read_bytes()
-        self.total = lambda: len(self._bundle)  # as it says
+        self.total = lambda: len(self._bundle)  # the announced size
         self._said = queue.SimpleQueue()
         self.endpoint = f"tcp/127.0.0.1:{port}"
-        self._shares = beside is not None  # the router of another
+        self._shares = beside is not None  # another coordinator's router
         self.session = beside.session if self._shares else open_session(Network(listen=(self.endpoint,)))
         declare, answer = self.session.declare_subscriber, self.session.declare_queryable
         self._declared = [
@@ -81,7 +81,7 @@ class Hand:
             self.session.close()
 
     def next(self, kind, accept=lambda _: True):
-        """The next message of this kind that is as wanted; what came before it is gone."""
+        """The next matching message of this kind; earlier messages are dropped."""
         while True:
             message = self._said.get(timeout=DEADLINE)
             if isinstance(message, kind) and accept(message):
@@ -109,14 +109,14 @@ class Hand:
         return next(each for each in batch.results if each.error)
 
     def results(self, *of):
-        """Wait until each of these jobs has come; digests of all results that came meanwhile."""
+        """Wait for the results of these jobs; digests of all results received."""
         missing, came = {job.digest for job in of}, set()
         while missing - came:
             came |= _digests(self.next(ResultBatch))
         return came
 
     def upload(self, of):
-        """Wait until every part of this job's file has come; its bytes."""
+        """Wait for all parts of this job's file; return its bytes."""
         parts, total = {}, 1
         while sum(map(len, parts.values())) < total:
             part = self.next(UploadPart, lambda part: part.digest == of.digest)

@@ -12,11 +12,11 @@ import pytest
 
 from tests.support.programs import find_program, require_programs
 
-CABLES = list(ip_network("198.18.0.0/16").subnets(new_prefix=30))  # RFC 2544: what networks are tried out with
+CABLES = list(ip_network("198.18.0.0/16").subnets(new_prefix=30))  # RFC 2544: reserved for network tests
 
 
 class Host:
-    """A namespace; `address` is this end of its cable, which it reaches us by, `own` is its own end."""
+    """A namespace; `address` is our end of its cable, `own` is its end."""
 
     def __init__(self, name, cable):
         self.name = name
@@ -32,19 +32,19 @@ class Host:
             _ip("-n", name, "link", "set", device, "up")
 
     def unplug(self):
-        """Whatever is sent from now on is lost, and nobody is told."""
+        """Drop all packets from now on, without an error to either side."""
         _ip("link", "set", self._near, "down")
 
     def plug(self):
         _ip("link", "set", self._near, "up")
 
     def remove(self):
-        _ip("netns", "del", self.name)  # its end of the cable goes with it, and so does ours
+        _ip("netns", "del", self.name)  # which removes both ends of the cable
 
 
 @contextmanager
 def new_host():
-    """A host, or `None` where this process may not make one."""
+    """A host, or `None` if this process may not make one."""
     name = f"df{secrets.token_hex(4)}"
     if find_program("ip") is None:
         yield None
@@ -62,7 +62,7 @@ def new_host():
 
 
 def require_hosts(*hosts):
-    """Skip the test unless all were made."""
+    """Skip the test unless all hosts could be made."""
     if None in hosts:
         if os.geteuid() == 0:
             require_programs("ip")
@@ -70,9 +70,9 @@ def require_hosts(*hosts):
 
 
 def _free_cable():
-    """None that another run of the tests has, or one that was killed left behind."""
-    told = json.loads(_ip("-json", "-4", "addr", "show"))
-    taken = {ip_interface(f"{a['local']}/30").network for device in told for a in device.get("addr_info", ())}
+    """A subnet that no other test run uses or left behind when it was killed."""
+    devices = json.loads(_ip("-json", "-4", "addr", "show"))
+    taken = {ip_interface(f"{a['local']}/30").network for device in devices for a in device.get("addr_info", ())}
     return random.SystemRandom().choice([cable for cable in CABLES if cable not in taken])
 
 

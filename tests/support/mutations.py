@@ -1,4 +1,4 @@
-"""Messages and files that something went wrong with."""
+"""Damaged messages and files."""
 
 import hashlib
 import io
@@ -32,14 +32,14 @@ MOST_SECONDS, MOST_KILOBYTES = 10, 300_000
 
 
 def mutations(count, seed):
-    """`count` damaged messages, or such as are made of two."""
+    """`count` damaged messages, some spliced from two."""
     source = random.Random(seed)
     for _ in range(count):
         yield mutate(source, source.choice(WHOLE), WHOLE)
 
 
 def mutate(source, whole, others):
-    """Damage: bits flipped, pieces cut out, doubled, swapped, or taken from another one."""
+    """Damage: bits flipped; pieces removed, repeated, swapped, or taken from another message."""
     payload = bytearray(whole)
     for _ in range(source.randint(1, 4)):
         start, end = sorted(source.randrange(len(payload) + 1) for _ in range(2))
@@ -60,7 +60,7 @@ def mutate(source, whole, others):
 
 
 def reworded(source, whole):
-    """A text with some of its words replaced by numbers, lists and texts that nobody expects."""
+    """A text with some words replaced by unexpected numbers, lists and texts."""
     text = bytearray(whole)
     for _ in range(source.randint(1, 2)):
         places = [place for place, byte in enumerate(text) if byte in b":=,[ "]
@@ -75,7 +75,7 @@ def reworded(source, whole):
 
 
 def archives(whole, count, seed):
-    """`count` damaged archives: their own bytes, or a member's, packed again so that only its reader can tell.
+    """`count` damaged archives: in their own bytes, or in a member, packed again with valid checksums.
 
     Where there is a manifest, it gives each member the hash that it has by then.
     """
@@ -93,13 +93,13 @@ def archives(whole, count, seed):
 
 
 def mutate_tail(source, whole):
-    """Damage to the archive's directory, which says what there is."""
+    """Damage to the archive's directory."""
     cut = max(0, len(whole) - 2000)
     return whole[:cut] + mutate(source, whole[cut:], [whole])
 
 
 def _within(source, members, words):
-    """The members, one of them damaged near its beginning, where headers are."""
+    """The members, one of them damaged near its start, where headers are."""
     changed = dict(members)
     name = source.choice([*members])
     data = members[name]
@@ -113,7 +113,7 @@ def _within(source, members, words):
 
 
 def packed(members, kind=zipfile.ZIP_STORED):
-    """Members as an archive."""
+    """Pack members as an archive."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", kind) as archive:
         for name, data in members.items():
@@ -122,14 +122,14 @@ def packed(members, kind=zipfile.ZIP_STORED):
 
 
 class Watched:
-    """What a reader may cost: no read is long, and all together hold little memory."""
+    """Measures reads, which must be fast and use little memory."""
 
     def __init__(self):
         self._before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         self._slowest, self._said = 0.0, set()
 
     def read(self, error, reader, *given):
-        """Whether it could be read; whatever is raised but `error`, which is one line, ends the test."""
+        """Whether the read succeeded. Only `error`, with a one-line text, may be raised."""
         began = process_time()
         try:
             reader(*given)
@@ -142,7 +142,7 @@ class Watched:
             self._slowest = max(self._slowest, process_time() - began)
 
     def check(self):
-        """The cost of them all."""
+        """Check the cost of all reads."""
         assert not [text for text in self._said if not text or "\n" in text]
         assert self._slowest < MOST_SECONDS
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - self._before < MOST_KILOBYTES

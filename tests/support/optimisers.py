@@ -39,7 +39,7 @@ class ParentsAndChildren:
 
 
 class WithoutState(ParentsAndChildren):
-    state = property()  # raises AttributeError: as good as not there
+    state = property()  # raises AttributeError, as if missing
 
 
 class KeepsObjects(ParentsAndChildren):

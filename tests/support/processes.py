@@ -1,4 +1,4 @@
-"""Real coordinators and workers as child processes, and waiting for what they do."""
+"""Real coordinators and workers as child processes, with waits for their output."""
 
 import fcntl
 import json
@@ -13,7 +13,7 @@ from dreamfleet.common.host.processes import VerbProcess, command
 from dreamfleet.common.monitoring.client import Client
 
 ROOT = Path(__file__).parents[2]
-DEADLINE = 300  # seconds that a test waits for what must come: many times what it takes, for a machine may be busy
+DEADLINE = 300  # seconds to wait for an event: many times the usual, since a machine may be busy
 
 
 def free_port():
@@ -23,7 +23,7 @@ def free_port():
 
 
 def environment(cache, root=ROOT):
-    inherited = {name: value for name, value in os.environ.items() if name != "SDL_VIDEODRIVER"}  # as people start it
+    inherited = {name: value for name, value in os.environ.items() if name != "SDL_VIDEODRIVER"}  # as in a user's shell
     return {
         **inherited,
         "PYTHONPATH": str(root),
@@ -34,7 +34,7 @@ def environment(cache, root=ROOT):
 
 
 class Process(VerbProcess):
-    """A verb running; its stderr lines can be waited for."""
+    """A running verb; tests can wait for lines of its stderr."""
 
     def __init__(self, arguments, cache, inside=(), root=ROOT):
         self._reading = threading.Event()
@@ -42,12 +42,12 @@ class Process(VerbProcess):
         super().__init__(*arguments, environment=environment(cache, root), inside=inside)
 
     def freeze(self, size=4096):
-        """Read its stderr no more, of which so many bytes still fit into the pipe."""
+        """Stop reading its stderr; `size` more bytes fit into the pipe."""
         fcntl.fcntl(self.popen.stderr, fcntl.F_SETPIPE_SZ, size)
         self._reading.clear()
 
     def thaw(self):
-        """Read on; nothing is lost."""
+        """Read on from where `freeze` stopped."""
         self._reading.set()
 
     def _add_line(self, line):
@@ -61,7 +61,7 @@ class Process(VerbProcess):
         return super().finish(timeout)
 
     def end(self, patience=0):
-        """At once: no test waits for a verb that it has done with."""
+        """End it at once, without a grace period by default."""
         self.thaw()
         super().end(patience)
 
@@ -78,7 +78,7 @@ class Processes:
         self._started = []
 
     def start(self, *arguments, inside=(), root=ROOT):
-        """A verb, `inside` a host of its own if given the words that lead there; `root` holds its files."""
+        """Start a verb; `inside` is a command prefix that runs it on another host, `root` is its source tree."""
         self._started.append(Process(arguments, self.cache, inside, root))
         return self._started[-1]
 
@@ -120,7 +120,7 @@ class Processes:
         return json.loads(out) if code == 0 else None
 
     def statuses(self):
-        """Of every live run, those with most slots first."""
+        """The status of every live run, most slots first."""
         with Client((self.endpoint,)) as client:
             return sorted((client.status(run) for run in client.runs()), key=lambda status: -status.slots)
 

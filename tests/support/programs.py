@@ -1,4 +1,4 @@
-"""Programs of Debian's packages that tests need: without one a test is skipped, and in CI it fails."""
+"""Programs of Debian packages that tests need; without one a test is skipped, or fails in CI."""
 
 import os
 import shutil
@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 LIST = Path(__file__).parents[2] / "deploy" / "test-packages.txt"
-SEARCHED = f"{os.environ.get('PATH', os.defpath)}:/usr/local/sbin:/usr/sbin:/sbin"  # sshd is in none of a user's
+SEARCHED = f"{os.environ.get('PATH', os.defpath)}:/usr/local/sbin:/usr/sbin:/sbin"  # sshd is not on a user's PATH
 TRUE = ("1", "true")
 NOT_INSTALLED = "not installed: "
 
 
 def packages():
-    """Each program of the list, and the package that has it."""
+    """The programs of the list, each with its package."""
     lines = [line.split() for line in LIST.read_text().splitlines() if not line.startswith("#")]
     return {program: package for package, program in lines}
 

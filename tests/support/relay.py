@@ -12,11 +12,11 @@ RESET_ON_CLOSE = struct.pack("ii", 1, 0)
 
 
 class Relay:
-    """Passes connections on to a port of this host, or of the host at `far`."""
+    """Forwards connections to a port of this host, or of the host at `far`."""
 
     def __init__(self, target, address="127.0.0.1", far="127.0.0.1"):
-        self.delay = 0.0  # seconds that every piece takes
-        self.rate = 0.0  # bytes a second of each connection and way; 0: as fast as they come
+        self.delay = 0.0  # seconds added to every piece
+        self.rate = 0.0  # bytes a second in each direction of a connection; 0: unlimited
         self._target = far, target
         self._flowing = threading.Event()
         self._flowing.set()
@@ -28,18 +28,18 @@ class Relay:
         self._run(self._accept)
 
     def hold(self):
-        """Pass nothing on, without a word to either side."""
+        """Hold all data, without closing connections."""
         self._flowing.clear()
 
     def release(self):
-        """Go on; nothing that was held is lost."""
+        """Forward again, beginning with the held data."""
         self._flowing.set()
 
     def cut(self):
-        """End every connection; new ones are let through."""
+        """Close every connection; new ones are accepted."""
         pairs, self._pairs = self._pairs, []
         for each in (one for pair in pairs for one in pair):
-            with suppress(OSError):  # its pump has ended meanwhile
+            with suppress(OSError):  # its pump has ended already
                 each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_ON_CLOSE)
                 each.shutdown(socket.SHUT_RDWR)
 
@@ -59,7 +59,7 @@ class Relay:
                 return
             try:
                 far = socket.create_connection(self._target)
-            except OSError:  # nobody listens there now
+            except OSError:  # nothing listens there now
                 near.close()
                 continue
             self._pairs.append((near, far))

@@ -1,4 +1,4 @@
-"""One of each message, for golden fixtures and for damage."""
+"""A sample of each message, for golden files and mutations."""
 
 import hashlib
 

@@ -1,4 +1,4 @@
-"""A coordinator's answers without a coordinator: any snapshot, over real Zenoh, and what comes of it a moment later."""
+"""Answer as a coordinator over real Zenoh, from snapshots that a test makes."""
 
 import dataclasses
 from contextlib import contextmanager
@@ -19,7 +19,7 @@ WORKER = STATUS.worker_list[0]
 
 
 def snapshot(generations=8, workers=1, population=16, name="night", **changes):
-    """Of a run of so many closed generations and workers."""
+    """A snapshot of a run with so many closed generations and workers."""
     history = History(
         dataclasses.replace(CLOSED, number=number, mean=float(number % 300), best=50.0 + number % 300, sigma=0.1)
         for number in range(generations)
@@ -45,7 +45,7 @@ def snapshot(generations=8, workers=1, population=16, name="night", **changes):
 
 
 class Served:
-    """What is answered; a test sets another snapshot."""
+    """Holds the snapshot that is served; a test may replace it."""
 
     def __init__(self, first):
         self.snapshot = first
@@ -53,7 +53,7 @@ class Served:
 
 @contextmanager
 def serving(endpoint, first, *others):
-    """Answer at `endpoint` until the end: for a run whose snapshot may be set, and for others."""
+    """Serve at `endpoint` the snapshot `first`, which may be replaced, and `others`."""
     served = Served(first)
     with open_session(Network(listen=(endpoint,))) as session:
         error_counter = ErrorCounter(getLogger(__name__))

@@ -1,4 +1,4 @@
-"""Hosts that are reached by a real sshd: each with a port, a host key and a home of its own."""
+"""Hosts behind a real sshd, each with its own port, host key and home folder."""
 
 import getpass
 import json
@@ -19,7 +19,7 @@ LISTENS = "Server listening"
 
 
 class SshHost:
-    """One sshd; `home` is where whoever logs in is at home."""
+    """One sshd; `home` is the home folder of its users."""
 
     def __init__(self, folder, name, address="127.0.0.1", inside=(), path=None, modules=ROOT, **options):
         self.name, self.address, self.inside = name, address, inside
@@ -42,7 +42,7 @@ class SshHost:
         self._popen = None
 
     def start(self):
-        Path("/run/sshd").mkdir(parents=True, exist_ok=True)  # sshd wants it where it runs as root
+        Path("/run/sshd").mkdir(parents=True, exist_ok=True)  # required by sshd when it runs as root
         command = [*self.inside, find_program("sshd"), "-D", "-e", "-f", self._config]
         self._popen = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         listens = threading.Event()
@@ -52,7 +52,7 @@ class SshHost:
         return self
 
     def stop(self):
-        """Nobody is let in any more, and no worker is left."""
+        """Stop sshd and all workers."""
         for path in self.root().glob("workers/*/worker.json"):
             state = json.loads(path.read_text())
             if state and process_start(state["pid"]) == state["birth"]:
@@ -64,7 +64,7 @@ class SshHost:
             self._popen = None
 
     def root(self):
-        """Where everything of a fleet's lies there."""
+        """The remote folder of environments and workers."""
         return self.home / ".local" / "share" / "dreamfleet"
 
     def _read(self, listens):
@@ -75,7 +75,7 @@ class SshHost:
 
 
 class SshHosts:
-    """Hosts, and the ssh client's configuration under which they are known by their names."""
+    """Hosts, and an ssh configuration with their names."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -87,13 +87,13 @@ class SshHosts:
         self.ssh = f"ssh -F {self.config}"
 
     def add(self, name, **options):
-        """A host that runs; the client knows its key."""
+        """Start a host whose key the client knows."""
         self._hosts[name] = SshHost(self.folder, name, **options).start()
         self.write()
         return self._hosts[name]
 
     def write(self, **strange):
-        """The client's configuration, `strange` names addresses of hosts that are none of ours."""
+        """Write the client's configuration; `strange` has addresses of foreign hosts by name."""
         self.known.write_text("".join(each.known for each in self._hosts.values()))
         addresses = {name: (host.address, host.port) for name, host in self._hosts.items()} | strange
         common = f"""Host *
@@ -109,7 +109,7 @@ class SshHosts:
         self.config.write_text("".join([*hosts, common]))
 
     def config_with(self, key):
-        """The same configuration with another key of the user's."""
+        """The same configuration with another user key."""
         path = self.folder / f"ssh_config_{key.name}"
         path.write_text(self.config.read_text().replace(f"IdentityFile {self._key}", f"IdentityFile {key}"))
         return path

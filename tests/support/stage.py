@@ -1,4 +1,4 @@
-"""Workers against coordinators driven by hand, over real routers."""
+"""Workers with hand-driven coordinators, over real routers."""
 
 import logging
 import queue
@@ -27,7 +27,7 @@ class Stage:
         return self.hands[-1]
 
     def also(self, hand, task=tasks.TOY, **more):
-        """Another run's coordinator, whose router is that of `hand`."""
+        """Another run's coordinator, on the router of `hand`."""
         self.hands.append(Hand(self.port, self.bundle, task, beside=hand, **more))
         return self.hands[-1]
 
@@ -50,7 +50,7 @@ class Stage:
 
 @contextmanager
 def listening():
-    """What a worker logs, as a queue of lines."""
+    """The log lines of workers as a queue."""
     lines = queue.SimpleQueue()
     handler = logging.Handler()
     handler.emit = lambda record: lines.put(record.getMessage())
@@ -70,5 +70,5 @@ def wait_for(lines, text):
 
 
 def drained(lines):
-    """What was said and not waited for."""
+    """Take all queued lines."""
     return [lines.get_nowait() for _ in range(lines.qsize())]

@@ -26,12 +26,14 @@ MODULE = "tests.support.tasks"
 )  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, PAINTED
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
-ROUNDING = "DREAMFLEET_TEST_ROUNDING"  # set: `Rounded` computes as a host of another class does
-ODD_REWARD = "DREAMFLEET_TEST_ODD_REWARD"  # a file that holds a number: the next episode gives it, and the file is gone
+ROUNDING = "DREAMFLEET_TEST_ROUNDING"  # if set, `Rounded` computes as on another host class
+ODD_REWARD = (
+    "DREAMFLEET_TEST_ODD_REWARD"  # a file with a number: the reward of the next episode, which removes the file
+)
 
 
 class ToyEnvironment(gymnasium.Env):
-    """Ten steps; the reward says how near the action is to a target that the seed makes."""
+    """Ten steps; the reward is the negative squared distance of the action to a target drawn from the seed."""
 
     observation_space = spaces.Box(-1, 1, (1,))
     action_space = spaces.Box(-1, 1, (8,))
@@ -88,7 +90,7 @@ class SecondToy(Toy):
 
 
 class Rounded(Toy):
-    """What it gives hangs on the host, by a bit."""
+    """Rewards differ in the last bit between hosts."""
 
     name = ROUNDED
 
@@ -149,7 +151,7 @@ class HangingPolicy(ToyPolicy):
 
 
 class Silent(Toy):
-    """Closes every connection of its process, and lives on."""
+    """Closes every connection of its process, and runs on."""
 
     name = SILENT
     probe_steps = 0
@@ -181,7 +183,7 @@ class ChattyPolicy(ToyPolicy):
 
 
 class Judged(Toy):
-    """Its judge is not its environment."""
+    """Has a judge that differs from its environment."""
 
     name = JUDGED
 
@@ -190,9 +192,9 @@ class Judged(Toy):
 
 
 class Counted(Toy):
-    """Every step that any process ever makes is counted in a file that outlives it; the bundle moves what it gives.
+    """Counts the steps of all processes in a file; rewards depend on the bundle.
 
-    Now and then an episode's reward is odd, if somebody asks for it.
+    A test can request an odd reward for one episode.
     """
 
     name = COUNTED
@@ -200,11 +202,11 @@ class Counted(Toy):
     seconds = 0.001
 
     def make_environment(self, assignment):
-        return CountedEnvironment(self.seconds, _told_by(assignment.bundle))
+        return CountedEnvironment(self.seconds, _reward_offset(assignment.bundle))
 
 
 class Wide(Counted):
-    """A slot scores 256 together."""
+    """A slot scores 256 episodes at once."""
 
     name = f"{MODULE}:Wide"
     batch_size = 256
@@ -229,13 +231,13 @@ class WideBatch:
         return scores
 
 
-def _told_by(bundle):
-    """A number that another bundle would not give; of what was verified, for the file may be another by now."""
+def _reward_offset(bundle):
+    """A number that depends on the verified content of the bundle."""
     return 0.0 if bundle is None else hashlib.sha256(bundle.read("encoder.onnx")).digest()[0] / 2560
 
 
 def _odd_reward():
-    """What an episode is asked to give; one process alone finds it."""
+    """The requested odd reward; only one process gets it."""
     asked = Path(os.environ.get(ODD_REWARD, "/nowhere"))
     taken = asked.with_name(f"{asked.name}.{os.getpid()}")
     try:
@@ -267,7 +269,7 @@ class CountedEnvironment(ToyEnvironment):
 
 
 class Heavy(Toy):
-    """What it sees cannot be compressed: a kept drive is a megabyte."""
+    """Observations do not compress: a kept drive takes a megabyte."""
 
     name = HEAVY
 
@@ -279,8 +281,8 @@ class HeavyEnvironment(ToyEnvironment):
     observation_space = spaces.Box(0, 255, (100_000,), np.uint8)
 
     def reset(self, *, seed=None, options=None):
-        _, told = super().reset(seed=seed)
-        return self._look(), told
+        _, info = super().reset(seed=seed)
+        return self._look(), info
 
     def step(self, action):
         _, *rest = super().step(action)
@@ -291,7 +293,7 @@ class HeavyEnvironment(ToyEnvironment):
 
 
 class Optimistic(Toy):
-    """Its dream rewards actions without bound, the less the warmer; in reality they soon are too large."""
+    """The dream rewards ever larger actions, less at higher temperature; in reality these soon cost reward."""
 
     name = OPTIMISTIC
     batch_size = 4
@@ -301,7 +303,7 @@ class Optimistic(Toy):
 
 
 class Exploding(Toy):
-    """Its rewards are numbers, their mean is none."""
+    """Rewards are finite, but their mean overflows."""
 
     name = EXPLODING
 
@@ -310,7 +312,7 @@ class Exploding(Toy):
 
 
 class Endless(Toy):
-    """It counts more steps than any journal."""
+    """Reports more steps than a journal can hold."""
 
     name = ENDLESS
 
@@ -341,7 +343,7 @@ class OptimisticBatch:
 
 
 class Painted(Toy):
-    """It sees pictures, whose colour says how many steps were made; so many steps, at leisure."""
+    """Observes pictures whose colour is the step number; an episode has `length` slow steps."""
 
     name = PAINTED
     seconds = 0.02
@@ -359,9 +361,9 @@ class PaintedEnvironment(ToyEnvironment):
         self._length = length
 
     def reset(self, *, seed=None, options=None):
-        _, told = super().reset(seed=seed)
+        _, info = super().reset(seed=seed)
         self._left = self._length
-        return self._look(), told
+        return self._look(), info
 
     def step(self, action):
         _, *rest = super().step(action)
@@ -372,5 +374,5 @@ class PaintedEnvironment(ToyEnvironment):
 
 
 def steps_made(folder):
-    """By all processes together."""
+    """The steps of all processes."""
     return sum(int.from_bytes(path.read_bytes(), "little") for path in Path(folder).iterdir())

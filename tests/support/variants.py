@@ -1,4 +1,4 @@
-"""Variants of driving CarRacing, and controllers that drive so."""
+"""CarRacing variants, and controllers for them."""
 
 import numpy as np
 
@@ -18,13 +18,13 @@ VARIANTS = {
 
 
 def vectors(bundle, count, seed=4, scale=0.3):
-    """Parameters `(count, size)` of the bundle's controllers."""
+    """Random parameters `(count, size)` for the bundle's controllers."""
     random = np.random.default_rng(seed)
     return random.normal(0, scale, (count, bundle.controller_shape.size)).astype(np.float32)
 
 
 def controller_of(bundle, task="car-racing", seed=4):
-    """One of the bundle's controllers, which drive by its variant."""
+    """A controller of the bundle and its variant."""
     (parameters,) = vectors(bundle, 1, seed)
     variant = bundle.variant
     return Controller(

@@ -47,7 +47,7 @@ def test_settings_that_differ_are_named_and_others_are_not(runs):
     assert differing_settings(sides(runs, "dream", "dream")) == {}
 
 
-def test_at_equal_spending_no_look_had_spent_more(runs):
+def test_at_an_equal_budget_no_evaluated_mean_exceeds_it(runs):
     dream, reality = sides(runs, "dream", "reality")
     for equal in at_equal_budget([dream, reality]):
         spent = {"steps in reality": lambda effort: effort.steps, "core-hours": lambda effort: effort.core_hours}
@@ -59,7 +59,7 @@ def test_at_equal_spending_no_look_had_spent_more(runs):
     assert at_equal_budget(sides(runs, "dream", "hidden")) == []
 
 
-def test_confirmed_scores_are_compared_on_the_tracks_that_both_drove(runs):
+def test_confirmed_scores_are_compared_on_common_tracks(runs):
     confirm(runs, "dream", [1.0, 2.0, 3.0, 4.0])
     confirm(runs, "reality", [2.0, 3.5, 3.5, 5.5, 99.0])
     one, other = sides(runs, "dream", "reality")
@@ -68,7 +68,7 @@ def test_confirmed_scores_are_compared_on_the_tracks_that_both_drove(runs):
     assert (found.seeds, found.mean, found.is_significant) == (4, 1.125, True)
 
 
-def test_the_verb_tells_the_difference_in_words_and_as_json(runs, capsys):
+def test_the_verb_prints_the_difference_as_text_and_as_json(runs, capsys):
     confirm(runs, "dream", [1.0, 2.0, 3.0, 4.0])
     confirm(runs, "reality", [2.0, 3.5, 3.5, 5.5])
     words = ["runs", "compare", "dream", "reality", "--runs-dir", str(runs)]
@@ -77,8 +77,8 @@ def test_the_verb_tells_the_difference_in_words_and_as_json(runs, capsys):
     assert "the same validation seeds" in text
     assert "confirmed: reality less dream: +1.1 ± 0.2 (standard error) on 4 equal seeds: better" in text
     assert command_line.main([*words, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert [each["of"] for each in told["differences"]] == [
+    report = json.loads(capsys.readouterr().out)
+    assert [each["of"] for each in report["differences"]] == [
         "at equal steps in reality",
         "at equal core-hours",
         "confirmed",
@@ -87,14 +87,14 @@ def test_the_verb_tells_the_difference_in_words_and_as_json(runs, capsys):
 
 def test_runs_without_scores_are_compared_by_their_settings(runs, capsys):
     assert command_line.main(["runs", "compare", "reality", "hidden", "--runs-dir", str(runs)]) == 0
-    told = capsys.readouterr().out
-    assert "covariance\tdiagonal\tfull" in told
-    assert "less" not in told
+    text = capsys.readouterr().out
+    assert "covariance\tdiagonal\tfull" in text
+    assert "less" not in text
     assert command_line.main(["runs", "compare", "reality", "--runs-dir", str(runs)]) == 2
     assert "two runs or more" in capsys.readouterr().err
 
 
-def test_a_run_that_closes_an_evaluation_meanwhile_is_read_as_of_one_moment(runs, monkeypatch):
+def test_a_run_is_read_in_one_transaction_while_an_evaluation_closes(runs, monkeypatch):
     read = RunFolder.evaluations
     with closing(sqlite3.connect(runs / "dream" / "journal.sqlite", isolation_level=None)) as journal:
         journal.execute("PRAGMA journal_mode = wal")  # as a coordinator's

@@ -52,7 +52,7 @@ def test_csv_tables_hold_every_row_of_the_journal(runs, tmp_path):
     assert [float(row["error"]) for row in read["evaluations"]] == [each.error for each in evaluations]
 
 
-def test_candidates_are_told_with_what_they_were_scored_by(runs):
+def test_candidates_are_exported_with_their_episodes_and_effort(runs):
     history, candidates, _ = stored(runs)
     first = [each for each in candidates if each.generation == 0]
     assert sum(each.fitness for each in first) / len(first) == pytest.approx(history[0].mean)
@@ -100,12 +100,12 @@ def test_the_receipt_says_what_a_paper_cites(runs, capsys):
                      "dreamfleet repeat reality ", "@misc{dreamfleet-reality,"):  # fmt: skip
             assert part in text
     assert command_line.main(["runs", "receipt", "reality", "--runs-dir", str(runs), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["receipt"]["generations"] == len(stored(runs)[0])
-    assert told["controller"] in text
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["receipt"]["generations"] == len(stored(runs)[0])
+    assert facts["controller"] in text
 
 
-def test_the_receipt_of_a_schedule_tells_each_stage_instead_of_the_first_ones_figures(runs, capsys):
+def test_the_receipt_of_a_schedule_lists_every_stage(runs, capsys):
     with sqlite3.connect(runs / "reality" / "journal.sqlite") as journal:
         (text,) = journal.execute("SELECT value FROM run WHERE key = 'settings'").fetchone()
         stages = [{"generations": 1}, {"horizon": 7, "episodes": 3}]
@@ -114,8 +114,8 @@ def test_the_receipt_of_a_schedule_tells_each_stage_instead_of_the_first_ones_fi
     journal.close()
     path = runs / "reality" / "controller.npz"
     controller = Controller.load(path)
-    told = {**controller.provenance, "settings": json.loads(text)}
-    replace(controller, provenance=told).save(path)
+    provenance = {**controller.provenance, "settings": json.loads(text)}
+    replace(controller, provenance=provenance).save(path)
     assert command_line.main(["runs", "receipt", "reality", "--runs-dir", str(runs)]) == 0
     text = capsys.readouterr().out
     assert "- stage 2: since generation 1, to the end: 7 steps" in text

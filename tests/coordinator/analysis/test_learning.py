@@ -35,9 +35,9 @@ def test_each_evaluation_stands_over_all_that_was_spent_up_to_it(runs, name, kin
         generations = [each.generation for each in run.evaluations()]
         assert [each.score for each in curve.points] == [each.mean for each in run.evaluations()]
     for generation, point in zip(generations, curve.points, strict=True):
-        told = sums(runs, name, generation)
-        assert (getattr(point.effort, kind), point.effort.judged) == (told["score"], told["evaluate"])
-        assert point.effort.steps == told["evaluate"] + (told["score"] if kind == "driven" else 0)
+        steps = sums(runs, name, generation)
+        assert (getattr(point.effort, kind), point.effort.judged) == (steps["score"], steps["evaluate"])
+        assert point.effort.steps == steps["evaluate"] + (steps["score"] if kind == "driven" else 0)
         assert 0 < point.effort.microseconds <= curve.total.microseconds
     assert (curve.world, curve.confirmed) == ("car-racing", None)
 

@@ -1,4 +1,4 @@
-"""What the page's server answers, and to whom."""
+"""The routes of the page and their access control."""
 
 import asyncio
 import json
@@ -43,7 +43,7 @@ def client_of(runs, host="127.0.0.1", base=HOME, **config):
     return TestClient(app, base_url=base, follow_redirects=False)
 
 
-def test_the_page_loads_what_it_names_and_a_browser_may_keep_that_for_ever(runs):
+def test_the_pages_files_load_and_may_be_cached_for_ever(runs):
     client = client_of(runs)
     page = client.get("/")
     assert page.headers["cache-control"] == "no-store"
@@ -87,7 +87,7 @@ def test_past_runs_are_listed_with_what_is_wrong_with_them(runs):
     assert rows["dream"]["best_error"] > 0
 
 
-def test_an_open_run_is_told_with_the_command_that_goes_on_with_it_and_an_ended_one_without(runs):
+def test_only_an_open_run_is_listed_with_its_resume_command(runs):
     with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
         journal.execute("INSERT OR REPLACE INTO run VALUES ('ended', '2 minutes')")
     client = client_of(runs)
@@ -104,8 +104,8 @@ def test_an_empty_or_absent_runs_folder_is_an_empty_list(tmp_path):
 
 
 def test_a_run_is_its_curves_facts_and_settings(runs):
-    told = client_of(runs).get("/runs/dream").json()
-    curves = told["curves"]
+    document = client_of(runs).get("/runs/dream").json()
+    curves = document["curves"]
     assert curves["generation"] == list(range(12))
     assert curves["band"] == "the middle half of the candidates"
     assert all(low <= high for low, high in zip(curves["low"], curves["high"], strict=True))
@@ -113,16 +113,16 @@ def test_a_run_is_its_curves_facts_and_settings(runs):
     assert curves["core_hours"] == sorted(curves["core_hours"])
     assert len(curves["evaluations"]["steps"]) == len(curves["evaluations"]["generation"]) > 0
     assert curves["dreamt"]
-    assert ["task.task", "dream"] in told["settings"]
-    assert "spent" in dict(told["facts"])
+    assert ["task.task", "dream"] in document["settings"]
+    assert "spent" in dict(document["facts"])
 
 
 def test_a_run_that_closed_no_generation_is_shown(runs):
     with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
         for table in ("generation", "candidate", "evaluation", "result", "strategy"):
             journal.execute(f"DELETE FROM {table}")
-    told = client_of(runs).get("/runs/dream").json()
-    assert (told["curves"]["generation"], told["generations"]) == ([], [])
+    document = client_of(runs).get("/runs/dream").json()
+    assert (document["curves"]["generation"], document["generations"]) == ([], [])
 
 
 def test_a_journal_whose_generations_are_far_apart_is_damaged_and_not_counted_through(runs):
@@ -138,13 +138,13 @@ def test_a_journal_whose_generations_are_far_apart_is_damaged_and_not_counted_th
 def test_no_name_leads_out_of_the_runs_folder(runs, name):
     shutil.copytree(runs / "dream", runs.parent / "outside")
     answer = client_of(runs).get(f"/runs/{name}")
-    assert answer.status_code in (404, 200)  # `..` is taken out of a path before it is asked for: that is the page
+    assert answer.status_code in (404, 200)  # `..` is removed from a path by the client, which then requests the page
     assert "curves" not in answer.text
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
 @pytest.mark.parametrize("path", PATHS)
-def test_it_is_only_looked_at(runs, method, path):
+def test_only_get_is_allowed(runs, method, path):
     assert client_of(runs).request(method, path).status_code == 405
 
 
@@ -152,14 +152,14 @@ def test_it_is_only_looked_at(runs, method, path):
     "host", ["evil.example", "evil.example:8420", "127.0.0.1.evil.example", "localhost.evil.example", ""]
 )
 @pytest.mark.parametrize("path", PATHS)
-def test_a_name_that_was_made_to_lead_here_is_refused(runs, host, path):
+def test_a_foreign_host_name_that_resolves_here_is_refused(runs, host, path):
     answer = client_of(runs).get(path, headers={"host": host})
     assert (answer.status_code, "127.0.0.1" in answer.text) == (421, True)
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
 @pytest.mark.parametrize("path", PATHS)
-def test_another_sites_page_may_lead_here_and_ask_for_nothing(runs, site, path):
+def test_another_sites_page_may_link_here_and_request_nothing_else(runs, site, path):
     client = client_of(runs)
     for mode in ("cors", "no-cors", "navigate"):
         answer = client.get(path, headers={"sec-fetch-site": site, "sec-fetch-mode": mode})
@@ -167,7 +167,7 @@ def test_another_sites_page_may_lead_here_and_ask_for_nothing(runs, site, path):
 
 
 @pytest.mark.parametrize("path", ["/live", "/view?run=night"])
-def test_of_a_stream_without_end_nobody_gets_the_head_alone(runs, path):
+def test_head_of_an_endless_stream_gets_headers_only(runs, path):
     answer = client_of(runs).head(path)
     assert (answer.status_code, answer.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
 
@@ -216,7 +216,7 @@ def test_no_redirect_leads_elsewhere(runs):
         assert client.get(path, params={"token": TOKEN}).headers["location"] == "/"
 
 
-def test_every_answer_forbids_what_it_can(runs):
+def test_every_answer_has_the_security_headers(runs):
     client = client_of(runs)
     for path in ("/", "/runs", "/runs/nothing", "/nothing"):
         headers = client.get(path).headers
@@ -225,7 +225,7 @@ def test_every_answer_forbids_what_it_can(runs):
         assert headers["cross-origin-resource-policy"] == "same-origin"
 
 
-def test_numbers_that_json_does_not_have_stand_in_no_answer(runs):
+def test_no_answer_holds_nan_or_infinity(runs):
     with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
         journal.execute("UPDATE generation SET mean = 9e999, best = -9e999 WHERE number = 2")
         journal.execute("UPDATE candidate SET fitness = 9e999 WHERE generation = 2")
@@ -239,7 +239,7 @@ def test_numbers_that_json_does_not_have_stand_in_no_answer(runs):
         json.loads(answer.text, parse_constant=refuse)
 
 
-def test_a_token_of_other_letters_opens_as_it_is_written(runs):
+def test_a_token_may_hold_non_ascii_letters(runs):
     token = "größer-als-日本語"
     client = client_of(runs, token=token)
     for encoding in ("utf-8", "latin-1"):
@@ -251,7 +251,7 @@ def test_a_token_of_other_letters_opens_as_it_is_written(runs):
         assert client_of(runs, token=short).get("/runs", headers=sent).status_code == 200
 
 
-def test_the_list_is_read_once_for_all_who_ask_meanwhile(runs, monkeypatch):
+def test_concurrent_requests_share_one_read_of_the_list(runs, monkeypatch):
     read, held = [], threading.Event()
 
     def slowly(folder):

@@ -1,4 +1,4 @@
-"""Where the page listens, and when it wants a token."""
+"""The dashboard's address and token."""
 
 import pytest
 
@@ -9,7 +9,7 @@ TOKEN = "correct horse battery"
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.7", "localhost", "::1"])
-def test_this_computer_alone_needs_no_token(host):
+def test_a_loopback_address_needs_no_token(host):
     assert DashboardConfig(host=host).is_loopback
 
 
@@ -20,12 +20,12 @@ def test_any_other_address_needs_one(host):
     assert not DashboardConfig(host=host, token=TOKEN).is_loopback
 
 
-def test_a_token_that_is_soon_guessed_is_refused():
+def test_a_short_token_is_refused():
     with pytest.raises(UsageError, match="at least 12 characters"):
         DashboardConfig(token="short")
 
 
-def test_a_token_does_not_stand_where_a_configuration_is_printed():
+def test_the_repr_hides_the_token():
     assert TOKEN not in repr(DashboardConfig(token=TOKEN))
 
 

@@ -1,4 +1,4 @@
-"""What charts draw: as many points as a screen can tell apart, with what they stand over."""
+"""The columns of the charts: bounded in number, and aligned."""
 
 import dataclasses
 import math
@@ -26,7 +26,7 @@ def data(generations, **changes):
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, MOST_POINTS, MOST_POINTS + 1, 1234, 5000, 99_999])
-def test_however_long_a_run_is_its_ends_are_drawn_and_no_more_points_than_fit(count):
+def test_a_long_run_is_downsampled_and_keeps_its_ends(count):
     kept = downsample(range(count))
     assert len(kept) <= MOST_POINTS + 1
     assert list(kept[:1]) == list(range(count))[:1]
@@ -57,7 +57,7 @@ def test_only_a_dream_has_a_temperature_and_two_axes():
     )  # fmt: skip
 
 
-def test_what_a_run_took_is_summed_up_with_its_start_and_without_what_confirmed_it():
+def test_effort_includes_the_start_and_excludes_confirmations():
     efforts = [
         GenerationEffort(0, False, Effort(10, 0, 0, 36 * 10**8)), GenerationEffort(0, True, Effort(0, 99, 0, 1)),
         GenerationEffort(2, False, Effort(5, 7, 0, 36 * 10**8)),
@@ -68,7 +68,7 @@ def test_what_a_run_took_is_summed_up_with_its_start_and_without_what_confirmed_
     assert (drawn["steps"], drawn["core_hours"]) == ([110, 110, 122], [1.0, 1.0, 2.0])
 
 
-def test_an_evaluation_of_a_generation_that_is_still_open_stands_over_all_that_was_spent():
+def test_an_evaluation_of_an_open_generation_has_the_total_effort():
     spent = cumulative_effort(Effort(), [], 3)
     odd = dataclasses.replace(data(3), evaluations=[StoredEvaluation(2**62, 1, 1.0, 0.0)])
     assert curves(odd, None, spent)["evaluations"]["steps"] == [0]

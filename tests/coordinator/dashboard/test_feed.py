@@ -1,4 +1,4 @@
-"""One look a refresh for however many viewers, the latest for each, none for nobody."""
+"""One poll a refresh for any number of viewers, and none without viewers."""
 
 import asyncio
 import threading
@@ -42,7 +42,7 @@ def looks():
 
 
 @pytest.mark.slow
-def test_every_viewer_gets_the_same_pictures_from_one_look_each(looks):
+def test_all_viewers_share_the_snapshots(looks):
     looks.are_single = True
 
     async def viewer(feed, snapshots, everybody):
@@ -62,7 +62,7 @@ def test_every_viewer_gets_the_same_pictures_from_one_look_each(looks):
     run(play())
 
 
-def test_a_slow_viewer_misses_pictures_and_holds_back_nobody(looks):
+def test_a_slow_viewer_skips_snapshots_and_delays_nobody(looks):
     async def play():
         feed = Feed(looks, refresh=0.0, linger=0.05)
         slow, fast = feed.snapshots(), feed.snapshots()
@@ -74,7 +74,7 @@ def test_a_slow_viewer_misses_pictures_and_holds_back_nobody(looks):
     run(play())
 
 
-def test_nobody_is_asked_while_nobody_looks_and_a_later_viewer_gets_no_old_picture(looks):
+def test_polling_stops_without_viewers_and_a_later_viewer_gets_no_stale_snapshot(looks):
     async def play():
         feed = Feed(looks, refresh=0.01, linger=0.02)
         async for _ in feed.snapshots():
@@ -94,7 +94,7 @@ def test_nobody_is_asked_while_nobody_looks_and_a_later_viewer_gets_no_old_pictu
     run(play())
 
 
-def test_a_feed_that_closes_lets_every_viewer_go(looks):
+def test_closing_the_feed_ends_every_stream(looks):
     async def play():
         feed = Feed(looks, refresh=0.01, linger=10)
         viewer = feed.snapshots()

@@ -10,7 +10,7 @@ def worker(name, rate=0.0, state="present", slots=1):
     return dataclasses.replace(STATUS.worker_list[0], worker=name, steps_per_second=rate, state=state, slots=slots)
 
 
-def test_a_lane_says_how_fast_a_slot_was_beside_the_fleets_fastest():
+def test_a_lane_shows_a_slots_speed_relative_to_the_fastest():
     lanes = Lanes()
     fleet = [worker("a/1", 90.0), worker("b/1", 90.0, slots=2), worker("c/1"), worker("d/1", state="silent"),
              worker("e/1", 5.0, state="lost")]  # fmt: skip
@@ -20,14 +20,14 @@ def test_a_lane_says_how_fast_a_slot_was_beside_the_fleets_fastest():
     assert [lane[-1] for lane in render] == ["9", "4", IDLE, SILENT, LOST]
 
 
-def test_one_stretch_keeps_what_was_seen_last_in_it():
+def test_a_slice_keeps_the_last_state():
     lanes, present, lost = Lanes(), worker("a/1", 10.0), worker("a/1", state="lost")
     lanes.update([present], 100.0)
     lanes.update([lost], 100.0 + 0.9 * STRETCH)
     assert lanes.render([lost])[0].strip() == LOST
 
 
-def test_what_nobody_watched_is_unknown_and_what_is_old_is_forgotten():
+def test_slices_without_an_update_are_unknown_and_old_ones_are_dropped():
     lanes, present = Lanes(), worker("a/1", 10.0)
     lanes.update([present], 100.0)
     lanes.update([present], 100.0 + 3 * STRETCH)

@@ -1,4 +1,4 @@
-"""What the page remembers of live runs."""
+"""The state that the page keeps of live runs."""
 
 import json
 import time
@@ -11,7 +11,7 @@ from tests.support.processes import free_port
 from tests.support.served import serving, snapshot
 
 
-def test_what_workers_did_is_remembered_while_nobody_looks(tmp_path, monkeypatch):
+def test_lanes_are_kept_while_polling_is_suspended(tmp_path, monkeypatch):
     now = [1000.0]
     monkeypatch.setattr(live_runs, "time", SimpleNamespace(time=lambda: now[0], monotonic=time.monotonic))
     endpoint = f"tcp/127.0.0.1:{free_port()}"

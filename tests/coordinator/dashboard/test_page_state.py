@@ -1,4 +1,4 @@
-"""What the page shows of a live run, and of one that nobody serves any more."""
+"""The page's document of live, lost and ended runs."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,20 +15,20 @@ def look(lost=None, folder=None, **changes):
     return RunSnapshot(status, status.worker_list, lanes, (status.population,), 100.0, lost, folder)
 
 
-def of_a_moment(told):
-    tiles = {each["name"]: each["value"] for each in told["tiles"]}
-    workers = told["workers"]
+def momentary_values(document):
+    tiles = {each["name"]: each["value"] for each in document["tiles"]}
+    workers = document["workers"]
     columns = [value for name in ("state", "rate", "leases", "load", "heard") for value in workers[name]]
     return [tiles["throughput"], tiles["fleet"], *columns]
 
 
 @pytest.mark.parametrize("gone", [{"lost": 101.0}, {"state": "ended"}, {"state": "left"}])
-def test_what_was_true_for_a_moment_is_told_of_a_live_run_alone(gone):
-    assert not {"-", None} & set(of_a_moment(page_state(look())))
-    told = page_state(look(**gone))
-    assert set(of_a_moment(told)) == {"-", None}
-    assert "at the last" in told["fleet"]
-    assert told["workers"]["finished"] == page_state(look())["workers"]["finished"], "what was done stays"
+def test_only_a_live_run_shows_momentary_values(gone):
+    assert not {"-", None} & set(momentary_values(page_state(look())))
+    document = page_state(look(**gone))
+    assert set(momentary_values(document)) == {"-", None}
+    assert "at the last" in document["fleet"]
+    assert document["workers"]["finished"] == page_state(look())["workers"]["finished"], "finished jobs stay"
 
 
 def test_no_generation_is_open_once_a_run_has_ended_or_only_its_mean_is_driven():
@@ -41,7 +41,7 @@ def test_no_generation_is_open_once_a_run_has_ended_or_only_its_mean_is_driven()
     )
 
 
-def test_a_lost_run_whose_journal_lies_here_is_told_with_its_whole_command():
+def test_a_lost_run_with_its_journal_here_shows_the_whole_command():
     assert (
         f"--resume {STATUS.run} --runs-dir /data/runs, with --join"
         in (page_state(look(101.0, Path("/data/runs") / STATUS.run))["sentence"])

@@ -1,4 +1,4 @@
-"""What is read of a journal for the page."""
+"""The page's data from journals."""
 
 import shutil
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Live views without a browser: what is said where nothing can be watched."""
+"""Live views without a browser: notices where there is no picture."""
 
 import asyncio
 import json
@@ -7,7 +7,7 @@ from dreamfleet.coordinator.dashboard.view_processes import ViewProcesses, ViewT
 
 
 def ending(views, target):
-    """What is said last to whoever watches what cannot be watched."""
+    """The last event of a view that shows nothing."""
 
     async def watch():
         said = [each async for each in views.events(target)]
@@ -17,18 +17,18 @@ def ending(views, target):
     return asyncio.run(watch())
 
 
-def test_what_its_process_says_as_it_ends_is_told(tmp_path):
+def test_the_last_notice_is_its_processs_last_message(tmp_path):
     views = ViewProcesses(("--connect", "tcp/127.0.0.1:1"), tmp_path, 1)
-    told = ending(views, ViewTarget("night", "generation", "3"))
-    assert (told["state"], "no run 'night'" in told["text"]) == ("ended", True), told
+    notice = ending(views, ViewTarget("night", "generation", "3"))
+    assert (notice["state"], "no run 'night'" in notice["text"]) == ("ended", True), notice
 
 
 def test_where_no_views_are_allowed_none_begins(tmp_path):
-    told = ending(ViewProcesses(("--connect", "tcp/127.0.0.1:1"), tmp_path, 0), ViewTarget("night"))
-    assert "no more are allowed" in told["text"]
+    notice = ending(ViewProcesses(("--connect", "tcp/127.0.0.1:1"), tmp_path, 0), ViewTarget("night"))
+    assert "no more are allowed" in notice["text"]
 
 
-def test_what_is_watched_becomes_flags_that_nothing_can_be_added_to(tmp_path):
+def test_a_target_becomes_flags_without_injection(tmp_path):
     place = ("--connect", "tcp/a:1", "tcp/b:2")
     for asked, flags in (
         ({"run": "night"}, ["--run=night", *place]),

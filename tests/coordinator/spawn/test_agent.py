@@ -1,4 +1,4 @@
-"""What the agent answers where a host is not as it was."""
+"""The agent on hosts in unexpected states."""
 
 import os
 
@@ -8,7 +8,7 @@ from dreamfleet.coordinator.spawn import agent
 from dreamfleet.coordinator.spawn.agent import COMPLETE, MARK, Channel, HostFolder
 
 
-def test_a_file_that_is_missing_inside_is_told_and_the_folder_is_let_go(tmp_path, capsys):
+def test_a_missing_file_is_reported_and_the_lock_released(tmp_path, capsys):
     asked = {"do": "start", "root": str(tmp_path / "place"), "name": "box", "python": str(tmp_path / "gone"),
              "words": [], "env": {}, "slots": 1, "held": False, "digest": "1"}  # fmt: skip
     for _ in range(2):
@@ -18,7 +18,7 @@ def test_a_file_that_is_missing_inside_is_told_and_the_folder_is_let_go(tmp_path
         assert "No such file" in said
 
 
-def test_who_removed_the_folder_that_is_waited_for_is_followed(tmp_path, monkeypatch):
+def test_a_folder_removed_while_waiting_for_its_lock_is_created_again(tmp_path, monkeypatch):
     host_folder, take = HostFolder(str(tmp_path / "place"), Channel()), HostFolder._acquire
 
     def removed(self, lock):
@@ -31,7 +31,7 @@ def test_who_removed_the_folder_that_is_waited_for_is_followed(tmp_path, monkeyp
         assert (host_folder.root / "lock").exists()
 
 
-def test_a_folder_that_is_somebodys_own_is_left_alone(tmp_path, capsys):
+def test_a_foreign_folder_is_left_alone(tmp_path, capsys):
     kept = [tmp_path / "cache" / "a", tmp_path / "workers" / "mine" / "b", tmp_path / "environments" / "c"]
     for path in kept:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -43,7 +43,7 @@ def test_a_folder_that_is_somebodys_own_is_left_alone(tmp_path, capsys):
     assert all(path.exists() for path in kept)
 
 
-def test_a_folder_that_was_there_stays_and_what_else_is_in_it(tmp_path):
+def test_a_folder_that_existed_before_stays_with_its_other_files(tmp_path):
     host_folder = HostFolder(str(tmp_path), Channel())
     (tmp_path / "notes").touch()
     with host_folder.locked():
@@ -54,10 +54,10 @@ def test_a_folder_that_was_there_stays_and_what_else_is_in_it(tmp_path):
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_an_environment_whose_python_is_gone_is_none(tmp_path, there):
+def test_an_environment_without_its_python_is_not_listed(tmp_path, there):
     folder = tmp_path / "environments" / "one"
     (folder / "bin").mkdir(parents=True)
     (folder / COMPLETE).touch()
     (folder / "bin" / "python").symlink_to(os.devnull if there else tmp_path / "gone")
-    found = agent.inspect_host({"root": str(tmp_path)}, Channel())
+    found = agent.inspect_host(HostFolder(str(tmp_path), Channel()))
     assert found["environments"] == (["one"] if there else [])

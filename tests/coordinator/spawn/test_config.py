@@ -1,4 +1,4 @@
-"""Which hosts a file names, what each is told, and whether it is reached by a tunnel."""
+"""The hosts of a file, their settings, and whether each needs a tunnel."""
 
 import argparse
 import re
@@ -19,7 +19,7 @@ def hosts(*rows, file=None, flags=None, environment=None):
     return read_hosts(rows, sources)
 
 
-def test_a_hosts_word_is_stronger_than_the_files_and_weaker_than_a_flag(tmp_path):
+def test_a_hosts_table_overrides_the_file_and_flags_override_it(tmp_path):
     (tmp_path / "a.whl").touch()
     row = {"address": "me@big", "slots": 16, "env": ["A=1", "B=x=y"], "wheelhouse": str(tmp_path)}
     (host,) = hosts(row, file={"spawn": {"slots": 4, "remote_dir": "/data/fleet"}})
@@ -32,7 +32,7 @@ def test_a_hosts_word_is_stronger_than_the_files_and_weaker_than_a_flag(tmp_path
     assert host.spawn.slots == 2
 
 
-def test_the_documented_file_is_one(tmp_path):
+def test_the_documented_file_is_valid(tmp_path):
     (tmp_path / "a.whl").touch()
     text = re.search(r"```toml\n(.*?)```", (Path(ROOT) / "docs" / "hosts.md").read_text(), re.DOTALL)[1]
     path = tmp_path / "hosts.toml"
@@ -60,12 +60,12 @@ def test_the_documented_file_is_one(tmp_path):
         ({"address": "a", "wheelhouse": "/nowhere"}, "holds no wheel"),
     ],
 )
-def test_what_is_wrong_in_a_file_is_said(row, why):
+def test_a_bad_file_is_refused_with_the_reason(row, why):
     with pytest.raises(UsageError, match=why):
         hosts(row)
 
 
-def test_hosts_are_told_apart_by_name():
+def test_host_names_are_unique():
     assert [each.name for each in hosts({"address": "a@h"}, {"address": "b@h", "name": "other"})] == ["h", "other"]
     with pytest.raises(UsageError, match="several hosts are called h"):
         hosts({"address": "a@h"}, {"address": "b@h"})

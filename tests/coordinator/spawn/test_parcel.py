@@ -1,4 +1,4 @@
-"""This installation as a wheel, and the name of what is made of it."""
+"""This installation as a wheel, and the name of its environment."""
 
 import base64
 import csv
@@ -13,7 +13,7 @@ from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.coordinator.spawn.parcel import Parcel, Wheel, pack_wheel, pins
 
 
-def test_the_wheel_holds_what_its_record_says_and_is_the_same_each_time():
+def test_the_wheel_matches_its_record_and_is_reproducible():
     wheel = pack_wheel(native=True)
     assert wheel == pack_wheel(native=True)
     with zipfile.ZipFile(io.BytesIO(wheel.data)) as archive:
@@ -37,14 +37,14 @@ def test_for_another_processor_it_holds_python_alone():
         assert not any(name.endswith(".so") for name in archive.namelist())
 
 
-def test_pins_are_what_a_worker_has_here():
+def test_pins_are_the_versions_installed_here():
     lines = pins().splitlines()
     assert f"numpy=={version('numpy')}" in lines
     assert f"onnxruntime=={version('onnxruntime')}" in lines
     assert not any(line.startswith(("torch", "matplotlib")) for line in lines)
 
 
-def test_whatever_makes_an_environment_differ_gives_it_another_name(tmp_path):
+def test_environments_that_differ_have_different_names(tmp_path):
     (tmp_path / "numpy-2.0-cp311-cp311-manylinux_2_28_x86_64.whl").write_bytes(b"1")
     wheel, other = Wheel("a.whl", b"a"), Wheel("a.whl", b"b")
     made = [

@@ -1,8 +1,8 @@
-"""What the ssh client says, as a line with its remedy."""
+"""Messages of the ssh client, explained in one line with a remedy."""
 
 import pytest
 
-from dreamfleet.coordinator.spawn.ssh_errors import NO_PYTHON, explain
+from dreamfleet.coordinator.spawn.connection import NO_PYTHON, explain
 
 SAID = {
     "ssh: Could not resolve hostname x: Name or service not known": "no such host",
@@ -21,5 +21,5 @@ SAID = {
 
 
 @pytest.mark.parametrize("said", SAID)
-def test_each_failure_has_its_remedy(said):
+def test_an_error_of_ssh_is_explained_with_a_remedy(said):
     assert SAID[said] in explain(said.splitlines(), 255, "me@x")
