@@ -93,7 +93,7 @@ class PolicyWithOutputs(Protocol):
     """Optional: a policy whose actions hide the numbers they come from, for example the index of the largest output."""
 
     def outputs(self, observation: Any) -> Any:
-        """The numbers that an action comes from, as one or more arrays. Their bits too tell host classes apart."""
+        """The numbers that an action comes from, as one or more arrays. Their bits distinguish host classes too."""
 
 
 @dataclass(frozen=True)

@@ -84,10 +84,10 @@ def test_dropout_is_part_of_the_dream_and_changes_no_promise(tmp_path):
     ] == together
 
 
-def test_steps_are_told_as_they_are_made(dreaming, random_bundle):
-    told = []
-    dreaming.score([(vector, 1) for vector in candidates(random_bundle, 3)], told.append)
-    assert told == [3 * step for step in range(1, HORIZON + 1)]
+def test_steps_are_reported_as_they_are_made(dreaming, random_bundle):
+    reported = []
+    dreaming.score([(vector, 1) for vector in candidates(random_bundle, 3)], reported.append)
+    assert reported == [3 * step for step in range(1, HORIZON + 1)]
 
 
 def test_another_temperature_is_another_dream(dreaming, random_bundle):

@@ -131,11 +131,11 @@ def test_the_environment_dreams_the_same_bits_with_any_memory(tmp_path, memory, 
     assert [dreamt(environment, policy, *dream) for dream in dreams] == DreamBatch(bundle, spec(bundle)).score(dreams)
 
 
-@pytest.mark.parametrize(("memory", "told"), [("rewarded", 0), ("rewarded first", 1)])
-def test_an_empty_memory_holds_the_reward_that_training_began_with(tmp_path, memory, told):
+@pytest.mark.parametrize(("memory", "reward"), [("rewarded", 0), ("rewarded first", 1)])
+def test_an_empty_memory_holds_the_reward_that_training_began_with(tmp_path, memory, reward):
     bundle = write_random_bundle(tmp_path / "b.zip", vae=SMALL, rnn=MEMORIES[memory])
     _, info = CarRacingDream(bundle).reset(seed=1)
-    assert info["memory"].tolist() == [*[0] * 8, told]
+    assert info["memory"].tolist() == [*[0] * 8, reward]
     assert np.array_equal(info["memory"], RecurrentState(bundle).state[0, :9]), "as in reality"
 
 
@@ -147,18 +147,18 @@ def test_many_dreams_begin_and_begin_again_as_the_single_ones(bundle):
     assert info["_memory"].all()
     begun = [each.reset(seed=10 + index) for index, each in enumerate(single)]
     assert np.array_equal(latents, [latent for latent, _ in begun])
-    assert np.array_equal(info["memory"], [told["memory"] for _, told in begun])
+    assert np.array_equal(info["memory"], [given["memory"] for _, given in begun])
     assert 0 < info["memory"].any(axis=1).sum() < 6
     for _ in range(3):
-        latents, _, _, _, told = many.step(np.tile(action, (6, 1)))
+        latents, _, _, _, given = many.step(np.tile(action, (6, 1)))
         assert np.array_equal(latents, [each.step(action)[0] for each in single])
-        assert not told
-    _, _, _, _, told = many.step(np.tile(action, (6, 1)))
-    assert told["_memory"].all()
-    assert 0 < told["memory"].any(axis=1).sum() < 6
+        assert not given
+    _, _, _, _, given = many.step(np.tile(action, (6, 1)))
+    assert given["_memory"].all()
+    assert 0 < given["memory"].any(axis=1).sum() < 6
 
 
-def test_whoever_is_told_a_memory_may_do_with_it_what_he_likes(bundle):
+def test_a_memory_that_was_given_may_be_changed(bundle):
     environment = CarRacingDream(bundle, recorded=1.0)
     first = environment.reset(seed=1)[1]["memory"]
     kept = first.copy()

@@ -105,7 +105,7 @@ def test_the_dream_is_shown_with_hard_pixels_and_its_score_below():
 
 def test_the_longest_text_fits_the_narrowest_window():
     with DriveWindow("a dream", (64, 64), 1) as window:
-        for _ in range(12):  # the clock tells a rate after ten frames
+        for _ in range(12):  # the clock knows its rate after ten frames
             window.show(pygame.Surface((64, 64)), DriveStatus(-1234.5, 10_000, 10_000, over=False))
         shown = pygame.display.get_surface()
         right = shown.subsurface((shown.get_width() - 12, 64, 12, 64))

@@ -26,7 +26,7 @@ def test_it_takes_the_size_of_what_it_shows_and_keeps_the_last_picture(unseen):
 
 
 @pytest.mark.parametrize("event", [{"type": pygame.QUIT}, {"type": pygame.KEYDOWN, "key": pygame.K_q}])
-def test_whoever_looks_can_close_it(unseen, event):
+def test_a_viewer_can_close_it(unseen, event):
     with PictureWindow("night") as screen:
         assert screen.draw(PICTURE)
         pygame.event.post(pygame.event.Event(event.pop("type"), event))

@@ -17,9 +17,9 @@ CARTPOLE = "gym:CartPole-v1"
 
 
 def spec(name, hidden=0, **options):
-    told = describe_task(name, options)
-    shape = ControllerShape(told.observations, told.outputs, hidden)
-    return TaskSpec(name, "", 1000, 0, shape, options=told.options, version=told.version)
+    description = describe_task(name, options)
+    shape = ControllerShape(description.observations, description.outputs, hidden)
+    return TaskSpec(name, "", 1000, 0, shape, options=description.options, version=description.version)
 
 
 def test_a_familys_members_are_announced_by_its_name():
@@ -40,15 +40,15 @@ def test_a_familys_members_are_announced_by_its_name():
     ],
 )
 def test_sizes_and_packages_are_the_environments_own(name, observations, outputs, engine):
-    told = describe_task(name, {})
-    assert (told.observations, told.outputs) == (observations, outputs)
-    assert told.packages == ("numpy", "gymnasium", *engine)
-    assert told.options == ""
+    description = describe_task(name, {})
+    assert (description.observations, description.outputs) == (observations, outputs)
+    assert description.packages == ("numpy", "gymnasium", *engine)
+    assert description.options == ""
 
 
 def test_the_environments_arguments_are_part_of_the_run():
-    told = describe_task("gym:LunarLander-v3", {"environment": {"continuous": True}})
-    assert (told.outputs, json.loads(told.options)) == (2, {"environment": {"continuous": True}})
+    description = describe_task("gym:LunarLander-v3", {"environment": {"continuous": True}})
+    assert (description.outputs, json.loads(description.options)) == (2, {"environment": {"continuous": True}})
     scorer = Scorer(spec("gym:LunarLander-v3", environment={"continuous": True}))
     assert isinstance(scorer.world.actions, Continuous)
     assert scorer.score("score", np.zeros(18, np.float32), 1).steps > 10

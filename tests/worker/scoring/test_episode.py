@@ -118,10 +118,10 @@ def test_reward_restores_patience():
     assert score(Scripted(rewards), Still(), PARAMETERS, EpisodeConfig(1, 100, patience=10)).steps == 50
 
 
-def test_steps_are_told_as_they_are_made():
-    told = []
-    score(Scripted([0.0] * 5), Still(), PARAMETERS, EpisodeConfig(1, 100), told.append)
-    assert told == [1, 2, 3, 4, 5]
+def test_steps_are_reported_as_they_are_made():
+    reported = []
+    score(Scripted([0.0] * 5), Still(), PARAMETERS, EpisodeConfig(1, 100), reported.append)
+    assert reported == [1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

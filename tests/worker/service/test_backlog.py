@@ -149,7 +149,7 @@ def test_vectors_have_so_much_room_and_no_more(monkeypatch):
         backlog.add_batch(batch(number + 1, vectors=(rubbish,)))
     assert len(backlog._vectors) == 4
     backlog.add_batch(batch(101, (job(0),)))
-    assert not backlog.queued, "it is given again, to whoever has room"
+    assert not backlog.queued, "it is given again, to a worker with room"
 
 
 def test_a_vector_that_others_have_spoilt_costs_its_jobs_which_are_given_again():

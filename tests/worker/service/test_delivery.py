@@ -16,9 +16,9 @@ def test_a_result_is_repeated_until_its_verdict_and_then_no_more(stage, cached):
     hand.ready()
     first, second = hand.job(0), hand.job(1)
     hand.send(1, first)
-    told = [hand.result(first) for _ in range(3)]
-    assert told[0].fitness is not None
-    assert told[0] == told[1] == told[2]
+    results = [hand.result(first) for _ in range(3)]
+    assert results[0].fitness is not None
+    assert results[0] == results[1] == results[2]
     assert hand.beat(lambda beat: beat.unacked).unacked == (tag(first),)
     hand.send(2, second, accepted=(first,))
     hand.beat(lambda beat: tag(first) not in beat.unacked and beat.seen == 2)
@@ -121,12 +121,12 @@ def test_a_failing_task_leaves_its_traceback_in_the_log_once_with_the_job_that_m
     jobs = [hand.job(number) for number in range(3)]
     hand.send(1, *jobs)
     hand.results(*jobs)
-    told = wait_for(said, "the road has ended")
-    assert told.startswith(
+    logged = wait_for(said, "the road has ended")
+    assert logged.startswith(
         f"task {tasks.RAISING}: RuntimeError: the road has ended (score in generation 7, candidate 2"
     )
-    assert f"seed {jobs[0].seeds[0]})" in told
-    assert 'raise RuntimeError("the road has ended")' in told
+    assert f"seed {jobs[0].seeds[0]})" in logged
+    assert 'raise RuntimeError("the road has ended")' in logged
     assert not [line for line in drained(said) if "Traceback" in line]
 
 

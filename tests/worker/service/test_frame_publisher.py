@@ -112,7 +112,7 @@ def test_frames_are_no_news_that_a_coordinator_owes_an_answer_to(stage, cached, 
     hand.ready()
     watching = viewer(hand)
     hand.send(1, *(hand.job(episode) for episode in range(8)))
-    hand.result(hand.job(0))  # of which no verdict will tell
+    hand.result(hand.job(0))  # without a verdict
     hand.hello()
     watching.frame()
 
@@ -180,7 +180,7 @@ def test_a_real_slot_gives_the_same_bits_watched_and_not(random_bundle, task):
     spec = TaskSpec(task, sha256, 60, 0, controller=None if path else shape)
     vector = np.random.default_rng(0).normal(0, 0.1, shape.size).astype("<f4").tobytes()
     slot = Slot(0, spec, path, events, announced)
-    told, frames = [], 0
+    outcomes, frames = [], 0
     while not slot.ready:
         slot.handle(events.get(timeout=DEADLINE)[1])
     for shown in (False, True, False):
@@ -189,10 +189,10 @@ def test_a_real_slot_gives_the_same_bits_watched_and_not(random_bundle, task):
         while not (results := slot.handle(event := events.get(timeout=DEADLINE)[1])):
             assert shown
             frames += slot.find_job(event.child_number, event.message) is not None
-        told.append([(each.fitness, each.steps, each.error) for each in results])
+        outcomes.append([(each.fitness, each.steps, each.error) for each in results])
     slot.stop()
-    assert told[0] == told[1] == told[2]
-    assert told[0][0][2] is None
+    assert outcomes[0] == outcomes[1] == outcomes[2]
+    assert outcomes[0][0][2] is None
     assert frames >= 1
 
 
@@ -204,8 +204,8 @@ class Clock:
 
 
 def test_showing_takes_no_more_than_a_hundredth_of_the_time_however_dear_a_picture_is():
-    clock, told = Clock(), []
-    sampler = FrameSampler(told.append, lambda: True, clock, clock)
+    clock, frames = Clock(), []
+    sampler = FrameSampler(frames.append, lambda: True, clock, clock)
 
     def look():
         clock.now += 0.05
@@ -215,18 +215,18 @@ def test_showing_takes_no_more_than_a_hundredth_of_the_time_however_dear_a_pictu
         if sampler.is_due():
             sampler.observe(0, look)
         clock.now += 0.001
-    assert 0.05 * len(told) <= 1.1 * MAX_TIME_SHARE * clock.now
-    assert len(told) > 10
+    assert 0.05 * len(frames) <= 1.1 * MAX_TIME_SHARE * clock.now
+    assert len(frames) > 10
 
 
 def test_cheap_pictures_come_ten_a_second_and_none_where_nobody_wants_them_any_more():
-    clock, told, wanted = Clock(), [], [True]
-    sampler = FrameSampler(told.append, lambda: wanted[0], clock, clock)
+    clock, frames, wanted = Clock(), [], [True]
+    sampler = FrameSampler(frames.append, lambda: wanted[0], clock, clock)
     while clock.now < 10:
         if sampler.is_due():
             sampler.observe(0, lambda: StepSnapshot(0, 0.0, ACTION))
         clock.now += 0.001
-    assert len(told) == pytest.approx(10 / FRAME_INTERVAL, abs=3)
+    assert len(frames) == pytest.approx(10 / FRAME_INTERVAL, abs=3)
     wanted[0] = False
     clock.now += 10
     assert not sampler.is_due()

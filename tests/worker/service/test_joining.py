@@ -37,7 +37,7 @@ def test_it_waits_for_a_coordinator_that_starts_later(stage, said, cached):
     assert stage.hand().ready().slots == 1
 
 
-def test_a_slot_that_can_score_is_told_at_once(stage, cached):
+def test_a_slot_that_can_score_is_reported_at_once(stage, cached):
     hand = stage.hand()
     hand.intervals = SLOW_BEATS
     stage.worker()
@@ -82,7 +82,7 @@ def test_it_says_hello_again_about_the_packages_that_the_runs_fingerprint_names(
     assert hand.beat(lambda beat: beat.capacity > 0).slots == 1
 
 
-def test_a_refusal_is_told_once_and_again_as_the_reason_changes_and_asked_about_until_it_is_over(stage, said, cached):
+def test_a_refusal_is_logged_once_for_each_reason_and_the_run_is_asked_again(stage, said, cached):
     hand = stage.hand()
     hand.refusal = ("your moon is full", "wait a week")
     stage.worker()
@@ -119,7 +119,7 @@ def test_one_that_shall_leave_when_it_is_done_is_ended_by_a_refusal_with_the_rea
     assert "your moon is full; wait a week" in str(error)
 
 
-def test_a_run_that_is_told_in_a_later_versions_words_is_refused_rather_than_scored_otherwise(stage):
+def test_a_run_whose_task_a_later_version_describes_is_refused(stage):
     hand = stage.hand()
     hand.spec = OfTomorrow(**vars(hand.spec))
     _, served = stage.worker(exit_when_done=True)
@@ -149,7 +149,7 @@ def test_a_name_that_cannot_be_kept_is_refused():
         WorkerConfig(name="big host")
 
 
-def test_a_task_that_it_is_told_of_and_cannot_load_is_an_error_at_once():
+def test_a_task_that_is_given_and_cannot_be_loaded_is_an_error_at_once():
     with pytest.raises(UsageError, match=r"'tests\.support\.tasks:Moon' cannot be loaded"):
         Worker(WorkerConfig(), Network(), ("tests.support.tasks:Moon",))
 

@@ -22,7 +22,7 @@ def test_it_leaves_when_its_run_is_over_if_it_shall(stage, cached, monkeypatch, 
     assert served.result(DEADLINE) is None
 
 
-def test_told_to_stop_it_finishes_what_runs_and_delivers(stage, cached):
+def test_stopped_once_it_finishes_what_runs_and_delivers(stage, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     made, served = stage.worker()
     hand.ready()
@@ -37,7 +37,7 @@ def test_told_to_stop_it_finishes_what_runs_and_delivers(stage, cached):
     assert served.result(DEADLINE) is None
 
 
-def test_told_twice_it_leaves_what_runs(stage, said, cached):
+def test_stopped_twice_it_leaves_what_runs(stage, said, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     made, served = stage.worker()
     hand.ready()
@@ -49,7 +49,7 @@ def test_told_twice_it_leaves_what_runs(stage, said, cached):
     wait_for(said, ": 0 jobs")
 
 
-def test_told_to_stop_it_leaves_a_download(stage):
+def test_stopped_once_it_leaves_a_download(stage):
     hand = stage.hand()
     hand.damage = lambda offset, data: None
     made, served = stage.worker()

@@ -88,7 +88,7 @@ def test_a_question_without_an_answer_is_asked_again_after_a_pause():
     assert member.must_rejoin(3.0, BUSY)
 
 
-def test_told_once_it_drains_until_all_is_delivered():
+def test_stopped_once_it_drains_until_all_is_delivered():
     member = joined(drain_timeout=30.0)
     assert not member.start_draining_if_due(1.0)
     member.stop()
@@ -100,7 +100,7 @@ def test_told_once_it_drains_until_all_is_delivered():
     assert member.is_over(31.1, busy=True), "but not for ever"
 
 
-def test_told_twice_it_leaves_at_once():
+def test_stopped_twice_it_leaves_at_once():
     member = joined()
     member.stop()
     member.stop()
@@ -170,7 +170,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.now += seconds
 
     @rule()
-    def it_is_told_to_stop(self):
+    def it_is_stopped(self):
         self.member.stop()
         self.stops += 1
 

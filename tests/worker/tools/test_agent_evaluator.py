@@ -1,4 +1,4 @@
-"""A judge tells how an episode was driven, and drives it as it would unwatched."""
+"""An evaluator reports how an episode was driven, and the statistics change nothing."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def tiny():
 
 
 @pytest.mark.parametrize("task", ["car-racing", "dream"])
-def test_it_tells_speed_and_brake_of_a_drive_that_is_the_same_unwatched(tiny, monkeypatch, tmp_path, task):
+def test_it_reports_speed_and_brake_of_a_drive_that_is_the_same_unwatched(tiny, monkeypatch, tmp_path, task):
     monkeypatch.setattr(judging, "EpisodeConfig", lambda seed, _horizon: EpisodeConfig(seed, STEPS))
     controller = find_controller("tiny", tmp_path)[0]
     parameters = controller.parameters.copy()
@@ -44,7 +44,7 @@ def test_it_tells_speed_and_brake_of_a_drive_that_is_the_same_unwatched(tiny, mo
     assert 0 <= drive.speed < 20
 
 
-def test_of_a_world_that_tells_nothing_nothing_is_told():
+def test_a_world_without_a_true_state_has_no_statistics():
     watch = DriveStatistics(World(STEERING_GAS_BRAKE, action_names=("steer", "gas", "brake")), None)
     watch.on_transition(moment({"lap_finished": True}))
     assert watch.drive(3, Score(5.0, 1)) == EpisodeResult(3, 5.0, 1)

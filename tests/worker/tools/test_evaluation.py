@@ -29,7 +29,7 @@ def controller(random_bundle):
     return make
 
 
-def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
+def test_scores_are_those_of_the_evaluation_environment(controller, random_bundle):
     task = find_task(tasks.JUDGED)
     alone = {
         seed: episode.score(

@@ -53,13 +53,13 @@ def sight_of(bundle, task, **more):
     seen = eyes.glimpse
     picture = (1, 1, b"") if seen.picture is None else pack_picture(seen.picture)
     numbers = [each.astype("<f4").tobytes() for each in (seen.latent, seen.state, PARAMETERS)]
-    told = {
+    facts = {
         "slot": 0, "tag": b"ABCDEFGH", "step": seen.step, "reward": seen.score, "height": picture[0],
         "width": picture[1], "picture": picture[2], "packed": bool(picture[2]), "generation": 7, "candidate": 2,
         "seed": 2**20, "action": tuple(map(float, seen.action)), "latent": numbers[0], "state": numbers[1],
         "parameters": numbers[2], **more,
     }  # fmt: skip
-    return LiveFrame.of("host-a/0a1b2c3d", decode(ViewFrame, encode(ViewFrame(**HEAD, **told))))
+    return LiveFrame.of("host-a/0a1b2c3d", decode(ViewFrame, encode(ViewFrame(**HEAD, **facts))))
 
 
 @pytest.mark.parametrize("task", ["car-racing", "dream"])

@@ -18,7 +18,7 @@ def finished_run(processes, random_bundle):
     return processes.runs / "test"
 
 
-def test_a_fitness_that_is_not_what_was_stored_is_told_and_exits_1(processes, finished_run):
+def test_a_fitness_that_differs_from_the_stored_one_is_reported_and_exits_1(processes, finished_run):
     replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
     code, out, _ = processes.call(*replay)
     assert (code, out.count("same bits")) == (0, 2)

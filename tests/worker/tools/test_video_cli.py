@@ -22,7 +22,7 @@ def verb(request, random_bundle, tmp_path):
     return ["record", "--controller", str(path), "--bundle", str(random_bundle.path)]
 
 
-def told(capsys, verb, *words):
+def answers(capsys, verb, *words):
     assert command_line.main([*verb, "--steps", str(STEPS), "--json", *map(str, words)]) == 0
     return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
@@ -33,13 +33,13 @@ def pictures(video):
 
 
 def test_each_of_several_tracks_has_a_video_of_its_own(verb, tmp_path, capsys):
-    both = told(capsys, verb, "--seed", FIRST, SECOND, FIRST, "--out", tmp_path / "drive.mp4")
+    both = answers(capsys, verb, "--seed", FIRST, SECOND, FIRST, "--out", tmp_path / "drive.mp4")
     assert [each["seed"] for each in both] == [FIRST, SECOND]
     for each in both:
         video = tmp_path / f"drive-{each['seed']}.mp4"
         assert each["video"] == str(video)
         assert len(pictures(video)) == STEPS
-        alone = told(capsys, verb, "--seed", each["seed"], "--out", tmp_path / "alone.mp4")
+        alone = answers(capsys, verb, "--seed", each["seed"], "--out", tmp_path / "alone.mp4")
         assert alone == [{**each, "video": str(tmp_path / "alone.mp4")}]
         np.testing.assert_allclose(pictures(tmp_path / "alone.mp4"), pictures(video), atol=8)  # x264 differs by a bit
 
