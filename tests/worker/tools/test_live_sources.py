@@ -44,7 +44,7 @@ class Once:
         self.glimpse = look()
 
 
-def sight_of(bundle, task, **more):
+def live_frame_of(bundle, task, **more):
     """A worker's frame of a moment of the real task."""
     scorer, eyes = Scorer(TaskSpec(task, bundle.sha256, 20, 0, temperature=1.0), bundle), Once()
     scorer.observer = eyes
@@ -64,31 +64,31 @@ def sight_of(bundle, task, **more):
 
 @pytest.mark.parametrize("task", ["car-racing", "dream"])
 def test_a_workers_frame_is_decoded_and_dreamt_on_by_the_viewer(random_bundle, task):
-    sight, imagination = sight_of(random_bundle, task), LiveDreamer(random_bundle, 1.0)
-    imagined = imagination.decode_and_dream(sight)
-    assert (imagined.decoded == Decoder(random_bundle).decode(sight.latent[None])[0]).all()
-    assert [ahead for ahead, _ in imagined.dreamt] == list(AHEAD)
-    assert len({picture.tobytes() for _, picture in imagined.dreamt}) == len(AHEAD)
+    live, dreamer = live_frame_of(random_bundle, task), LiveDreamer(random_bundle, 1.0)
+    dream = dreamer.decode_and_dream(live)
+    assert (dream.decoded == Decoder(random_bundle).decode(live.latent[None])[0]).all()
+    assert [ahead for ahead, _ in dream.dreamt] == list(AHEAD)
+    assert len({picture.tobytes() for _, picture in dream.dreamt}) == len(AHEAD)
     assert all(
         np.array_equal(one[1], other[1])
-        for one, other in zip(imagined.dreamt, imagination.decode_and_dream(sight).dreamt, strict=True)
+        for one, other in zip(dream.dreamt, dreamer.decode_and_dream(live).dreamt, strict=True)
     )
-    shown = LiveCanvas("night", ("steer", "gas", "brake"), imagination).draw(sight)
+    shown = LiveCanvas("night", ("steer", "gas", "brake"), dreamer).draw(live)
     assert shown.picture.shape == (*SIZE[::-1], 3)
     assert shown.facts == {
         "run": "night", "worker": "host-a/0a1b2c3d", "kind": "score", "generation": 7, "candidate": 2, "seed": 2**20,
-        "step": 9, "score": sight.frame.reward,
+        "step": 9, "score": live.frame.reward,
     }  # fmt: skip
-    assert (sight.picture is None) == (task == "dream")
+    assert (live.picture is None) == (task == "dream")
 
 
 @pytest.mark.parametrize(
     "more", [{"latent": bytes(8)}, {"latent": b""}, {"state": bytes(8)}, {"parameters": bytes(16)}, {"picture": b""}]
 )
 def test_a_frame_that_is_of_another_world_model_is_shown_as_far_as_it_goes(random_bundle, more):
-    sight = sight_of(random_bundle, "car-racing", **({"packed": False} if "picture" in more else {}), **more)
-    glass = LiveCanvas("n" * 63, ("steer", "gas", "brake"), LiveDreamer(random_bundle, 1.0))
-    assert glass.draw(sight).picture.shape == (*SIZE[::-1], 3)
+    live = live_frame_of(random_bundle, "car-racing", **({"packed": False} if "picture" in more else {}), **more)
+    canvas = LiveCanvas("n" * 63, ("steer", "gas", "brake"), LiveDreamer(random_bundle, 1.0))
+    assert canvas.draw(live).picture.shape == (*SIZE[::-1], 3)
 
 
 def driver(bundle):
