@@ -112,8 +112,8 @@ class Backlog:
         """The complete vector with this hash; `None` while parts are missing.
 
         R13: a long vector travels in parts, because each message is limited.
-        R2: it is complete once its bytes have the named hash. If it is long enough and has another hash, it is dropped, so
-        that damaged bytes are never scored.
+        R2: it is complete once its bytes have the named hash. With another hash it is dropped, so that damaged
+        bytes are never scored.
         """
         vector = self._vectors.get(vector_hash)
         if not isinstance(vector, PartialVector):
