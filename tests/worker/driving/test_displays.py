@@ -54,7 +54,7 @@ def run(code, folder, **variables):
     return done.stdout.splitlines()[-1]
 
 
-def test_looking_for_a_screen_loads_no_driver_of_graphics(tmp_path):
+def test_looking_for_a_screen_loads_no_graphics_driver(tmp_path):
     assert run(WITHOUT_A_SCREEN + WHAT_IS_LOADED, tmp_path) == "[]"
 
 

@@ -22,7 +22,7 @@ def spec(name, hidden=0, **options):
     return TaskSpec(name, "", 1000, 0, shape, options=description.options, version=description.version)
 
 
-def test_a_familys_members_are_announced_by_its_name():
+def test_a_family_is_announced_by_its_name():
     assert "gym" in known_tasks()
     assert (family_of(CARTPOLE), family_of("car-racing"), family_of("a.module:Task")) == (
         "gym", "car-racing", "a.module:Task",
@@ -95,7 +95,7 @@ def test_observations_are_normalised_by_what_the_run_froze():
         ("car-racing:x", "cannot be loaded"),
     ],
 )
-def test_what_cannot_be_scored_in_is_refused_with_why(name, says):
+def test_an_unusable_environment_is_refused_with_the_reason(name, says):
     with pytest.raises(UsageError, match=says):
         describe_task(name, {})
 
@@ -141,7 +141,7 @@ def strange():
         ({"fails": "exit"}, "cannot be made: SystemExit"),
     ],
 )
-def test_whatever_an_environment_does_as_it_is_made_is_one_error(strange, arguments, says):
+def test_any_error_while_an_environment_is_made_is_one_line(strange, arguments, says):
     with pytest.raises(UsageError, match=says):
         describe_task(strange, {"environment": arguments})
 
@@ -165,6 +165,6 @@ def test_a_controller_of_other_outputs_is_refused():
         Scorer(TaskSpec(CARTPOLE, "", 100, 0, ControllerShape(4, 3)))
 
 
-def test_of_equal_outputs_the_first_action_is_taken_and_numbers_begin_where_the_environment_says():
+def test_the_first_of_equal_outputs_is_chosen_and_actions_start_at_the_spaces_start():
     assert Discrete(3, first=2).to_action(np.array([0.0, 1.0, 1.0])) == 3
     assert Continuous.between([0, -2], [1, 2]).to_action(np.array([0.0, 100.0])) == pytest.approx([0.5, 2.0])

@@ -46,7 +46,7 @@ class Listening(Still):
         self.heard.append(value)
 
 
-def test_a_policy_that_listens_hears_every_reward():
+def test_a_reward_aware_policy_gets_every_reward():
     policy = Listening()
     score(Scripted([1.0, 2.0, 3.5]), policy, PARAMETERS, EpisodeConfig(1, 100))
     assert policy.heard == [1.0, 2.0, 3.5]
@@ -64,7 +64,7 @@ def test_the_horizon_ends_an_episode():
     assert score(Scripted([1.0] * 10), Still(), PARAMETERS, EpisodeConfig(1, 4)).steps == 4
 
 
-def test_a_hopeless_episode_is_cut_and_charged_what_standing_still_costs():
+def test_an_episode_that_patience_cuts_is_charged_for_standing_still():
     driven = score(
         Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, EpisodeConfig(1, 100, patience=20, idle_cost=0.1)
     )
@@ -83,7 +83,7 @@ def test_a_hopeless_episode_is_cut_and_charged_what_standing_still_costs():
         ([1.0] + [0.0] * 39, {}, 20),  # it was given up
     ],
 )
-def test_time_costs_until_the_course_is_finished_and_to_crash_saves_nothing(rewards, info, paid):
+def test_time_is_charged_until_the_course_is_finished_and_after_a_crash(rewards, info, paid):
     free = EpisodeConfig(1, 20, patience=5, finish="lap")
     found = [score(Scripted(rewards, info), Still(), PARAMETERS, each) for each in (free, replace(free, time_cost=0.5))]
     assert found[0].fitness - found[1].fitness == 0.5 * paid
@@ -105,7 +105,7 @@ class OffCourse(Scripted):
 @pytest.mark.parametrize(
     ("off_course_steps", "paid"), [((), 0), ((3,), 1), (range(5, 9), 4), (range(1, 180), MAX_OFF_COURSE_STEPS)]
 )
-def test_steps_off_the_course_cost_so_much_and_one_loss_no_more(off_course_steps, paid):
+def test_steps_off_the_course_are_charged_up_to_a_limit(off_course_steps, paid):
     free = EpisodeConfig(1, 200, off_course="off")
     course = [free, replace(free, off_course_cost=2.0)]
     found = [score(OffCourse([0.0] * 199, off_course_steps), Still(), PARAMETERS, each) for each in course]
@@ -125,7 +125,7 @@ def test_steps_are_reported_as_they_are_made():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_what_is_no_number_is_an_error_and_no_fitness(value):
+def test_a_sum_that_is_not_finite_is_an_error(value):
     with pytest.raises(ValueError, match="NaN"):
         score(Scripted([1.0]), Still(), np.full(3, value, np.float32), EpisodeConfig(1, 10))
     with pytest.raises(ValueError, match="add up"):

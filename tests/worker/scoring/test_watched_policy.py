@@ -46,7 +46,7 @@ def watched_and_not(scorer, jobs):
 
 
 @pytest.mark.parametrize("kind", ["score", "evaluate", "collect"])
-def test_a_drive_by_a_world_model_shows_what_it_sees_and_from_where_it_would_dream_on(random_bundle, kind):
+def test_a_step_with_a_world_model_shows_picture_latent_and_state(random_bundle, kind):
     scorer = Scorer(TaskSpec("car-racing", random_bundle.sha256, HORIZON, 0), random_bundle)
     vector = parameters(random_bundle.controller_shape.size)
     if kind == "collect":
@@ -70,7 +70,7 @@ def test_a_drive_by_a_world_model_shows_what_it_sees_and_from_where_it_would_dre
     scorer.close()
 
 
-def test_a_turn_of_dreams_shows_the_first_that_goes_on(random_bundle):
+def test_a_batch_of_dreams_shows_the_first_that_has_not_ended(random_bundle):
     scorer = Scorer(TaskSpec("dream", random_bundle.sha256, HORIZON, 0, temperature=1.0), random_bundle)
     jobs = [("score", parameters(random_bundle.controller_shape.size, row), 2**20 + row) for row in range(20)]
     scores, seen = watched_and_not(scorer, jobs)
@@ -83,7 +83,7 @@ def test_a_turn_of_dreams_shows_the_first_that_goes_on(random_bundle):
 
 
 @pytest.mark.parametrize("name", ["gym:CartPole-v1", "gym:LunarLander-v3", "gym:Acrobot-v1"])
-def test_gymnasiums_own_worlds_are_drawn_for_an_onlooker(name):
+def test_gymnasiums_own_worlds_are_drawn_while_watched(name):
     spec = TaskSpec(name, "", 200, 0, controller=shape_of(find_task(name).describe({})))
     scorer = Scorer(spec)
     jobs = [("score", parameters(spec.controller.size, row), 2**20 + row) for row in range(3)]
@@ -98,7 +98,7 @@ def shape_of(world):
     return ControllerShape(world.observations, world.outputs)
 
 
-def test_a_world_that_is_now_and_then_drawn_steps_as_one_that_is_not():
+def test_drawing_does_not_change_the_steps():
     task = find_task("gym:LunarLander-v3")
     shown = task.make_watched_environment(
         Assignment(TaskSpec(task.name, "", 200, 0, controller=shape_of(task.describe({}))))
@@ -117,7 +117,7 @@ class Sketchy(CartPoleEnv):
     """Not of gymnasium's own: its pictures might change something."""
 
 
-def test_another_packages_world_is_not_drawn_and_one_that_cannot_be_drawn_is_shown_without(monkeypatch):
+def test_other_packages_worlds_are_shown_without_a_picture(monkeypatch):
     gymnasium.register("Sketchy-v0", Sketchy, max_episode_steps=50)
     task = find_task("gym:Sketchy-v0")
     spec = TaskSpec("gym:Sketchy-v0", "", 50, 0, controller=shape_of(task.describe({})))

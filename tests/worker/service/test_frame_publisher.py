@@ -67,7 +67,7 @@ def viewer():
         each.close()
 
 
-def test_a_viewer_is_shown_the_job_that_runs_and_what_it_sees(stage, hand, cached, viewer):
+def test_a_viewer_sees_the_running_job_and_its_observation(stage, hand, cached, viewer):
     stage.worker()
     hand.ready()
     watching = viewer(hand)
@@ -105,7 +105,7 @@ def test_scores_are_the_same_bits_while_two_viewers_come_and_go_or_are_killed(st
     assert hand.result(hand.job(0)).fitness == plain.fitness
 
 
-def test_frames_are_no_news_that_a_coordinator_owes_an_answer_to(stage, cached, viewer):
+def test_frames_do_not_restart_the_coordinators_silence(stage, cached, viewer):
     """A worker that has results without a verdict says hello again after five silent beats, watched or not."""
     hand = stage.hand(tasks.PAINTED)
     stage.worker()
@@ -133,7 +133,7 @@ def test_after_a_slot_was_killed_in_the_middle_the_next_child_is_watched(stage, 
     assert (unpack_picture(frame) == frame.step).all()
 
 
-def test_of_two_slots_one_is_shown(stage, hand, cached, viewer):
+def test_one_of_two_slots_is_shown(stage, hand, cached, viewer):
     stage.worker(slots=2)
     hand.hello()
     hand.beat(lambda beat: beat.capacity == 2)
@@ -161,7 +161,7 @@ def shown_by(slot):
         seen.append(event.message)
 
 
-def test_a_child_that_nobody_watches_says_nothing_but_its_result(slot):
+def test_an_unwatched_child_sends_only_its_result(slot):
     unwatched, fitness = shown_by(slot)
     assert unwatched == []
     slot.slot.show(True)
@@ -173,7 +173,7 @@ def test_a_child_that_nobody_watches_says_nothing_but_its_result(slot):
 
 
 @pytest.mark.parametrize("task", ["car-racing", "dream", "gym:CartPole-v1"])
-def test_a_real_slot_gives_the_same_bits_watched_and_not(random_bundle, task):
+def test_a_slot_gives_the_same_bits_watched_and_not(random_bundle, task):
     events, announced = queue.SimpleQueue(), ("car-racing", "dream", "gym")
     sha256, path = ("", None) if task.startswith("gym") else (random_bundle.sha256, random_bundle.path)
     shape = ControllerShape(4, 2) if path is None else random_bundle.controller_shape
@@ -203,7 +203,7 @@ class Clock:
         return self.now
 
 
-def test_showing_takes_no_more_than_a_hundredth_of_the_time_however_dear_a_picture_is():
+def test_expensive_frames_take_at_most_a_hundredth_of_the_time():
     clock, frames = Clock(), []
     sampler = FrameSampler(frames.append, lambda: True, clock, clock)
 
@@ -219,7 +219,7 @@ def test_showing_takes_no_more_than_a_hundredth_of_the_time_however_dear_a_pictu
     assert len(frames) > 10
 
 
-def test_cheap_pictures_come_ten_a_second_and_none_where_nobody_wants_them_any_more():
+def test_cheap_frames_come_ten_a_second_while_somebody_watches():
     clock, frames, wanted = Clock(), [], [True]
     sampler = FrameSampler(frames.append, lambda: wanted[0], clock, clock)
     while clock.now < 10:
@@ -232,7 +232,7 @@ def test_cheap_pictures_come_ten_a_second_and_none_where_nobody_wants_them_any_m
     assert not sampler.is_due()
 
 
-def test_what_goes_wrong_as_a_step_is_shown_fails_no_job():
+def test_an_error_while_sampling_fails_no_job():
     sampler = FrameSampler(lambda _seen: 1 / 0, lambda: True)
     sampler.observe(0, lambda: StepSnapshot(0, 0.0, ACTION))
     assert not sampler.is_due()

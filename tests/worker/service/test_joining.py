@@ -70,7 +70,7 @@ def test_without_a_name_several_runs_are_listed_until_one_is_left(stage, said, c
     other.close()
 
 
-def test_it_says_hello_again_about_the_packages_that_the_runs_fingerprint_names(stage, cached):
+def test_it_says_hello_again_with_the_packages_of_the_runs_fingerprint(stage, cached):
     hand = stage.hand()
     hand.packages = ("numpy", "no-such-package")
     stage.worker()
@@ -111,7 +111,7 @@ def say(query, reply):
         query.reply(query.key_expr, encode_json(reply))
 
 
-def test_one_that_shall_leave_when_it_is_done_is_ended_by_a_refusal_with_the_reason_and_the_remedy(stage):
+def test_a_refusal_ends_a_worker_with_exit_when_done(stage):
     stage.hand().refusal = ("your moon is full", "wait a week")
     _, served = stage.worker(exit_when_done=True)
     error = served.exception(DEADLINE)
@@ -128,7 +128,7 @@ def test_a_run_whose_task_a_later_version_describes_is_refused(stage):
     assert "in a form that this version does not know (wrong fields); install dreamfleet" in str(error)
 
 
-def test_of_any_run_one_that_refuses_is_left_to_others(stage, said, cached):
+def test_with_any_a_run_that_refuses_is_skipped(stage, said, cached):
     picky = stage.hand(run="picky")
     picky.refusal = ("your moon is full", "wait a week")
     other = stage.also(picky, run="second")
@@ -138,13 +138,13 @@ def test_of_any_run_one_that_refuses_is_left_to_others(stage, said, cached):
     other.ready()
 
 
-def test_a_name_is_what_the_run_knows_it_by(stage, cached):
+def test_a_name_is_its_identity_in_the_run(stage, cached):
     hand = stage.hand()
     stage.worker(name="hostB")
     assert hand.hello().worker.startswith("hostB/")
 
 
-def test_a_name_that_cannot_be_kept_is_refused():
+def test_an_invalid_name_is_refused():
     with pytest.raises(UsageError, match="'big host' cannot name a worker"):
         WorkerConfig(name="big host")
 
@@ -173,7 +173,7 @@ def test_a_task_that_it_did_not_announce_is_never_imported(stage, cached, tmp_pa
     assert not mark.exists()
 
 
-def test_a_worker_of_any_run_leaves_one_of_an_unannounced_task_to_others(stage, said, cached):
+def test_with_any_a_run_of_an_unannounced_task_is_skipped(stage, said, cached):
     hand = stage.hand("os:abort", run="evil")
     other = stage.also(hand, run="second")
     other.slots = 1
@@ -192,7 +192,7 @@ def test_a_child_imports_no_task_that_its_worker_did_not_announce(tmp_path, monk
     assert not mark.exists()
 
 
-def test_a_world_model_of_a_world_that_it_did_not_announce_imports_nothing(stage, tmp_path, monkeypatch):
+def test_a_world_model_of_an_unannounced_task_imports_nothing(stage, tmp_path, monkeypatch):
     mark, small = foreign(tmp_path, monkeypatch), stage.bundle
     parts = {name: small.read(name) for name in small.manifest.parts}
     world = replace(small.manifest, task="foreign_world:World")
@@ -203,7 +203,7 @@ def test_a_world_model_of_a_world_that_it_did_not_announce_imports_nothing(stage
     assert not mark.exists()
 
 
-def test_it_names_its_class_with_all_that_it_says_once_a_child_has_found_it_out(stage, cached):
+def test_it_sends_its_host_class_once_a_child_has_determined_it(stage, cached):
     hand = stage.hand()
     stage.worker()
     assert hand.hello().host_class == ""
@@ -217,7 +217,7 @@ def test_it_names_its_class_with_all_that_it_says_once_a_child_has_found_it_out(
     assert hand.hello().host_class == beat.host_class
 
 
-def test_a_coordinator_from_before_classes_hears_nothing_of_them(stage, cached):
+def test_a_coordinator_without_host_classes_gets_none(stage, cached):
     hand = stage.hand()
     hand.classes = False
     stage.worker()

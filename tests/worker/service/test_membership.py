@@ -33,14 +33,14 @@ def joined(visible=True, **terms):
     return made
 
 
-def test_a_member_whose_coordinator_is_in_sight_and_speaks_says_nothing():
+def test_it_says_no_hello_while_its_coordinator_is_in_sight_and_active():
     member = joined()
     for second in range(1, 20):
         member.note_activity(float(second))
         assert not any(member.must_rejoin(float(second), hands) for hands in (IDLE, BUSY, OWED))
 
 
-def test_a_run_that_ends_with_its_workers_is_left_at_once_and_the_next_one_is_not():
+def test_it_leaves_a_run_that_ends_at_once_and_not_the_next_one():
     member = joined()
     member.end_run()
     assert member.is_over(1.0, busy=True)
@@ -49,7 +49,7 @@ def test_a_run_that_ends_with_its_workers_is_left_at_once_and_the_next_one_is_no
 
 
 @pytest.mark.parametrize(("hands", "after"), [(IDLE, PATIENCE), (OWED, PATIENCE), (UPLOADING, PATIENCE + UPLOAD_GRACE)])
-def test_silence_that_means_something_makes_it_ask_whether_it_is_known(hands, after):
+def test_silence_of_a_coordinator_that_owes_an_answer_makes_it_say_hello(hands, after):
     member = joined()
     assert not member.must_rejoin(after, hands)
     assert member.must_rejoin(after + 0.1, hands)
@@ -59,7 +59,7 @@ def test_silence_while_jobs_run_means_nothing():
     assert not joined().must_rejoin(1e6, BUSY)
 
 
-def test_a_coordinator_that_was_out_of_sight_is_asked_at_once_and_only_when_it_is_back():
+def test_it_says_hello_when_the_coordinator_is_back_in_sight():
     member = joined()
     member.remove_coordinator("first", 1.0)
     assert not member.must_rejoin(1.0, BUSY)
@@ -70,7 +70,7 @@ def test_a_coordinator_that_was_out_of_sight_is_asked_at_once_and_only_when_it_i
     assert not member.must_rejoin(1.1, BUSY)
 
 
-def test_another_life_of_the_coordinator_is_asked_and_then_obeyed():
+def test_it_says_hello_to_another_life_of_the_coordinator():
     member = joined()
     member.remove_coordinator("first", 1.0)
     assert not member.add_coordinator("second")
@@ -79,7 +79,7 @@ def test_another_life_of_the_coordinator_is_asked_and_then_obeyed():
     assert not member.must_rejoin(1.1, BUSY)
 
 
-def test_a_question_without_an_answer_is_asked_again_after_a_pause():
+def test_an_unanswered_hello_is_repeated_after_a_pause():
     member = joined()
     member.remove_coordinator("first", 1.0)
     member.add_coordinator("first")
@@ -117,7 +117,7 @@ def test_it_drains_at_the_end_of_its_lifetime_which_begins_before_any_run():
 
 
 @pytest.mark.parametrize("seen", [True, False])
-def test_it_leaves_a_run_that_is_gone_if_it_shall(seen):
+def test_it_leaves_a_run_without_a_coordinator_if_configured(seen):
     leaves, stays = (joined(visible=seen, leaves_without_coordinator=each) for each in (True, False))
     for member in (leaves, stays):
         if seen:

@@ -21,7 +21,7 @@ def result(number):
     return Result(number.to_bytes(32, "little"), 1.0, 10, 0.1, None, None)
 
 
-def test_a_result_leaves_at_once_and_again_until_its_verdict():
+def test_a_result_is_due_at_once_and_again_until_its_verdict():
     outbox = Outbox(repeat=1.0)
     outbox.add(result(1))
     assert outbox.due(0.0) == [(result(1),)]

@@ -53,7 +53,7 @@ def test_a_world_without_a_true_state_has_no_statistics():
 @pytest.mark.parametrize(
     ("last", "finished"), [({"lap_finished": True}, True), ({"lap_finished": False}, False), ({}, False)]
 )
-def test_a_lap_is_finished_where_the_environment_says_so_as_it_ends(last, finished):
+def test_a_lap_is_finished_if_the_environment_says_so_at_the_end(last, finished):
     watch = DriveStatistics(find_task("car-racing").world, lambda: {"speed": 30.0})
     for info in ({}, last):
         watch.on_transition(moment(info))
@@ -61,7 +61,7 @@ def test_a_lap_is_finished_where_the_environment_says_so_as_it_ends(last, finish
     assert (drive.finished, drive.speed, drive.braking) == (finished, 30.0, 0.0)
 
 
-def test_gymnasium_says_so_of_a_lap():
+def test_gymnasium_reports_a_finished_lap():
     """The rule that is relied on: all tiles visited, and the flag in `info`; off the field it is there, and false."""
     environment = gymnasium.make("CarRacing-v3")
     environment.reset(seed=1)

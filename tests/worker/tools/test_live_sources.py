@@ -63,7 +63,7 @@ def live_frame_of(bundle, task, **more):
 
 
 @pytest.mark.parametrize("task", ["car-racing", "dream"])
-def test_a_workers_frame_is_decoded_and_dreamt_on_by_the_viewer(random_bundle, task):
+def test_the_viewer_decodes_a_workers_frame_and_continues_it_as_a_dream(random_bundle, task):
     live, dreamer = live_frame_of(random_bundle, task), LiveDreamer(random_bundle, 1.0)
     dream = dreamer.decode_and_dream(live)
     assert (dream.decoded == Decoder(random_bundle).decode(live.latent[None])[0]).all()
@@ -85,7 +85,7 @@ def test_a_workers_frame_is_decoded_and_dreamt_on_by_the_viewer(random_bundle, t
 @pytest.mark.parametrize(
     "more", [{"latent": bytes(8)}, {"latent": b""}, {"state": bytes(8)}, {"parameters": bytes(16)}, {"picture": b""}]
 )
-def test_a_frame_that_is_of_another_world_model_is_shown_as_far_as_it_goes(random_bundle, more):
+def test_a_frame_of_another_world_model_is_shown_without_the_model(random_bundle, more):
     live = live_frame_of(random_bundle, "car-racing", **({"packed": False} if "picture" in more else {}), **more)
     canvas = LiveCanvas("n" * 63, ("steer", "gas", "brake"), LiveDreamer(random_bundle, 1.0))
     assert canvas.draw(live).picture.shape == (*SIZE[::-1], 3)
@@ -97,7 +97,7 @@ def driver(bundle):
     return lambda: (agent, {"controller": "mine"})
 
 
-def test_a_controller_is_shown_at_the_worlds_pace_and_scores_as_it_would_unseen(random_bundle, monkeypatch):
+def test_a_controller_is_shown_in_real_time_and_scores_the_same(random_bundle, monkeypatch):
     drive = driver(random_bundle)
     agent, _ = drive()
     shown = list(islice(driven_frames(drive, ParallelDreamConfig(), 10, SEED), 8))
@@ -113,7 +113,7 @@ def test_a_controller_is_shown_at_the_worlds_pace_and_scores_as_it_would_unseen(
 PICTURES = [CaptionedFrame(np.full((40, 60, 3), value, np.uint8), {"step": value}) for value in (10, 200, 90)]
 
 
-def test_stills_lie_in_a_folder_beside_what_they_show(tmp_path):
+def test_pictures_are_in_a_folder_with_their_facts(tmp_path):
     with open_sink(str(tmp_path / "new" / "stills"), 10, io.BytesIO()) as show:
         assert all(show(each) for each in (None, *PICTURES))
     assert sorted(path.name for path in (tmp_path / "new" / "stills").iterdir()) == [
@@ -131,7 +131,7 @@ def test_a_video_has_every_picture(tmp_path):
         assert len(list(container.decode(stream))) == 3
 
 
-def test_a_stream_is_read_back_picture_by_picture_and_ends_where_its_reader_leaves(tmp_path):
+def test_a_stream_has_every_picture_and_ends_when_its_reader_leaves(tmp_path):
     out = io.BytesIO()
     with open_sink("-", 10, out) as show:
         assert all(show(each) for each in (None, *PICTURES))
@@ -150,7 +150,7 @@ def test_a_stream_is_read_back_picture_by_picture_and_ends_where_its_reader_leav
         assert not show(PICTURES[0])
 
 
-def test_places_where_nothing_can_be_written_are_refused(tmp_path):
+def test_unwritable_outputs_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     for name in ("live.webm", "file", "file/stills", "file/live.mp4"):
         with pytest.raises(DreamfleetError, match="--out"), open_sink(str(tmp_path / name), 10, io.BytesIO()):

@@ -25,7 +25,7 @@ def controller(random_bundle):
     return Controller(shape, parameters, "car-racing", random_bundle.sha256)
 
 
-def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_bundle, tmp_path):
+def test_a_video_has_one_frame_a_step_and_the_drives_score(controller, random_bundle, tmp_path):
     steps, agent = [], make_agent(controller, random_bundle)
     score = record(agent, SEED, STEPS, tmp_path / "new" / "drive.mp4", on_step=steps.append)
     task, assignment = find_task("car-racing"), Assignment.of("car-racing", random_bundle)
@@ -42,7 +42,7 @@ def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_
 
 
 @pytest.mark.parametrize("after", [0, 3])
-def test_a_recording_that_is_stopped_can_be_played_as_far_as_it_came(controller, random_bundle, tmp_path, after):
+def test_a_stopped_recording_is_playable(controller, random_bundle, tmp_path, after):
     steps = [0]
     record(
         make_agent(controller, random_bundle), SEED, STEPS, tmp_path / "drive.mp4", on_step=steps.append,
@@ -61,7 +61,7 @@ def test_a_controller_that_was_evolved_in_the_dream_is_recorded_in_reality(contr
     assert scores[0] == scores[1]
 
 
-def test_a_bundle_that_cannot_dream_is_recorded_with_two_pictures(controller, random_bundle, tmp_path):
+def test_a_bundle_without_a_dream_is_recorded_with_two_pictures(controller, random_bundle, tmp_path):
     manifest = random_bundle.manifest
     parts = {name: random_bundle.read(name) for name in manifest.parts if name != DREAM_GRAPH}
     awake = write_bundle(tmp_path / "awake.zip", replace(manifest, parts={}), parts)

@@ -32,7 +32,7 @@ def pictures(video):
         return [each.to_ndarray(format="rgb24").astype(int) for each in container.decode(container.streams.video[0])]
 
 
-def test_each_of_several_tracks_has_a_video_of_its_own(verb, tmp_path, capsys):
+def test_each_track_has_its_own_video(verb, tmp_path, capsys):
     both = answers(capsys, verb, "--seed", FIRST, SECOND, FIRST, "--out", tmp_path / "drive.mp4")
     assert [each["seed"] for each in both] == [FIRST, SECOND]
     for each in both:
@@ -53,9 +53,7 @@ def test_each_of_several_tracks_has_a_video_of_its_own(verb, tmp_path, capsys):
         (("--out", "folder.mp4"), "--out folder.mp4 is a folder: name a file in it"),
     ],
 )
-def test_what_cannot_be_recorded_is_one_line_before_anything_is_driven(
-    verb, words, says, tmp_path, monkeypatch, capsys
-):
+def test_an_invalid_recording_is_one_line_before_the_first_step(verb, words, says, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.mp4").mkdir()
     assert command_line.main([*verb, *words]) == UsageError.exit_code
