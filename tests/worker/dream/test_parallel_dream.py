@@ -15,7 +15,7 @@ TINY = VAEConfig(latent=3, channels=(2, 2, 2, 2))
 
 
 def drive(bundle, steps, config=None, moved=0.0):
-    """The latents of a made-up drive, those dreamt beside it, and since when."""
+    """The latents of an artificial drive, the dreamt ones, and where each dream started."""
     random, model = np.random.default_rng(0), DreamStep(bundle)
     parameters = random.normal(size=bundle.controller_shape.size).astype(np.float32)
     daydream = ParallelDream(bundle, parameters, config or ParallelDreamConfig(every=4))
@@ -55,7 +55,7 @@ def test_a_dream_that_has_ended_restarts(tmp_path):
     rnn = MDNRNNConfig(latent=3, hidden=4, done=True)
     vae, model = random_models(0, TINY, rnn)
     with torch.no_grad():
-        model.heads.bias[-1] = 9.0  # always over
+        model.heads.bias[-1] = 9.0  # always predicts the end
     parts = export_graphs(weights(vae), weights(model), np.zeros((1, 2, 3), np.float32), TINY, rnn)
     bundle = write_bundle(tmp_path / "b.zip", make_manifest("over", {}, TINY, rnn), parts)
     real, dreamt, since = drive(bundle, 3)

@@ -1,4 +1,4 @@
-"""A display that nobody asked for is not opened, and one that was opened harms nothing that comes after."""
+"""No display is opened without need, and an opened one does not harm the training that follows."""
 
 import os
 import subprocess
@@ -63,7 +63,7 @@ def test_driving_opens_no_display(tmp_path):
 
 
 def test_a_process_that_drew_through_mesa_trains(tmp_path):
-    """The real triton where torch brought it, else one that ends the process as the real one does."""
+    """The real triton if torch installed it, or else a fake that crashes the process as the real one does."""
     if find_spec("triton") is None:
         (tmp_path / "triton").mkdir()
         stand_in = "import os\nif 'libLLVM' in open('/proc/self/maps').read(): os._exit(139)\n"

@@ -57,7 +57,7 @@ def test_the_environments_arguments_are_part_of_the_run():
 
 def test_a_score_is_the_environments_own_under_a_controller():
     scorer = Scorer(spec(CARTPOLE))
-    parameters = np.array([0, 0, -1, -1, 0, 0, 1, 1, 0, 0], np.float32)  # to the side that the pole falls to
+    parameters = np.array([0, 0, -1, -1, 0, 0, 1, 1, 0, 0], np.float32)  # pushes to the side to which the pole falls
     environment = gymnasium.make("CartPole-v1")
     observation, _ = environment.reset(seed=7)
     total, over = 0.0, False
@@ -101,7 +101,7 @@ def test_an_unusable_environment_is_refused_with_the_reason(name, says):
 
 
 class Strange(gymnasium.Env):
-    """What its arguments say."""
+    """An environment whose arguments choose its actions, or the error that its construction raises."""
 
     observation_space = gymnasium.spaces.Box(-1, 1, (2,))
 

@@ -43,7 +43,7 @@ def test_a_burst_replaces_a_resting_action_for_some_steps():
 
 
 class Recorder(DisturbedPolicy):
-    """Writes down what is done, and of it the disturbance."""
+    """Records each action and its noise."""
 
     def on_action(self, action, push):
         self.noted = (*getattr(self, "noted", ()), (action, push))

@@ -11,7 +11,7 @@ PARAMETERS = np.zeros(3, np.float32)
 
 
 class Scripted(gymnasium.Env):
-    """Gives these rewards, then ends."""
+    """An environment with given rewards."""
 
     observation_space = spaces.Box(-1, 1, (1,))
     action_space = spaces.Box(-1, 1, (1,))
@@ -76,11 +76,11 @@ def test_an_episode_that_patience_cuts_is_charged_for_standing_still():
 @pytest.mark.parametrize(
     ("rewards", "info", "paid"),
     [
-        ([1.0] * 8, {"lap": True}, 8),  # it came home
-        ([1.0] * 8, {"lap": False}, 20),  # it crashed
+        ([1.0] * 8, {"lap": True}, 8),  # finished
+        ([1.0] * 8, {"lap": False}, 20),  # crashed
         ([1.0] * 8, {}, 20),
-        ([1.0] * 40, {}, 20),  # it is still on its way
-        ([1.0] + [0.0] * 39, {}, 20),  # it was given up
+        ([1.0] * 40, {}, 20),  # reached the horizon
+        ([1.0] + [0.0] * 39, {}, 20),  # cut by patience
     ],
 )
 def test_time_is_charged_until_the_course_is_finished_and_after_a_crash(rewards, info, paid):
@@ -91,7 +91,7 @@ def test_time_is_charged_until_the_course_is_finished_and_after_a_crash(rewards,
 
 
 class OffCourse(Scripted):
-    """Says in its `info` which steps leave the course: these."""
+    """An environment whose `info` says at given steps that they are off the course."""
 
     def __init__(self, rewards, off_course_steps):
         super().__init__(rewards)

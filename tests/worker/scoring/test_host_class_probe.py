@@ -1,4 +1,4 @@
-"""The class of a host: what it computes on fixed inputs, and nothing else."""
+"""The class of a host depends only on the bits that it computes on fixed inputs."""
 
 import numpy as np
 import pytest

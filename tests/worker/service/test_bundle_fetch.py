@@ -1,4 +1,4 @@
-"""Downloads that are cut, over a real router: what is on disk stays, and the whole is verified."""
+"""Interrupted downloads over a real router: parts on disk stay, and the whole file is verified."""
 
 import hashlib
 import resource

@@ -1,4 +1,4 @@
-"""What a worker takes and what it delivers, whatever is lost, doubled or foreign."""
+"""A worker receives and delivers correctly although messages are lost, repeated or foreign."""
 
 import hashlib
 

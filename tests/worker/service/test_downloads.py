@@ -1,4 +1,4 @@
-"""A worker that fetches its run's world model: damage, and what an earlier download left."""
+"""A worker fetches its run's world model: damaged parts, and files of earlier downloads."""
 
 import pytest
 
@@ -42,7 +42,7 @@ def test_it_asks_again_for_a_bundle_that_arrived_damaged(stage, said):
 
 
 def test_wrong_parts_of_a_stranger_do_not_prevent_the_download(stage, said):
-    """Somebody answers first for every part, with bytes of nothing."""
+    """A stranger answers first for every part, with wrong bytes."""
     hand = stage.hand()
     head = {"run_uid": hand.run_uid, "incarnation": 1, "sha256": bytes.fromhex(stage.bundle.sha256)}
 

@@ -1,4 +1,4 @@
-"""What a worker shows while somebody subscribes, and that nothing of it changes or delays anything."""
+"""The frames that a worker sends while somebody subscribes; they change and delay nothing."""
 
 import multiprocessing
 import queue
@@ -25,7 +25,7 @@ ACTION = (0.0, 1.0)
 
 
 class Viewer:
-    """Subscribes to all that a worker shows."""
+    """A subscriber to a worker's frames."""
 
     def __init__(self, hand, worker=None):
         self._frames = queue.SimpleQueue()
@@ -48,7 +48,7 @@ class Viewer:
 
 @pytest.fixture
 def hand(stage):
-    """A coordinator that nobody takes for silent."""
+    """A coordinator that is never considered silent."""
     made = stage.hand(tasks.PAINTED)
     made.intervals = Intervals(beat=10.0, repeat=0.1)
     return made
@@ -96,7 +96,7 @@ def test_scores_are_the_same_bits_while_two_viewers_come_and_go_or_are_killed(st
     one, other = viewer(hand), viewer(hand)
     hand.send(2, *(hand.job(episode) for episode in range(1, 4)), accepted=(hand.job(0),))
     one.frame()
-    one.close()  # without a word to anybody
+    one.close()  # without notice
     other.frame()
     other.leave()
     for episode in range(1, 4):
@@ -125,7 +125,7 @@ def test_after_a_slot_was_killed_in_the_middle_the_next_child_is_watched(stage, 
     hand.send(1, *jobs)
     watching.frame()
     (child,) = multiprocessing.active_children()
-    child.kill()  # in whichever job it has come to by now
+    child.kill()  # in any job
     killed = hand.failure()
     assert "slot crashed" in killed.error
     later = {tag(job) for job in jobs[[job.digest for job in jobs].index(killed.digest) + 1 :]}
@@ -151,7 +151,7 @@ def slot(small_bundle):
 
 
 def shown_by(slot):
-    """The words that a slot's child says of one turn, its result last."""
+    """The messages of a slot's child about one group, its result last."""
     slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
     seen = []
     while True:

@@ -1,4 +1,4 @@
-"""What a coordinator says, or a task of its worker, ends no worker."""
+"""Neither a coordinator's message nor a task ends a worker."""
 
 from dreamfleet.common.protocol.codec import encode
 from dreamfleet.common.protocol.messages import Result, ResultBatch

@@ -1,4 +1,4 @@
-"""What a child does with a turn, without a child."""
+"""Scoring a group of jobs, without a child process."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ WORK = [(job(number), VECTOR) for number in range(3)]
 
 
 class Scorer:
-    """Gives the scores that it was made with, after one step each."""
+    """Returns given scores, after one step each."""
 
     def __init__(self, *scores):
         self._scores = scores

@@ -1,4 +1,4 @@
-"""How a worker comes to a run: it waits, is welcomed or refused."""
+"""How a worker joins a run: it waits, is welcomed or is refused."""
 
 import os
 import queue
@@ -21,12 +21,12 @@ from tests.support.hand import DEADLINE, SECOND, Hand
 from tests.support.processes import free_port
 from tests.support.stage import drained, wait_for
 
-SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest that there are
+SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest valid ones
 
 
 @dataclass(frozen=True)
 class OfTomorrow(TaskSpec):
-    """A specification with what a later version adds to it."""
+    """A specification with a field of a later version."""
 
     later: float = 0.5
 
@@ -97,7 +97,7 @@ def test_a_refusal_is_logged_once_for_each_reason_and_the_run_is_asked_again(sta
 
 
 def test_one_answer_of_several_is_enough_to_join(stage, cached):
-    """Somebody who answers for everything, and says that he knows all, answers first and refuses."""
+    """A stranger that claims to answer every query completely answers first, and refuses."""
     hand = stage.hand()
     refusal = replace(samples.JSON["hello-reply"], run="test", accepted=False, why="go away", remedy="far away")
     with open_session(Network(connect=(hand.endpoint,))) as session:
@@ -155,7 +155,7 @@ def test_a_task_that_is_given_and_cannot_be_loaded_is_an_error_at_once():
 
 
 def foreign(tmp_path, monkeypatch):
-    """A module that leaves a mark when it is imported, and the mark."""
+    """A module that writes a file when it is imported, and that file."""
     mark = tmp_path / "imported"
     (tmp_path / "foreign_world.py").write_text(
         f"open({str(mark)!r}, 'w').close()\ndef World():\n    raise SystemExit\n"

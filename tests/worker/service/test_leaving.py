@@ -87,7 +87,7 @@ def test_late_events_of_the_last_runs_slots_do_not_reach_the_next_run(stage, sai
     hand.ready()
     other = stage.also(hand, run="two")
     hand.vanish()
-    hand.slots = 1  # as if another worker served it: the next run is the one that has none
+    hand.slots = 1  # as if another worker served it; the next run has no slots
     other.ready()
     other.send(1, other.job())
     assert other.result(other.job()).fitness is not None

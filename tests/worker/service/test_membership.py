@@ -1,4 +1,4 @@
-"""When a worker says hello again, drains and leaves, in any order of what may happen to it."""
+"""When a worker says hello again, drains and leaves, for any order of events."""
 
 import math
 
@@ -25,7 +25,7 @@ UPLOADING = WorkerLoad(idle=True, awaits_verdict=True, uploading=True)
 
 
 def joined(visible=True, **terms):
-    """At time 0, in the first life of a coordinator."""
+    """A member at time 0, in the first life of its coordinator."""
     made = Membership(LeaveConditions(**terms), now=0.0)
     made.join("first", BEAT, now=0.0)
     if visible:
@@ -126,14 +126,14 @@ def test_it_leaves_a_run_without_a_coordinator_if_configured(seen):
         since = 1e6 if seen else 0.0
         member.remove_coordinator(
             "never seen", since + COORDINATOR_GONE_AFTER
-        )  # a token that is lost twice starts no clock anew
+        )  # losing a token twice does not restart the clock
         assert not member.is_over(since + COORDINATOR_GONE_AFTER, busy=True)
     assert leaves.is_over(since + COORDINATOR_GONE_AFTER + 0.1, busy=True)
     assert not stays.is_over(math.inf, busy=False)
 
 
 class AnyOrder(RuleBasedStateMachine):
-    """A worker among coordinators that come and go, beside a plain account of what happened."""
+    """A worker among coordinators that come and go, compared with a simple model of what happened."""
 
     nonces = st.sampled_from(["first", "second", "third"])
     hands = st.builds(WorkerLoad, idle=st.booleans(), awaits_verdict=st.booleans(), uploading=st.booleans())
@@ -220,7 +220,7 @@ class AnyOrder(RuleBasedStateMachine):
             elif self.drains:
                 alone = (
                     not self.seen and self.now - self.alone > COORDINATOR_GONE_AFTER
-                )  # nobody takes what it would deliver
+                )  # nobody could receive its results
                 assert is_over == (not busy or self.now > self.drain_until or alone)
             else:
                 assert is_over == (not self.seen and self.now - self.alone > COORDINATOR_GONE_AFTER)

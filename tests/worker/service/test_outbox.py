@@ -58,7 +58,7 @@ def test_verdicts_on_nothing_are_harmless():
 
 
 def drain(uploads, now, seconds):
-    """Everything that leaves from `now` on, with its time."""
+    """Everything that is sent from `now` on, with its time."""
     sent = []
     for turn in range(round(seconds / BURST_INTERVAL) + 1):
         sent += [(now + turn * BURST_INTERVAL, part) for part in uploads.due(now + turn * BURST_INTERVAL)]

@@ -1,4 +1,4 @@
-"""A worker and the next life of its coordinator, or a coordinator that may have forgotten it."""
+"""A worker after its coordinator restarted, or may have forgotten it."""
 
 from dataclasses import replace
 from time import monotonic
@@ -14,7 +14,7 @@ from tests.support.hand import DEADLINE, SECOND, tag
 from tests.support.relay import Relay
 from tests.support.stage import wait_for
 
-SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest that there are
+SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest valid ones
 
 
 def test_it_follows_its_run_into_the_coordinators_next_life(stage, cached):
@@ -82,7 +82,7 @@ def relay(stage):
 
 def test_a_cut_connection_makes_it_say_hello_again(stage, relay, cached):
     hand = stage.hand()
-    hand.intervals = SLOW_BEATS  # so that no silence is long enough to be what it notices
+    hand.intervals = SLOW_BEATS  # so long that silence cannot be what makes it say hello
     stage.worker(relay.endpoint)
     hand.ready()
     first, second = hand.job(0), hand.job(1)

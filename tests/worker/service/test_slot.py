@@ -230,7 +230,7 @@ def test_a_hung_job_is_killed_and_its_child_replaced(harness):
     slot.slot.submit([(stalling, VECTOR)])
     now = monotonic()
     slot.slot.check(now + 4.0, 0.0)
-    slot.slot.check(now + 8.0, 4.0)  # the host stood still for four of the eight seconds
+    slot.slot.check(now + 8.0, 4.0)  # the host was suspended for four of the eight seconds
     assert slot.slot.running
     slot.slot.check(now + 9.5, 0.0)
     result = slot.result()
@@ -265,7 +265,7 @@ def test_a_child_that_hangs_as_it_starts_is_replaced(harness):
     pid, now = slot.slot.pid, monotonic()
     os.kill(pid, signal.SIGSTOP)
     slot.slot.check(now + START_LIMIT - 1.0, 0.0)
-    slot.slot.check(now + 2 * START_LIMIT, START_LIMIT)  # so long did the host itself stand still
+    slot.slot.check(now + 2 * START_LIMIT, START_LIMIT)  # the host was suspended for that time
     slot.slot.check(now + 2 * START_LIMIT + 2.0, 0.0)
     slot.slot.handle(slot.gone())
     assert slot.score().fitness is not None
@@ -328,7 +328,7 @@ def test_a_child_that_ends_as_it_starts_blames_no_job(harness):
         slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
     os.kill(slot.slot.pid, signal.SIGKILL)
     assert slot.result().error == "slot crashed (signal 9)"
-    os.kill(slot.slot.pid, signal.SIGKILL)  # the next child, to which the second job has gone, and which starts
+    os.kill(slot.slot.pid, signal.SIGKILL)  # the next child, which is starting and has the second job
     scored = slot.result()
     assert scored.digest == job(1, spec=slot.spec).digest
     assert scored.fitness is not None

@@ -106,7 +106,7 @@ def test_a_job_is_scored_with_the_controller_shape_of_its_run(random_bundle):
 
 
 def varied(bundle, task="car-racing", horizon=5, **named):
-    """A specification of a variant, and a vector that it scores."""
+    """A specification with a variant, and a parameter vector."""
     variant = Variant(**named)
     shape = bundle.shape_of("zh", 0, variant)
     spec = TaskSpec(task, bundle.sha256, horizon, 0, shape, options=variant.options, version=variant.version)
@@ -114,7 +114,7 @@ def varied(bundle, task="car-racing", horizon=5, **named):
 
 
 def judged(spec, bundle, vector, episode_config):
-    """The score of a course in the task's judge."""
+    """The score of an episode in the task's evaluation environment."""
     task, assignment = find_task(spec.task), Assignment(spec, bundle)
     judge = task.make_evaluation_environment(assignment)
     found = score(judge, task.make_policy(assignment), vector, episode_config)

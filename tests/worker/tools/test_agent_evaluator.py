@@ -62,7 +62,7 @@ def test_a_lap_is_finished_if_the_environment_says_so_at_the_end(last, finished)
 
 
 def test_gymnasium_reports_a_finished_lap():
-    """The rule that is relied on: all tiles visited, and the flag in `info`; off the field it is there, and false."""
+    """gymnasium's flag in `info`: true when all tiles were visited, false when the car left the field."""
     environment = gymnasium.make("CarRacing-v3")
     environment.reset(seed=1)
     inner = environment.unwrapped

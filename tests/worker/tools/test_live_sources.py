@@ -1,4 +1,4 @@
-"""What is shown live: of a worker's frames, and of drives for the viewer; and where it goes."""
+"""Live frames of workers and of drives for the viewer, and their outputs."""
 
 import io
 import json
@@ -31,26 +31,26 @@ PARAMETERS = np.random.default_rng(0).normal(0, 0.1, 867).astype(np.float32)
 
 
 class Once:
-    """Sees the tenth step."""
+    """Observes the tenth step."""
 
     def __init__(self):
-        self.glimpse, self._asked = None, 0
+        self.step, self._asked = None, 0
 
     def is_due(self):
         self._asked += 1
         return self._asked == 10
 
     def observe(self, _episode, look):
-        self.glimpse = look()
+        self.step = look()
 
 
 def live_frame_of(bundle, task, **more):
-    """A worker's frame of a moment of the real task."""
+    """A worker's frame of one step of a task."""
     scorer, eyes = Scorer(TaskSpec(task, bundle.sha256, 20, 0, temperature=1.0), bundle), Once()
     scorer.observer = eyes
     scorer.score("score", PARAMETERS, 2**20)
     scorer.close()
-    seen = eyes.glimpse
+    seen = eyes.step
     picture = (1, 1, b"") if seen.picture is None else pack_picture(seen.picture)
     numbers = [each.astype("<f4").tobytes() for each in (seen.latent, seen.state, PARAMETERS)]
     facts = {

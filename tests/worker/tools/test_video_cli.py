@@ -1,4 +1,4 @@
-"""`record` and `baseline record` take the same tracks and answer alike."""
+"""`record` and `baseline record` take the same arguments and print the same answers."""
 
 import json
 
