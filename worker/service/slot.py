@@ -162,7 +162,7 @@ class Slot:
         since += gap
         if not self.ready:
             limit = START_LIMIT * 2**self._failed_starts
-            self._kill_after(limit, now - since, f"no word for {limit:g} s as it started")
+            self._kill_after(limit, now - since, f"not ready after {limit:g} s")
         elif self._groups:
             if self.steps != steps:
                 since = now
