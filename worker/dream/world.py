@@ -49,9 +49,7 @@ class DreamWorld:
         if self._reward_kind == "none" and not survival:
             raise BundleError(f"{bundle.path.name} predicts no reward: nothing can be scored in its dream")
         if self._reward_kind != "value" and self._dream_reward is None:
-            raise BundleError(
-                f"task {bundle.manifest.task} does not say what a dreamt step of {bundle.path.name} is worth"
-            )
+            raise BundleError(f"task {bundle.manifest.task} defines no reward for a dreamt step of {bundle.path.name}")
         self._step = DreamStep(bundle)
         self._temperature = temperature
         self.chance = self._step.chance

@@ -1,1 +1,1 @@
-"""A person at the wheel, on the track or in the dream."""
+"""Driving by hand, on the track or in the dream."""

@@ -1,1 +1,1 @@
-"""Scoring candidates: one episode loop for all who drive one."""
+"""Scoring candidates, with one episode loop for scoring, evaluating, recording and collecting."""

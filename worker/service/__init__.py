@@ -1,1 +1,1 @@
-"""A worker as a service: joins a run, scores what it is given, delivers until acknowledged."""
+"""The worker service: it joins a run, scores jobs, and delivers each result until it is acknowledged."""

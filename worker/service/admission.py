@@ -37,7 +37,7 @@ class Admission:
     spec: TaskSpec
     intervals: Intervals
     packages: tuple[str, ...] = NUMERIC_PACKAGES  # the run's fingerprint consists of their versions
-    numbering: int = 0  # R12: each welcome starts a new numbering of batches
+    numbering: int = 0  # R12: of the batches that follow; older ones cannot pass for current ones
     classes: bool = False  # whether the coordinator supports host classes
 
 

@@ -111,8 +111,9 @@ class Backlog:
     def _assemble(self, vector_hash: bytes) -> bytes | None:
         """The complete vector with this hash; `None` while parts are missing.
 
-        R13: a long vector travels in parts. R2: it is complete once its bytes have the named hash; if it is long enough
-        and has another hash, it is dropped.
+        R13: a long vector travels in parts, because each message is limited.
+        R2: it is complete once its bytes have the named hash. With another hash it is dropped, so that damaged
+        bytes are never scored.
         """
         vector = self._vectors.get(vector_hash)
         if not isinstance(vector, PartialVector):

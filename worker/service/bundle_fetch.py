@@ -7,6 +7,7 @@ hash is used again only if nobody else answers.
 from __future__ import annotations
 
 import logging
+import os
 import random
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -88,21 +89,22 @@ def _download(
     total, silences, source = None, 0, ""
     sources: set[str] = set()
     with open_append(path) as file:
-        while (total is None or file.tell() < total) and not stopped():
-            before = file.tell()
+        length = file.seek(0, os.SEEK_END)
+        while (total is None or length < total) and not stopped():
+            before = length
             offsets = [before + index * MAX_PART for index in range(WINDOW if total else 1)]
             wanted = [each for each in offsets if total is None or each < total]
             parts = _query_parts(session, key, sha256, wanted, inbox, stopped, source)
             source = source or _choose_source(parts, corrupt_sources)
             for part in sorted(parts.get(source, []), key=lambda part: part.offset):
                 total = _checked_length(part) if total is None else total
-                if part.total == total and part.offset == file.tell() and part.offset + len(part.data) <= total:
-                    file.write(part.data)
+                if part.total == total and part.offset == length and length + len(part.data) <= total:
+                    length += file.write(part.data)
                     sources.add(source)
-            if total is not None and file.tell() > total:
-                file.seek(0)
+            if total is not None and length > total:
+                length = file.seek(0)
                 file.truncate()  # it was the beginning of another file
-            elif file.tell() > before or file.tell() == total:
+            elif length > before or length == total:
                 silences = 0
             else:
                 silences, total, source = silences + 1, None, ""  # its length may have been wrong

@@ -77,7 +77,7 @@ def _make_scorer(
 def _score_groups(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandoned: Any, is_watched: Any) -> None:
     """Score group after group until the parent closes the pipe.
 
-    R9: a group whose jobs are no longer wanted (`abandoned`) ends at its next step.
+    R9: a group whose jobs are no longer wanted (`abandoned`) ends at its next step, so that the slot is free again.
     """
     from dreamfleet.worker.service.frame_sampler import FrameSampler
     from dreamfleet.worker.service.job_group import AbandonedError, score_group

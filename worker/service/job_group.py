@@ -64,7 +64,8 @@ class AbandonedError(Exception):
 def score_group(scorer: Scorer, group: int, work: Sequence[JobWithVector], count: Callable[[int], None]) -> GroupDone:
     """Score a group and return one result a job.
 
-    R8: an exception of the task becomes an error of these jobs, never a fitness. It does not end the slot.
+    R8: an exception of the task becomes an error of these jobs, because a wrong fitness would mislead the search. The
+    slot lives on.
     `count` gets the number of steps so far, over all jobs; it may raise `AbandonedError` to end the group.
     """
     started, made = perf_counter(), 0
@@ -117,7 +118,8 @@ def _results(
 def _result(job: Job, score: Score, spent: float, sha256: bytes | None, horizon: int) -> Result:
     """The result of one job.
 
-    R8: a fitness or step count out of bounds becomes this job's error; the jobs scored with it keep their results.
+    R8: a fitness or step count out of bounds becomes this job's error, because a wrong number would mislead the search.
+    The jobs scored with it keep their results.
     """
     fitness, steps = float(score.fitness), int(score.steps)
     why = rejection_reason(fitness, steps, spent, LONGEST_EPISODE if job.kind == "evaluate" else horizon)

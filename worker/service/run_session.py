@@ -175,7 +175,7 @@ class RunSession:
 
         R12: a batch of another life or of an older numbering is ignored, because the coordinator has said its content
         again since. A batch of a newer numbering only makes this worker say hello.
-        R9: a cancelled job stops at its next step.
+        R9: a cancelled job stops at its next step, so that no slot works for nothing.
         """
         batch = self._link.inbox.decode(JobBatch, payload)
         if batch is None:

@@ -81,7 +81,8 @@ class CoordinatorSender:
     ) -> None:  # fmt: skip
         """Send a heartbeat: batches received up to `seen`, queued and running jobs, results without a verdict.
 
-        R10: `seen` confirms batches. R12: `numbering` names their numbering, so it confirms no batch of another one.
+        R10: `seen` confirms batches, so that the coordinator does not send them again.
+        R12: `numbering` names the numbering that `seen` belongs to, so it confirms no batch of another one.
         R20: every job that this worker has is listed, because a job that is not listed is given to another worker.
         """
         running: list[RunningJob] = slots.running

@@ -162,7 +162,7 @@ class Slot:
         since += gap
         if not self.ready:
             limit = START_LIMIT * 2**self._failed_starts
-            self._kill_after(limit, now - since, f"no word for {limit:g} s as it started")
+            self._kill_after(limit, now - since, f"not ready after {limit:g} s")
         elif self._groups:
             if self.steps != steps:
                 since = now
@@ -173,7 +173,7 @@ class Slot:
     def abandon(self, digest: bytes) -> None:
         """Mark a job as unwanted.
 
-        R9: a group without a wanted job ends at its next step.
+        R9: a group without a wanted job ends at its next step, so that no slot works for nothing.
         """
         for group in self._groups:
             digests = {job.digest for job in group.jobs}
@@ -231,7 +231,7 @@ class Slot:
     def _replace_child(self) -> tuple[Result, ...]:
         """Replace a child that is gone; return errors for the jobs that it was scoring.
 
-        R8: a crash is an error of these jobs, never a fitness.
+        R8: a crash is an error of these jobs, which other workers then try, and never a fitness.
         """
         assert self._child is not None  # it has just sent its last event
         if not self._child.wait_for_exit():

@@ -67,7 +67,7 @@ class SlotPool:
     def capacity(self) -> int:
         """How many jobs the ready slots score at once.
 
-        R14: heartbeats report it, and it bounds how many jobs the coordinator gives this worker.
+        R14: the coordinator gives this worker at most twice as many jobs, so that little is lost with it.
         """
         return min(sum(slot.ready for slot in self._slots) * self._batch_size, MAX_LEASES // 2)
 

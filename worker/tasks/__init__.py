@@ -1,1 +1,1 @@
-"""What can be scored in: each task is an environment and what a controller sees of it and may do."""
+"""Tasks: the contract between an environment, a policy and the rest of the system, and finding tasks by name."""

@@ -96,7 +96,7 @@ class PolicyWithOutputs(Protocol):
     """
 
     def outputs(self, observation: Any) -> Any:
-        """The numbers that an action comes from, as one or more arrays. Their bits too tell host classes apart."""
+        """The numbers that an action comes from, as one or more arrays. Their bits distinguish host classes too."""
 
 
 @dataclass(frozen=True)

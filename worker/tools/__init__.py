@@ -1,1 +1,1 @@
-"""What people do with a controller: judge it, record it, score it again."""
+"""Tools for people: evaluate, record, watch and replay a controller."""

@@ -28,9 +28,9 @@ def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Episod
     pin_thread_pools()
     if jobs == 1:  # in this process, so that a script needs no `if __name__ == "__main__"`
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-        judge = AgentEvaluator(agent)
-        yield from map(judge.drive, seeds)
-        judge.close()
+        evaluator = AgentEvaluator(agent)
+        yield from map(evaluator.drive, seeds)
+        evaluator.close()
         return
     pool = ProcessPoolExecutor(
         min(jobs, len(seeds)), get_context("spawn"), _ProcessEvaluator.start, (agent, os.getpid())

@@ -20,7 +20,7 @@ Driver = tuple[Agent, dict[str, Any]]
 """An agent, and the facts about it for captions."""
 
 
-def worker_frames(view: LiveView, glass: LiveCanvas, rate: float) -> Iterator[CaptionedFrame | None]:
+def worker_frames(view: LiveView, canvas: LiveCanvas, rate: float) -> Iterator[CaptionedFrame | None]:
     """Yield a worker's newest frame `rate` times a second until the run is over; the last one again if none is new.
 
     `None` before the first frame.
@@ -28,8 +28,8 @@ def worker_frames(view: LiveView, glass: LiveCanvas, rate: float) -> Iterator[Ca
     shown, due = None, monotonic()
     while not view.is_over:
         due = max(due + 1 / rate, monotonic())
-        if (sight := view.next(max(0.0, due - monotonic()))) is not None:
-            shown = glass.draw(sight)
+        if (live_frame := view.next(max(0.0, due - monotonic()))) is not None:
+            shown = canvas.draw(live_frame)
         sleep(max(0.0, due - monotonic()))
         yield shown
 

@@ -47,25 +47,25 @@ class LiveDreamer:
 
     def __init__(self, bundle: Bundle, temperature: float) -> None:
         self._decoder, self._latent = Decoder(bundle), bundle.manifest.latent
-        self._onward = DreamContinuation(bundle, temperature) if can_dream(bundle) else None
+        self._continuation = DreamContinuation(bundle, temperature) if can_dream(bundle) else None
 
-    def decode_and_dream(self, sight: LiveFrame) -> DecodedDream | None:
+    def decode_and_dream(self, live: LiveFrame) -> DecodedDream | None:
         """The decoded dream of a frame; `None` if the frame has no latent of this world model."""
-        latent = sight.latent
+        latent = live.latent
         if latent is None or len(latent) != self._latent:
             return None
-        dreamt = self._dream(sight)
+        dreamt = self._dream(live)
         pictures = self._decoder.decode(np.stack([latent, *dreamt.values()]))
         return DecodedDream(pictures[0], tuple(zip(dreamt, pictures[1:], strict=True)))
 
-    def _dream(self, sight: LiveFrame) -> dict[int, NDArray[np.float32]]:
+    def _dream(self, live: LiveFrame) -> dict[int, NDArray[np.float32]]:
         """The dreamt latents by steps ahead."""
-        if self._onward is None or sight.latent is None or sight.state is None or sight.parameters is None:
+        if self._continuation is None or live.latent is None or live.state is None or live.parameters is None:
             return {}
-        moment = sight.latent, sight.state, sight.parameters
-        if not self._onward.fits(*moment):
+        moment = live.latent, live.state, live.parameters
+        if not self._continuation.fits(*moment):
             return {}
-        steps = islice(self._onward.dream(*moment, sight.frame.seed), max(AHEAD))
+        steps = islice(self._continuation.dream(*moment, live.frame.seed), max(AHEAD))
         return {ahead: latent[0] for ahead, latent in enumerate(steps, 1) if ahead in AHEAD}
 
 
@@ -77,42 +77,42 @@ class LiveCanvas(Board):
         super().__init__(SIZE, actions)
         self._run, self._dreamer = run, dreamer
 
-    def draw(self, sight: LiveFrame) -> CaptionedFrame:
+    def draw(self, live: LiveFrame) -> CaptionedFrame:
         """Draw a frame."""
-        imagined = None if self._dreamer is None else self._dreamer.decode_and_dream(sight)
+        dream = None if self._dreamer is None else self._dreamer.decode_and_dream(live)
         self._surface.fill(BACKGROUND)
-        if imagined is not None:
-            self._draw_model(sight.picture, imagined)
-        elif sight.picture is not None:
-            self._draw_fitted("what it looks like", sight.picture, (EDGE, EDGE), WHOLE)
+        if dream is not None:
+            self._draw_model(live.picture, dream)
+        elif live.picture is not None:
+            self._draw_fitted("what it looks like", live.picture, (EDGE, EDGE), WHOLE)
         else:
             self._text("this task shows no picture", (EDGE, EDGE), self._small, FAINT)
-        self._draw_words(sight)
-        return CaptionedFrame(pixels(self._surface), frame_facts(self._run, sight))
+        self._draw_words(live)
+        return CaptionedFrame(pixels(self._surface), frame_facts(self._run, live))
 
-    def _draw_model(self, seen: Frame | None, imagined: DecodedDream) -> None:
+    def _draw_model(self, seen: Frame | None, dream: DecodedDream) -> None:
         """Draw observation and decoded latent side by side; without an observation, the decoded latent alone."""
         left, words = (SIZE[0] - BIG) // 2, "its dream, decoded"
         if seen is not None:
             self._draw_fitted("what the model sees", seen, (EDGE, EDGE), (BIG, BIG))
             left, words = SIZE[0] - EDGE - BIG, "what it decodes"
-        self._draw_fitted(words, imagined.decoded, (left, EDGE), (BIG, BIG))
-        self._draw_strip(imagined)
+        self._draw_fitted(words, dream.decoded, (left, EDGE), (BIG, BIG))
+        self._draw_strip(dream)
 
-    def _draw_strip(self, imagined: DecodedDream) -> None:
+    def _draw_strip(self, dream: DecodedDream) -> None:
         pitch = (SIZE[0] - 2 * EDGE - SMALL) // (len(AHEAD) - 1)
-        if not imagined.dreamt:
+        if not dream.dreamt:
             self._text("no dream goes on from here", (EDGE, STRIP), self._small, FAINT)
-        for column, (ahead, picture) in enumerate(imagined.dreamt):
+        for column, (ahead, picture) in enumerate(dream.dreamt):
             words = f"dreamt {ahead} steps on" if column == 0 else f"{ahead} steps on"
             self._draw_fitted(words, picture, (EDGE + column * pitch, STRIP), (SMALL, SMALL))
 
-    def _draw_words(self, sight: LiveFrame) -> None:
-        frame = sight.frame
+    def _draw_words(self, live: LiveFrame) -> None:
+        frame = live.frame
         whose = f"candidate {frame.candidate}" if frame.kind == "score" else "its mean, in reality"
         lines = [
             f"generation {frame.generation}, {whose}",
-            f"run {truncate(self._run, NAME)}   worker {truncate(sight.worker.partition('/')[0], NAME)}",
+            f"run {truncate(self._run, NAME)}   worker {truncate(live.worker.partition('/')[0], NAME)}",
             f"seed {frame.seed}",
         ]
         self._text(f"score {frame.reward:7.1f}   step {frame.step}", (EDGE, FOOT), self._large, INK)
@@ -132,10 +132,10 @@ class LiveCanvas(Board):
         self._picture(picture, (corner[0], corner[1] + LABEL), size, smooth=height != width)
 
 
-def frame_facts(run: str, sight: LiveFrame) -> dict[str, Any]:
+def frame_facts(run: str, live: LiveFrame) -> dict[str, Any]:
     """The facts of a frame, for captions and JSON."""
-    frame = sight.frame
+    frame = live.frame
     return {
-        "run": run, "worker": sight.worker, "kind": frame.kind, "generation": frame.generation,
+        "run": run, "worker": live.worker, "kind": frame.kind, "generation": frame.generation,
         "candidate": frame.candidate, "seed": frame.seed, "step": frame.step, "score": frame.reward,
     }  # fmt: skip

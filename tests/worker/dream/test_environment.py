@@ -47,7 +47,7 @@ def test_the_hidden_state_behind_the_latent_is_what_a_controller_remembers(rando
 
 
 @pytest.mark.parametrize("features", ["z", "zh"])
-def test_many_dreams_are_the_single_ones(random_bundle, features):
+def test_vectorised_dreams_equal_single_ones(random_bundle, features):
     many = gymnasium.make_vec(
         ENVIRONMENT, num_envs=3, bundle=random_bundle, vectorization_mode="vector_entry_point", horizon=4,
         features=features,
@@ -68,12 +68,12 @@ def test_many_dreams_are_the_single_ones(random_bundle, features):
 
 
 @pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_temperature_that_is_none_is_refused(random_bundle, temperature):
+def test_an_invalid_temperature_is_refused(random_bundle, temperature):
     with pytest.raises(UsageError, match="temperature must be a positive number"):
         CarRacingDream(random_bundle, temperature=temperature)
 
 
-def test_an_action_that_is_none_is_refused(random_bundle):
+def test_an_invalid_action_is_refused(random_bundle):
     environment = CarRacingDream(random_bundle)
     environment.reset(seed=1)
     with pytest.raises(ValueError, match="three finite numbers"):

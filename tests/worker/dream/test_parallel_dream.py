@@ -15,7 +15,7 @@ TINY = VAEConfig(latent=3, channels=(2, 2, 2, 2))
 
 
 def drive(bundle, steps, config=None, moved=0.0):
-    """The latents of a made-up drive, those dreamt beside it, and since when."""
+    """The latents of an artificial drive, the dreamt ones, and where each dream started."""
     random, model = np.random.default_rng(0), DreamStep(bundle)
     parameters = random.normal(size=bundle.controller_shape.size).astype(np.float32)
     daydream = ParallelDream(bundle, parameters, config or ParallelDreamConfig(every=4))
@@ -29,14 +29,14 @@ def drive(bundle, steps, config=None, moved=0.0):
     return real, np.stack(dreamt), since
 
 
-def test_a_dream_begins_again_with_the_drives_latent_and_goes_its_own_way_between(random_bundle):
+def test_a_dream_restarts_from_the_drives_latent(random_bundle):
     real, dreamt, since = drive(random_bundle, 10)
     assert since == [0, 0, 0, 0, 4, 4, 4, 4, 8, 8]
     same = [np.array_equal(one, other) for one, other in zip(real, dreamt, strict=True)]
     assert [step for step, equal in enumerate(same) if equal] == [0, 4, 8]
 
 
-def test_a_dream_between_two_beginnings_sees_nothing_of_the_drive(random_bundle):
+def test_between_restarts_a_dream_does_not_depend_on_the_drive(random_bundle):
     config = ParallelDreamConfig(every=100)
     real, dreamt, _ = drive(random_bundle, 6, config)
     other, again, _ = drive(random_bundle, 6, config, moved=1.0)
@@ -51,11 +51,11 @@ def test_a_model_without_a_reward_head_dreams_too(tmp_path):
     assert np.isfinite(dreamt).all()
 
 
-def test_a_dream_that_has_ended_begins_again(tmp_path):
+def test_a_dream_that_has_ended_restarts(tmp_path):
     rnn = MDNRNNConfig(latent=3, hidden=4, done=True)
     vae, model = random_models(0, TINY, rnn)
     with torch.no_grad():
-        model.heads.bias[-1] = 9.0  # always over
+        model.heads.bias[-1] = 9.0  # always predicts the end
     parts = export_graphs(weights(vae), weights(model), np.zeros((1, 2, 3), np.float32), TINY, rnn)
     bundle = write_bundle(tmp_path / "b.zip", make_manifest("over", {}, TINY, rnn), parts)
     real, dreamt, since = drive(bundle, 3)
@@ -64,6 +64,6 @@ def test_a_dream_that_has_ended_begins_again(tmp_path):
 
 
 @pytest.mark.parametrize("temperature", [0.0, float("nan")])
-def test_a_temperature_that_is_none_is_refused(temperature):
+def test_an_invalid_temperature_is_refused(temperature):
     with pytest.raises(UsageError, match="temperature must be a positive number"):
         ParallelDreamConfig(temperature)

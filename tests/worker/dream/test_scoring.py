@@ -62,7 +62,7 @@ def test_a_variant_dreams_the_same_bits_alone_in_any_batch_and_step_by_step(rand
         assert episode.score(environment, DreamPolicy(bundle), dream[0], EpisodeConfig(dream[1], HORIZON)) == found
 
 
-def test_rows_that_leave_a_batch_take_along_what_they_held(tmp_path):
+def test_rows_that_end_do_not_change_the_others(tmp_path):
     rnn = MDNRNNConfig(latent=3, hidden=4, done=True)
     plain = write_random_bundle(tmp_path / "b.zip", vae=VAEConfig(latent=3, channels=(2, 2, 2, 2)), rnn=rnn)
     bundle = plain.with_controllers(None, VARIANTS["all"])
@@ -73,7 +73,7 @@ def test_rows_that_leave_a_batch_take_along_what_they_held(tmp_path):
     assert [dreamer.score([dream])[0] for dream in dreams] == together
 
 
-def test_dropout_is_part_of_the_dream_and_changes_no_promise(tmp_path):
+def test_with_dropout_scores_have_the_same_bits_too(tmp_path):
     bundle = write_random_bundle(tmp_path / "b.zip", rnn=MDNRNNConfig(dropout=0.3))
     dreamer, environment = DreamBatch(bundle, spec(bundle)), CarRacingDream(bundle, temperature=1.3, horizon=HORIZON)
     dreams = [(vector, seed) for vector in candidates(bundle, 3) for seed in (1, 2)]
@@ -84,10 +84,10 @@ def test_dropout_is_part_of_the_dream_and_changes_no_promise(tmp_path):
     ] == together
 
 
-def test_steps_are_told_as_they_are_made(dreaming, random_bundle):
-    told = []
-    dreaming.score([(vector, 1) for vector in candidates(random_bundle, 3)], told.append)
-    assert told == [3 * step for step in range(1, HORIZON + 1)]
+def test_steps_are_reported_as_they_are_made(dreaming, random_bundle):
+    reported = []
+    dreaming.score([(vector, 1) for vector in candidates(random_bundle, 3)], reported.append)
+    assert reported == [3 * step for step in range(1, HORIZON + 1)]
 
 
 def test_another_temperature_is_another_dream(dreaming, random_bundle):
@@ -96,7 +96,7 @@ def test_another_temperature_is_another_dream(dreaming, random_bundle):
     assert colder.score(dreams) != dreaming.score(dreams)
 
 
-def test_a_vector_that_is_no_controller_is_refused(dreaming, random_bundle):
+def test_an_invalid_vector_is_refused(dreaming, random_bundle):
     (vector,) = candidates(random_bundle, 1)
     vector[3] = np.nan
     for wrong in (vector, vector[:-1]):

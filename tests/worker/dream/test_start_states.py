@@ -50,20 +50,20 @@ def dreams_of(bundle, candidates, seeds):
     return [(vector, seed) for vector in vectors for seed in seeds]
 
 
-def test_the_share_of_dreams_that_is_asked_for_begins_at_recorded_states():
+def test_the_configured_share_of_dreams_starts_at_recorded_states():
     for share in (0.0, 0.25, 1.0):
         recorded = np.mean([begun(seed, share)[1].any() for seed in range(400)])
         assert abs(recorded - share) < 0.06 * (0 < share < 1) + 1e-9
 
 
-def test_every_recorded_state_is_begun_at_with_its_own_memory():
+def test_every_recorded_state_is_used_with_its_memory():
     memories = {begun(seed, 1.0)[1].tobytes() for seed in range(200)}
     assert memories == {state[6:].tobytes() for state in STATES}
     spread = np.stack([begun(seed, 1.0)[0] for seed in range(200) if (begun(seed, 1.0)[1] == STATES[2, 6:]).all()])
     assert (abs(spread.mean(0) - STATES[2, :3]) < 3 * np.exp(0.5 * STATES[2, 3:6]) / np.sqrt(len(spread))).all()
 
 
-def test_a_dream_that_begins_at_a_first_picture_is_the_same_at_every_share():
+def test_a_dream_from_a_first_picture_is_the_same_at_every_share():
     for seed in range(50):
         plain, some = begun(seed, 0.0), begun(seed, 0.4)
         assert not plain[1].any()
@@ -83,7 +83,7 @@ def test_a_fitness_is_the_same_bits_alone_in_any_batch_and_in_any_order(bundle):
     assert DreamBatch(bundle, spec(bundle)).score(dreams[11:16]) == together[11:16]
 
 
-def test_only_dreams_that_begin_at_recorded_states_are_others_than_without_them(bundle):
+def test_recorded_states_change_only_the_dreams_that_start_there(bundle):
     dreams = dreams_of(bundle, 1, range(40))
     plain, some, all_of_them = (DreamBatch(bundle, spec(bundle, share)).score(dreams) for share in (0.0, 0.5, 1.0))
     same = [a == b for a, b in zip(plain, some, strict=True)]
@@ -92,7 +92,7 @@ def test_only_dreams_that_begin_at_recorded_states_are_others_than_without_them(
     assert not any(a == c for a, c in zip(plain, all_of_them, strict=True))
 
 
-def test_without_a_share_a_bundle_with_states_dreams_as_one_without(bundle, tmp_path):
+def test_with_share_zero_recorded_states_change_nothing(bundle, tmp_path):
     without = write_random_bundle(tmp_path / "without.zip", vae=SMALL, rnn=PLAIN)
     dreams = dreams_of(bundle, 3, range(5))
     assert DreamBatch(without, spec(without, 0.0)).score(dreams) == DreamBatch(bundle, spec(bundle, 0.0)).score(dreams)
@@ -131,15 +131,15 @@ def test_the_environment_dreams_the_same_bits_with_any_memory(tmp_path, memory, 
     assert [dreamt(environment, policy, *dream) for dream in dreams] == DreamBatch(bundle, spec(bundle)).score(dreams)
 
 
-@pytest.mark.parametrize(("memory", "told"), [("rewarded", 0), ("rewarded first", 1)])
-def test_an_empty_memory_holds_the_reward_that_training_began_with(tmp_path, memory, told):
+@pytest.mark.parametrize(("memory", "reward"), [("rewarded", 0), ("rewarded first", 1)])
+def test_an_empty_memory_holds_the_reward_that_training_began_with(tmp_path, memory, reward):
     bundle = write_random_bundle(tmp_path / "b.zip", vae=SMALL, rnn=MEMORIES[memory])
     _, info = CarRacingDream(bundle).reset(seed=1)
-    assert info["memory"].tolist() == [*[0] * 8, told]
+    assert info["memory"].tolist() == [*[0] * 8, reward]
     assert np.array_equal(info["memory"], RecurrentState(bundle).state[0, :9]), "as in reality"
 
 
-def test_many_dreams_begin_and_begin_again_as_the_single_ones(bundle):
+def test_vectorised_dreams_start_and_restart_as_single_ones(bundle):
     action = np.array([0.1, 0.5, 0.0], np.float32)
     many = CarRacingDreamVector(6, bundle, horizon=3, recorded=0.5)
     single = [CarRacingDream(bundle, horizon=3, recorded=0.5) for _ in range(6)]
@@ -147,18 +147,18 @@ def test_many_dreams_begin_and_begin_again_as_the_single_ones(bundle):
     assert info["_memory"].all()
     begun = [each.reset(seed=10 + index) for index, each in enumerate(single)]
     assert np.array_equal(latents, [latent for latent, _ in begun])
-    assert np.array_equal(info["memory"], [told["memory"] for _, told in begun])
+    assert np.array_equal(info["memory"], [given["memory"] for _, given in begun])
     assert 0 < info["memory"].any(axis=1).sum() < 6
     for _ in range(3):
-        latents, _, _, _, told = many.step(np.tile(action, (6, 1)))
+        latents, _, _, _, given = many.step(np.tile(action, (6, 1)))
         assert np.array_equal(latents, [each.step(action)[0] for each in single])
-        assert not told
-    _, _, _, _, told = many.step(np.tile(action, (6, 1)))
-    assert told["_memory"].all()
-    assert 0 < told["memory"].any(axis=1).sum() < 6
+        assert not given
+    _, _, _, _, given = many.step(np.tile(action, (6, 1)))
+    assert given["_memory"].all()
+    assert 0 < given["memory"].any(axis=1).sum() < 6
 
 
-def test_whoever_is_told_a_memory_may_do_with_it_what_he_likes(bundle):
+def test_a_memory_that_was_given_may_be_changed(bundle):
     environment = CarRacingDream(bundle, recorded=1.0)
     first = environment.reset(seed=1)[1]["memory"]
     kept = first.copy()
@@ -167,7 +167,7 @@ def test_whoever_is_told_a_memory_may_do_with_it_what_he_likes(bundle):
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
-def test_a_share_that_is_none_is_refused(bundle, share):
+def test_an_invalid_share_is_refused(bundle, share):
     with pytest.raises(UsageError, match="recorded states must be from 0 to 1"):
         DreamWorld(bundle, 1.0, recorded=share)
 

@@ -1,4 +1,4 @@
-"""A display that nobody asked for is not opened, and one that was opened harms nothing that comes after."""
+"""No display is opened without need, and an opened one does not harm the training that follows."""
 
 import os
 import subprocess
@@ -56,7 +56,7 @@ def run(code, folder, **variables):
     return done.stdout.splitlines()[-1]
 
 
-def test_looking_for_a_screen_loads_no_driver_of_graphics(tmp_path):
+def test_looking_for_a_screen_loads_no_graphics_driver(tmp_path):
     assert run(WITHOUT_A_SCREEN + WHAT_IS_LOADED, tmp_path) == "[]"
 
 
@@ -66,7 +66,7 @@ def test_driving_opens_no_display(tmp_path):
 
 @pytest.mark.slow
 def test_a_process_that_drew_through_mesa_trains(tmp_path):
-    """The real triton where torch brought it, else one that ends the process as the real one does."""
+    """The real triton if torch installed it, or else a fake that crashes the process as the real one does."""
     if find_spec("triton") is None:
         (tmp_path / "triton").mkdir()
         stand_in = "import os\nif 'libLLVM' in open('/proc/self/maps').read(): os._exit(139)\n"

@@ -64,7 +64,7 @@ def test_held_keys_are_an_action(held, action):
     assert not pedals.action().any()
 
 
-def test_a_window_that_loses_the_focus_lets_every_key_go():
+def test_losing_the_focus_releases_all_keys():
     pedals = Pedals()
     pedals.handle_event(down(pygame.K_UP))
     pedals.handle_event(pygame.event.Event(pygame.WINDOWFOCUSLOST))
@@ -79,7 +79,7 @@ def test_holding_up_accelerates_and_q_quits():
     assert hand.speeds[29] > 20 > 1 > hand.speeds[0]
 
 
-def test_r_begins_the_same_track_again_and_an_end_waits_for_it(random_bundle):
+def test_r_restarts_the_same_track(random_bundle):
     scene = DreamScene(random_bundle, 1.0, 3)
     hand = Hand({6: [down(pygame.K_r)], 8: [down(pygame.K_ESCAPE)]})
     whole, left = drive(scene, DrivingConfig(SEED, 3), hand)
@@ -105,14 +105,14 @@ def test_the_dream_is_shown_with_hard_pixels_and_its_score_below():
 
 def test_the_longest_text_fits_the_narrowest_window():
     with DriveWindow("a dream", (64, 64), 1) as window:
-        for _ in range(12):  # the clock tells a rate after ten frames
+        for _ in range(12):  # the clock knows its rate after ten frames
             window.show(pygame.Surface((64, 64)), DriveStatus(-1234.5, 10_000, 10_000, over=False))
         shown = pygame.display.get_surface()
         right = shown.subsurface((shown.get_width() - 12, 64, 12, 64))
         assert pygame.transform.average_color(right)[:3] == BACKGROUND
 
 
-def test_without_a_screen_it_says_so(monkeypatch, capsys):
+def test_without_a_screen_it_is_an_error(monkeypatch, capsys):
     for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     pygame.display.quit()
@@ -125,11 +125,11 @@ def test_without_a_screen_it_says_so(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("arguments", [{"seed": -1}, {"seed": 1, "steps": 0}, {"seed": 1, "scale": 0.0}])
-def test_what_cannot_be_driven_is_refused(arguments):
+def test_invalid_arguments_are_refused(arguments):
     with pytest.raises(UsageError):
         DrivingConfig(**arguments)
 
 
-def test_a_world_model_without_a_dream_is_a_mistake(capsys):
+def test_a_world_model_without_a_dream_is_refused(capsys):
     assert main(["drive", "--temperature", "0.5"]) == UsageError.exit_code
     assert "add --dream" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The verb in a real window, under keys of a real (virtual) keyboard."""
+"""The verb `drive` in a window on a virtual screen, with keys of a virtual keyboard."""
 
 import os
 import re
@@ -16,13 +16,13 @@ pytestmark = pytest.mark.needs_programs("Xvfb", "xdotool")
 
 @pytest.fixture
 def screen():
-    """The number of a virtual screen."""
+    """The number of a virtual X screen."""
     read, write = os.pipe()
     command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x1024x24", "-nolisten", "tcp"]
     with subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL) as server:
         os.close(write)
-        with os.fdopen(read) as told:
-            number = told.readline().strip()
+        with os.fdopen(read) as pipe:
+            number = pipe.readline().strip()
         yield f":{number}"
         server.terminate()
 
@@ -45,7 +45,7 @@ def test_a_person_drives_and_quits(screen, tmp_path):
     with subprocess.Popen([*command, "--scale", "0.3"], env=seen, stdout=subprocess.PIPE, text=True) as driving:
         try:
             hand("search", "--sync", "--onlyvisible", "--class", ".", "windowfocus", "--sync", "keydown", "Up")
-            said = driving.stdout.readline()  # of the episode's end
+            said = driving.stdout.readline()  # printed at the episode's end
             hand("keyup", "Up", "key", "q")
             assert driving.wait(DEADLINE) == 0
         finally:

@@ -15,7 +15,7 @@ def unseen(monkeypatch):
     pygame.display.quit()
 
 
-def test_it_takes_the_size_of_what_it_shows_and_keeps_the_last_picture(unseen):
+def test_it_takes_the_size_of_its_picture_and_keeps_the_last_one(unseen):
     with PictureWindow("night") as screen:
         assert screen.draw(None)
         assert screen.draw(PICTURE)
@@ -26,14 +26,14 @@ def test_it_takes_the_size_of_what_it_shows_and_keeps_the_last_picture(unseen):
 
 
 @pytest.mark.parametrize("event", [{"type": pygame.QUIT}, {"type": pygame.KEYDOWN, "key": pygame.K_q}])
-def test_whoever_looks_can_close_it(unseen, event):
+def test_a_viewer_can_close_it(unseen, event):
     with PictureWindow("night") as screen:
         assert screen.draw(PICTURE)
         pygame.event.post(pygame.event.Event(event.pop("type"), event))
         assert not screen.draw(PICTURE)
 
 
-def test_without_a_screen_it_says_how_to_look_otherwise(monkeypatch):
+def test_without_a_screen_the_error_names_other_ways(monkeypatch):
     for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(NoDisplayError, match=r"write a file by --out live\.mp4"), PictureWindow("night"):

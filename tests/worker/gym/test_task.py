@@ -17,12 +17,12 @@ CARTPOLE = "gym:CartPole-v1"
 
 
 def spec(name, hidden=0, **options):
-    told = describe_task(name, options)
-    shape = ControllerShape(told.observations, told.outputs, hidden)
-    return TaskSpec(name, "", 1000, 0, shape, options=told.options, version=told.version)
+    description = describe_task(name, options)
+    shape = ControllerShape(description.observations, description.outputs, hidden)
+    return TaskSpec(name, "", 1000, 0, shape, options=description.options, version=description.version)
 
 
-def test_a_familys_members_are_announced_by_its_name():
+def test_a_family_is_announced_by_its_name():
     assert "gym" in known_tasks()
     assert (family_of(CARTPOLE), family_of("car-racing"), family_of("a.module:Task")) == (
         "gym", "car-racing", "a.module:Task",
@@ -40,15 +40,15 @@ def test_a_familys_members_are_announced_by_its_name():
     ],
 )
 def test_sizes_and_packages_are_the_environments_own(name, observations, outputs, engine):
-    told = describe_task(name, {})
-    assert (told.observations, told.outputs) == (observations, outputs)
-    assert told.packages == ("numpy", "gymnasium", *engine)
-    assert told.options == ""
+    description = describe_task(name, {})
+    assert (description.observations, description.outputs) == (observations, outputs)
+    assert description.packages == ("numpy", "gymnasium", *engine)
+    assert description.options == ""
 
 
 def test_the_environments_arguments_are_part_of_the_run():
-    told = describe_task("gym:LunarLander-v3", {"environment": {"continuous": True}})
-    assert (told.outputs, json.loads(told.options)) == (2, {"environment": {"continuous": True}})
+    description = describe_task("gym:LunarLander-v3", {"environment": {"continuous": True}})
+    assert (description.outputs, json.loads(description.options)) == (2, {"environment": {"continuous": True}})
     scorer = Scorer(spec("gym:LunarLander-v3", environment={"continuous": True}))
     assert isinstance(scorer.world.actions, Continuous)
     assert scorer.score("score", np.zeros(18, np.float32), 1).steps > 10
@@ -57,7 +57,7 @@ def test_the_environments_arguments_are_part_of_the_run():
 
 def test_a_score_is_the_environments_own_under_a_controller():
     scorer = Scorer(spec(CARTPOLE))
-    parameters = np.array([0, 0, -1, -1, 0, 0, 1, 1, 0, 0], np.float32)  # to the side that the pole falls to
+    parameters = np.array([0, 0, -1, -1, 0, 0, 1, 1, 0, 0], np.float32)  # pushes to the side to which the pole falls
     environment = gymnasium.make("CartPole-v1")
     observation, _ = environment.reset(seed=7)
     total, over = 0.0, False
@@ -95,13 +95,13 @@ def test_observations_are_normalised_by_what_the_run_froze():
         ("car-racing:x", "cannot be loaded"),
     ],
 )
-def test_what_cannot_be_scored_in_is_refused_with_why(name, says):
+def test_an_unusable_environment_is_refused_with_the_reason(name, says):
     with pytest.raises(UsageError, match=says):
         describe_task(name, {})
 
 
 class Strange(gymnasium.Env):
-    """What its arguments say."""
+    """An environment whose arguments choose its actions, or the error that its construction raises."""
 
     observation_space = gymnasium.spaces.Box(-1, 1, (2,))
 
@@ -141,7 +141,7 @@ def strange():
         ({"fails": "exit"}, "cannot be made: SystemExit"),
     ],
 )
-def test_whatever_an_environment_does_as_it_is_made_is_one_error(strange, arguments, says):
+def test_any_error_while_an_environment_is_made_is_one_line(strange, arguments, says):
     with pytest.raises(UsageError, match=says):
         describe_task(strange, {"environment": arguments})
 
@@ -165,6 +165,6 @@ def test_a_controller_of_other_outputs_is_refused():
         Scorer(TaskSpec(CARTPOLE, "", 100, 0, ControllerShape(4, 3)))
 
 
-def test_of_equal_outputs_the_first_action_is_taken_and_numbers_begin_where_the_environment_says():
+def test_the_first_of_equal_outputs_is_chosen_and_actions_start_at_the_spaces_start():
     assert Discrete(3, first=2).to_action(np.array([0.0, 1.0, 1.0])) == 3
     assert Continuous.between([0, -2], [1, 2]).to_action(np.array([0.0, 100.0])) == pytest.approx([0.5, 2.0])

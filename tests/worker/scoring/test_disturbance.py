@@ -11,7 +11,7 @@ from dreamfleet.worker.scoring.disturbance import ActionBursts, Disturbance, Dis
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 
-def test_noise_is_as_large_as_is_said_and_touches_no_action_at_its_bound():
+def test_noise_has_its_size_and_leaves_actions_at_a_bound_alone():
     disturbance = Disturbance(0, STEERING_GAS_BRAKE, 0.3)
     pushes = np.concatenate([disturbance.next() for _ in range(20_000)])
     np.testing.assert_allclose(pushes.std(axis=0), [0.3, 0.15, 0.15], rtol=0.1)
@@ -20,7 +20,7 @@ def test_noise_is_as_large_as_is_said_and_touches_no_action_at_its_bound():
     np.testing.assert_allclose(done, [[1.0, 0.0, 1.0], [0.3, 0.8, 0.0]], atol=1e-6)
 
 
-def test_what_rests_is_tried_for_a_spell_and_then_rests_again():
+def test_a_burst_replaces_a_resting_action_for_some_steps():
     chosen = np.array([[0.2, 1.0, 0.0]], np.float32)  # steers, full gas, no brake
 
     def drive(seed):
@@ -43,7 +43,7 @@ def test_what_rests_is_tried_for_a_spell_and_then_rests_again():
 
 
 class Recorder(DisturbedPolicy):
-    """Writes down what is done, and of it the disturbance."""
+    """Records each action and its noise."""
 
     def on_action(self, action, push):
         self.noted = (*getattr(self, "noted", ()), (action, push))
@@ -64,7 +64,7 @@ def pictures(count):
     return np.random.default_rng(0).integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
 
 
-def test_every_mind_remembers_what_was_done_and_not_what_was_chosen(tiny, tmp_path):
+def test_every_recurrent_state_gets_the_disturbed_action(tiny, tmp_path):
     watching = RecurrentState(tiny)
     mind, policy = driver(tiny, tmp_path, 0.5, watching)
     calm = RecurrentState(tiny)
@@ -80,7 +80,7 @@ def test_every_mind_remembers_what_was_done_and_not_what_was_chosen(tiny, tmp_pa
     assert not watching.state.any()
 
 
-def test_without_noise_it_does_what_the_hand_chooses(tiny, tmp_path):
+def test_without_noise_it_does_what_the_actor_chooses(tiny, tmp_path):
     mind, policy = driver(tiny, tmp_path, 0.0)
     controller, _ = find_controller("tiny", tmp_path)
     hand = ControllerActor(controller, tiny, mind)

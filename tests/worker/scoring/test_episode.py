@@ -11,7 +11,7 @@ PARAMETERS = np.zeros(3, np.float32)
 
 
 class Scripted(gymnasium.Env):
-    """Gives these rewards, then ends."""
+    """An environment with given rewards."""
 
     observation_space = spaces.Box(-1, 1, (1,))
     action_space = spaces.Box(-1, 1, (1,))
@@ -46,7 +46,7 @@ class Listening(Still):
         self.heard.append(value)
 
 
-def test_a_policy_that_listens_hears_every_reward():
+def test_a_reward_aware_policy_gets_every_reward():
     policy = Listening()
     score(Scripted([1.0, 2.0, 3.5]), policy, PARAMETERS, EpisodeConfig(1, 100))
     assert policy.heard == [1.0, 2.0, 3.5]
@@ -64,7 +64,7 @@ def test_the_horizon_ends_an_episode():
     assert score(Scripted([1.0] * 10), Still(), PARAMETERS, EpisodeConfig(1, 4)).steps == 4
 
 
-def test_a_hopeless_episode_is_cut_and_charged_what_standing_still_costs():
+def test_an_episode_that_patience_cuts_is_charged_for_standing_still():
     driven = score(
         Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, EpisodeConfig(1, 100, patience=20, idle_cost=0.1)
     )
@@ -76,14 +76,14 @@ def test_a_hopeless_episode_is_cut_and_charged_what_standing_still_costs():
 @pytest.mark.parametrize(
     ("rewards", "info", "paid"),
     [
-        ([1.0] * 8, {"lap": True}, 8),  # it came home
-        ([1.0] * 8, {"lap": False}, 20),  # it crashed
+        ([1.0] * 8, {"lap": True}, 8),  # finished
+        ([1.0] * 8, {"lap": False}, 20),  # crashed
         ([1.0] * 8, {}, 20),
-        ([1.0] * 40, {}, 20),  # it is still on its way
-        ([1.0] + [0.0] * 39, {}, 20),  # it was given up
+        ([1.0] * 40, {}, 20),  # reached the horizon
+        ([1.0] + [0.0] * 39, {}, 20),  # cut by patience
     ],
 )
-def test_time_costs_until_the_course_is_finished_and_to_crash_saves_nothing(rewards, info, paid):
+def test_time_is_charged_until_the_course_is_finished_and_after_a_crash(rewards, info, paid):
     free = EpisodeConfig(1, 20, patience=5, finish="lap")
     found = [score(Scripted(rewards, info), Still(), PARAMETERS, each) for each in (free, replace(free, time_cost=0.5))]
     assert found[0].fitness - found[1].fitness == 0.5 * paid
@@ -91,7 +91,7 @@ def test_time_costs_until_the_course_is_finished_and_to_crash_saves_nothing(rewa
 
 
 class OffCourse(Scripted):
-    """Says in its `info` which steps leave the course: these."""
+    """An environment whose `info` says at given steps that they are off the course."""
 
     def __init__(self, rewards, off_course_steps):
         super().__init__(rewards)
@@ -105,7 +105,7 @@ class OffCourse(Scripted):
 @pytest.mark.parametrize(
     ("off_course_steps", "paid"), [((), 0), ((3,), 1), (range(5, 9), 4), (range(1, 180), MAX_OFF_COURSE_STEPS)]
 )
-def test_steps_off_the_course_cost_so_much_and_one_loss_no_more(off_course_steps, paid):
+def test_steps_off_the_course_are_charged_up_to_a_limit(off_course_steps, paid):
     free = EpisodeConfig(1, 200, off_course="off")
     course = [free, replace(free, off_course_cost=2.0)]
     found = [score(OffCourse([0.0] * 199, off_course_steps), Still(), PARAMETERS, each) for each in course]
@@ -118,14 +118,14 @@ def test_reward_restores_patience():
     assert score(Scripted(rewards), Still(), PARAMETERS, EpisodeConfig(1, 100, patience=10)).steps == 50
 
 
-def test_steps_are_told_as_they_are_made():
-    told = []
-    score(Scripted([0.0] * 5), Still(), PARAMETERS, EpisodeConfig(1, 100), told.append)
-    assert told == [1, 2, 3, 4, 5]
+def test_steps_are_reported_as_they_are_made():
+    reported = []
+    score(Scripted([0.0] * 5), Still(), PARAMETERS, EpisodeConfig(1, 100), reported.append)
+    assert reported == [1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_what_is_no_number_is_an_error_and_no_fitness(value):
+def test_a_sum_that_is_not_finite_is_an_error(value):
     with pytest.raises(ValueError, match="NaN"):
         score(Scripted([1.0]), Still(), np.full(3, value, np.float32), EpisodeConfig(1, 10))
     with pytest.raises(ValueError, match="add up"):

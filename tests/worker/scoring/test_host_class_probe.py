@@ -1,4 +1,4 @@
-"""The class of a host: what it computes on fixed inputs, and nothing else."""
+"""The class of a host depends only on the bits that it computes on fixed inputs."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def scorer_of(task, bundle):
 
 
 @pytest.mark.parametrize("task", ["car-racing", "dream"])
-def test_a_host_is_of_one_class_however_often_and_after_whatever_it_is_asked(random_bundle, task):
+def test_the_host_class_does_not_depend_on_what_ran_before(random_bundle, task):
     scorer = scorer_of(task, random_bundle)
     found = scorer.host_class
     assert len(found) == 16
@@ -31,32 +31,32 @@ def test_a_host_is_of_one_class_however_often_and_after_whatever_it_is_asked(ran
     assert before == again.score("score", fixed_parameters(random_bundle.controller_shape.size), seed=7)
 
 
-def test_a_bit_of_the_world_is_another_class(random_bundle, monkeypatch):
+def test_another_bit_of_the_world_is_another_class(random_bundle, monkeypatch):
     here = scorer_of(tasks.ROUNDED, random_bundle).host_class
     monkeypatch.setenv(tasks.ROUNDING, "1")
     assert scorer_of(tasks.ROUNDED, random_bundle).host_class != here
 
 
-def test_a_bit_of_what_a_policy_computes_is_another_class_though_its_actions_are_the_same(monkeypatch):
+def test_another_bit_of_a_policys_outputs_is_another_class(monkeypatch):
     here = Scorer(CART_POLE).host_class
     outputs = FlatPolicy.outputs
     monkeypatch.setattr(FlatPolicy, "outputs", lambda self, seen: np.nextafter(outputs(self, seen), np.float32(9)))
     assert Scorer(CART_POLE).host_class != here
 
 
-def test_another_package_version_is_no_class_of_its_own(monkeypatch):
+def test_another_package_version_is_the_same_class(monkeypatch):
     here = Scorer(CART_POLE).host_class
     monkeypatch.setattr("dreamfleet.worker.scoring.scorer.fingerprint", lambda _: "riscv64 other")
     assert Scorer(CART_POLE).host_class == here
 
 
 @pytest.mark.parametrize("task", [tasks.RAISING, tasks.CRASHING])
-def test_a_task_that_lets_nobody_look_or_fails_at_it_is_classed_by_the_fingerprint(random_bundle, task):
+def test_without_a_probe_episode_the_fingerprint_gives_the_class(random_bundle, task):
     scorer = scorer_of(task, random_bundle)
     assert scorer.host_class == class_from_fingerprint(fingerprint(scorer.world.packages))
 
 
-def test_whatever_an_environment_observes_counts_and_an_address_in_memory_does_not():
+def test_all_observed_values_count_and_memory_addresses_do_not():
     def host_class(value):
         found = HostClassProbe()
         found.add_value(value)

@@ -1,4 +1,4 @@
-"""Somebody looks on while episodes are scored: what he is shown, and that it changes no score by a bit."""
+"""Watching episodes while they are scored: what the observer gets, and that no score changes by a bit."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ HORIZON = 40
 
 
 class Eyes:
-    """Sees every so many steps."""
+    """Observes every so many steps."""
 
     def __init__(self, every=3):
         self.seen, self._every, self._asked = [], every, 0
@@ -36,7 +36,7 @@ def parameters(size, seed=0):
 
 
 def watched_and_not(scorer, jobs):
-    """The scores of a turn, twice unwatched with a watched one between; and what was seen."""
+    """The scores of a group: unwatched, watched and unwatched; and the observed steps."""
     before = scorer.score_all(jobs, lambda _made: None)
     scorer.observer = eyes = Eyes()
     during = scorer.score_all(jobs, lambda _made: None)
@@ -46,7 +46,7 @@ def watched_and_not(scorer, jobs):
 
 
 @pytest.mark.parametrize("kind", ["score", "evaluate", "collect"])
-def test_a_drive_by_a_world_model_shows_what_it_sees_and_from_where_it_would_dream_on(random_bundle, kind):
+def test_a_step_with_a_world_model_shows_picture_latent_and_state(random_bundle, kind):
     scorer = Scorer(TaskSpec("car-racing", random_bundle.sha256, HORIZON, 0), random_bundle)
     vector = parameters(random_bundle.controller_shape.size)
     if kind == "collect":
@@ -56,40 +56,40 @@ def test_a_drive_by_a_world_model_shows_what_it_sees_and_from_where_it_would_dre
         assert (again, shown.to_bytes()) == (plain, kept.to_bytes())
         seen = eyes.seen
     else:
-        scorer.world = replace(scorer.world, horizon=HORIZON)  # of an evaluation
+        scorer.world = replace(scorer.world, horizon=HORIZON)  # evaluations use the world's
         _, seen = watched_and_not(scorer, [(kind, vector, 2**20)])
-    assert [glimpse.step for _, glimpse in seen] == list(range(2, HORIZON, 3))
-    assert {glimpse.picture.shape for _, glimpse in seen} == {(64, 64, 3)}
+    assert [step.step for _, step in seen] == list(range(2, HORIZON, 3))
+    assert {step.picture.shape for _, step in seen} == {(64, 64, 3)}
     step = DreamStep(random_bundle)
-    for _, glimpse in seen:  # latent and state are those from before the action
+    for _, step in seen:  # latent and state are those from before the action
         acted = step.step(
-            glimpse.latent[None], vector[None], glimpse.state[None], np.zeros((1, 32), np.float32),
+            step.latent[None], vector[None], step.state[None], np.zeros((1, 32), np.float32),
             np.zeros((1, 32), np.float32), 1.0,
         )  # fmt: skip
-        assert np.allclose(acted.action[0], glimpse.action, atol=1e-5)
+        assert np.allclose(acted.action[0], step.action, atol=1e-5)
     scorer.close()
 
 
-def test_a_turn_of_dreams_shows_the_first_that_goes_on(random_bundle):
+def test_a_batch_of_dreams_shows_the_first_that_has_not_ended(random_bundle):
     scorer = Scorer(TaskSpec("dream", random_bundle.sha256, HORIZON, 0, temperature=1.0), random_bundle)
     jobs = [("score", parameters(random_bundle.controller_shape.size, row), 2**20 + row) for row in range(20)]
     scores, seen = watched_and_not(scorer, jobs)
     assert seen
-    for episode, glimpse in seen:
-        assert all(score.steps <= glimpse.step for score in scores[:episode]), "an earlier one still goes on"
-        assert glimpse.picture is None
-        assert (glimpse.latent.shape, glimpse.action.shape) == ((32,), (3,))
+    for episode, step in seen:
+        assert all(score.steps <= step.step for score in scores[:episode]), "an earlier one still goes on"
+        assert step.picture is None
+        assert (step.latent.shape, step.action.shape) == ((32,), (3,))
     scorer.close()
 
 
 @pytest.mark.parametrize("name", ["gym:CartPole-v1", "gym:LunarLander-v3", "gym:Acrobot-v1"])
-def test_gymnasiums_own_worlds_are_drawn_for_an_onlooker(name):
+def test_gymnasiums_own_worlds_are_drawn_while_watched(name):
     spec = TaskSpec(name, "", 200, 0, controller=shape_of(find_task(name).describe({})))
     scorer = Scorer(spec)
     jobs = [("score", parameters(spec.controller.size, row), 2**20 + row) for row in range(3)]
     _, seen = watched_and_not(scorer, jobs)
     assert {episode for episode, _ in seen} == {0, 1, 2}
-    pictures = {glimpse.picture.tobytes() for _, glimpse in seen}
+    pictures = {step.picture.tobytes() for _, step in seen}
     assert len(pictures) > 3
     scorer.close()
 
@@ -98,7 +98,7 @@ def shape_of(world):
     return ControllerShape(world.observations, world.outputs)
 
 
-def test_a_world_that_is_now_and_then_drawn_steps_as_one_that_is_not():
+def test_drawing_does_not_change_the_steps():
     task = find_task("gym:LunarLander-v3")
     shown = task.make_watched_environment(
         Assignment(TaskSpec(task.name, "", 200, 0, controller=shape_of(task.describe({}))))
@@ -114,22 +114,22 @@ def test_a_world_that_is_now_and_then_drawn_steps_as_one_that_is_not():
 
 
 class Sketchy(CartPoleEnv):
-    """Not of gymnasium's own: its pictures might change something."""
+    """An environment of another package, whose `render` might change scores."""
 
 
-def test_another_packages_world_is_not_drawn_and_one_that_cannot_be_drawn_is_shown_without(monkeypatch):
+def test_other_packages_worlds_are_shown_without_a_picture(monkeypatch):
     gymnasium.register("Sketchy-v0", Sketchy, max_episode_steps=50)
     task = find_task("gym:Sketchy-v0")
     spec = TaskSpec("gym:Sketchy-v0", "", 50, 0, controller=shape_of(task.describe({})))
     assert task.make_watched_environment(Assignment(spec)) is None
     _, seen = watched_and_not(Scorer(spec), [("score", parameters(spec.controller.size), 2**20)])
-    assert {glimpse.picture for _, glimpse in seen} == {None}
+    assert {step.picture for _, step in seen} == {None}
 
     own = find_task("gym:CartPole-v1")
     spec = TaskSpec(own.name, "", 50, 0, controller=shape_of(own.describe({})))
     monkeypatch.setattr(CartPoleEnv, "render", lambda self: 1 / 0)
     _, seen = watched_and_not(Scorer(spec), [("score", parameters(spec.controller.size), 2**20)])
-    assert {glimpse.picture for _, glimpse in seen} == {None}
+    assert {step.picture for _, step in seen} == {None}
 
 
 def test_the_environment_of_a_watched_drive_is_closed_with_the_scorer():

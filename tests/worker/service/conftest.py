@@ -12,7 +12,7 @@ PARTS = 6  # of the small bundle
 
 @pytest.fixture(scope="module")
 def small_bundle(tmp_path_factory):
-    """No world model, only as many bytes: the toy tasks do not look inside."""
+    """A bundle with placeholder bytes as its world model, which the toy tasks do not read."""
     parts = dict.fromkeys(("encoder.onnx", "decoder.onnx"), b"x")
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
@@ -36,6 +36,6 @@ def stage(small_bundle):
 
 @pytest.fixture
 def said():
-    """What a worker logs, waited for with `wait_for`."""
+    """The log of a worker, for `wait_for`."""
     with listening() as lines:
         yield lines

@@ -21,7 +21,7 @@ def test_jobs_come_out_in_order_with_their_vector():
     assert [backlog.take(1), backlog.take(5), backlog.take(1)] == [[(job(0), VECTOR)], [(job(1), VECTOR)], []]
 
 
-def test_a_batch_that_comes_twice_counts_once():
+def test_a_repeated_batch_counts_once():
     backlog = Backlog(SPEC)
     for _ in range(2):
         backlog.add_batch(batch(1, (job(0),)))
@@ -30,7 +30,7 @@ def test_a_batch_that_comes_twice_counts_once():
     assert not backlog.take(1)
 
 
-def test_seen_is_the_last_number_without_a_gap():
+def test_seen_is_the_highest_number_without_a_gap():
     backlog = Backlog(SPEC)
     seen = []
     for number in (1, 3, 4, 2):
@@ -39,7 +39,7 @@ def test_seen_is_the_last_number_without_a_gap():
     assert seen == [1, 1, 1, 4]
 
 
-def test_a_vector_may_be_spread_over_batches_that_come_in_any_order():
+def test_parts_of_a_vector_may_arrive_in_batches_in_any_order():
     backlog = Backlog(SPEC)
     first, second = (dataclasses.replace(WHOLE, offset=at, data=VECTOR[at : at + 32]) for at in (0, 32))
     backlog.add_batch(batch(2, (job(0),), (second,)))
@@ -55,41 +55,41 @@ def test_a_cancelled_job_is_not_started():
     assert backlog.take(1) == [(job(1), VECTOR)]
 
 
-def test_a_job_that_a_slot_has_in_hand_is_not_queued_again():
+def test_a_job_that_a_slot_has_is_not_queued_again():
     backlog = Backlog(SPEC)
     backlog.add_batch(batch(1, (job(0), job(1))), {job(0).digest})
     assert backlog.take(5) == [(job(1), VECTOR)]
 
 
-def test_a_job_whose_digest_is_of_something_else_is_refused():
+def test_a_job_with_another_jobs_digest_is_refused():
     backlog = Backlog(SPEC)
     wrong = dataclasses.replace(job(0), seeds=(5,))
     assert backlog.add_batch(batch(1, (wrong,))) == [(wrong, "the job's digest is not of its content")]
     assert not backlog.take(1)
 
 
-def test_a_job_is_of_the_temperature_that_it_names():
+def test_a_job_has_the_temperature_that_it_names():
     backlog, warm = Backlog(SPEC), job(1, temperature=1.5)
     renamed = [dataclasses.replace(warm, temperature=wrong) for wrong in (None, 1.25)]
     assert [each for each, _ in backlog.add_batch(batch(1, (warm, *renamed)))] == renamed
     assert backlog.take(5) == [(warm, VECTOR)]
 
 
-def test_a_turn_is_of_one_temperature():
+def test_jobs_taken_together_have_one_temperature():
     jobs = [job(episode, temperature=each) for episode, each in enumerate((None, None, 1.5, 1.5, 2.25))]
     backlog = Backlog(SPEC)
     backlog.add_batch(batch(1, jobs))
     assert [[each.episode for each, _ in backlog.take(5)] for _ in range(4)] == [[0, 1], [2, 3], [4], []]
 
 
-def test_a_job_is_of_the_horizon_and_patience_that_it_names():
+def test_a_job_has_the_horizon_and_patience_that_it_names():
     backlog, short = Backlog(SPEC), job(1, horizon=400, patience=0)
     renamed = [dataclasses.replace(short, **wrong) for wrong in ({"horizon": None}, {"patience": 1}, {"horizon": 401})]
     assert [each for each, _ in backlog.add_batch(batch(1, (short, *renamed)))] == renamed
     assert backlog.take(5) == [(short, VECTOR)]
 
 
-def test_a_turn_is_of_one_stage():
+def test_jobs_taken_together_have_one_stage():
     named = ({}, {}, {"horizon": 400}, {"horizon": 400}, {"horizon": 400, "patience": 5}, {"patience": 5})
     backlog = Backlog(SPEC)
     backlog.add_batch(batch(1, [job(episode, **each) for episode, each in enumerate(named)]))
@@ -102,7 +102,7 @@ def test_a_damaged_vector_is_never_scored():
     assert not backlog.take(1)
 
 
-def test_vectors_that_no_job_needs_are_let_go():
+def test_the_oldest_vectors_that_no_job_needs_are_dropped():
     backlog = Backlog(SPEC)
     for number in range(1, 500):
         data = number.to_bytes(8, "little")
@@ -111,7 +111,7 @@ def test_vectors_that_no_job_needs_are_let_go():
     assert len(backlog._vectors) <= MAX_UNUSED_VECTORS
 
 
-def test_a_new_life_of_the_coordinator_counts_from_one_again():
+def test_a_new_numbering_counts_from_one():
     backlog = Backlog(SPEC)
     backlog.add_batch(batch(1, (job(0),)))
     backlog.start_numbering(1)
@@ -121,7 +121,7 @@ def test_a_new_life_of_the_coordinator_counts_from_one_again():
     assert backlog.take(1) == [(job(1), VECTOR)]
 
 
-def test_a_number_that_no_coordinator_has_reached_counts_for_nothing():
+def test_a_batch_number_far_ahead_is_ignored():
     backlog = Backlog(SPEC)
     for number in (MAX_BATCHES_AHEAD + 1, 2**40, 2**62):
         backlog.add_batch(batch(number, (job(0),)))
@@ -131,7 +131,7 @@ def test_a_number_that_no_coordinator_has_reached_counts_for_nothing():
     assert backlog.seen == 1
 
 
-def test_more_jobs_than_a_worker_may_hold_are_let_go():
+def test_jobs_beyond_the_limit_are_dropped():
     backlog = Backlog(SPEC)
     for number in range(3):
         backlog.add_batch(batch(number + 1, tuple(job(number * 500 + each) for each in range(500))))
@@ -141,7 +141,7 @@ def test_more_jobs_than_a_worker_may_hold_are_let_go():
     assert backlog.take(1) == [(job(0), VECTOR)]
 
 
-def test_vectors_have_so_much_room_and_no_more(monkeypatch):
+def test_bytes_of_vectors_are_limited(monkeypatch):
     monkeypatch.setattr(room, "MAX_VECTOR_BYTES", 4 * MAX_PART)
     backlog = Backlog(SPEC)
     for number in range(100):
@@ -149,10 +149,10 @@ def test_vectors_have_so_much_room_and_no_more(monkeypatch):
         backlog.add_batch(batch(number + 1, vectors=(rubbish,)))
     assert len(backlog._vectors) == 4
     backlog.add_batch(batch(101, (job(0),)))
-    assert not backlog.queued, "it is given again, to whoever has room"
+    assert not backlog.queued, "it is given again, to a worker with room"
 
 
-def test_a_vector_that_others_have_spoilt_costs_its_jobs_which_are_given_again():
+def test_jobs_of_a_corrupted_vector_are_dropped_and_can_be_given_again():
     backlog = Backlog(SPEC)
     backlog.add_batch(batch(1, vectors=(dataclasses.replace(WHOLE, data=bytes(64)),)))
     backlog.add_batch(batch(2, (job(0), job(1))))

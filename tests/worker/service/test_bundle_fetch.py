@@ -1,4 +1,4 @@
-"""Downloads that are cut, over a real router: what is on disk stays, and the whole is verified."""
+"""Interrupted downloads over a real router: parts on disk stay, and the whole file is verified."""
 
 import hashlib
 import resource
@@ -75,7 +75,7 @@ SIZES = [0, 1, 17, MAX_PART - 1, MAX_PART, MAX_PART + 1, 3 * MAX_PART + 11, -1, 
 
 
 @pytest.mark.parametrize("cut", SIZES)
-def test_a_download_that_was_cut_anywhere_goes_on_from_there(session, hand, store, bundle, cut):
+def test_an_interrupted_download_continues(session, hand, store, bundle, cut):
     whole = bundle.path.read_bytes()
     cut = len(whole) if cut is None else cut % len(whole)
     partial = begun(store, bundle, whole[:cut])
@@ -87,7 +87,7 @@ def test_a_download_that_was_cut_anywhere_goes_on_from_there(session, hand, stor
 
 
 @pytest.mark.parametrize("where", [0, MAX_PART, 2 * MAX_PART + 16])
-def test_a_damaged_beginning_is_thrown_away_and_fetched_again(session, hand, store, bundle, where):
+def test_a_damaged_beginning_is_fetched_again(session, hand, store, bundle, where):
     spoilt = bytearray(bundle.path.read_bytes()[: 2 * MAX_PART + 17])
     spoilt[where] ^= 1
     begun(store, bundle, bytes(spoilt))
@@ -97,19 +97,19 @@ def test_a_damaged_beginning_is_thrown_away_and_fetched_again(session, hand, sto
     assert 0 in offsets
 
 
-def test_a_beginning_that_is_longer_than_the_bundle_is_of_something_else(session, hand, store, bundle):
+def test_a_partial_file_longer_than_the_bundle_is_discarded(session, hand, store, bundle):
     begun(store, bundle, bundle.path.read_bytes() + b"!")
     assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
 
 
-def test_parts_that_come_short_never_make_a_wrong_file(session, hand, store, bundle):
+def test_short_parts_never_make_a_wrong_file(session, hand, store, bundle):
     """Every second answer is cut, as by a coordinator that serves smaller parts."""
     short = iter([True, False] * 100)
     hand.damage = lambda offset, data: data[: len(data) // 2] if next(short) else data
     assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
 
 
-def test_a_stop_in_the_middle_keeps_what_has_come_and_the_next_life_goes_on(session, hand, store, bundle):
+def test_a_stopped_download_keeps_its_parts_and_is_continued(session, hand, store, bundle):
     stop = threading.Event()
     hand.damage = lambda offset, data: stop.set() if offset >= 2 * MAX_PART else data  # no answer from here on
     assert fetch(session, hand, store, stop.is_set) is None
@@ -129,7 +129,7 @@ def test_two_workers_of_a_host_fetch_it_once(session, hand, store, bundle):
     assert len([offset for offset in asked(hand) if offset == 0]) == 1
 
 
-def test_a_coordinator_that_stays_silent_is_an_error_and_what_has_come_stays(session, hand, store, bundle, monkeypatch):
+def test_a_silent_coordinator_is_an_error_and_the_parts_stay(session, hand, store, bundle, monkeypatch):
     monkeypatch.setattr(bundle_fetch, "MAX_ROUNDS_WITHOUT_PROGRESS", 2)
     monkeypatch.setattr(bundle_fetch, "QUERY_TIMEOUT", 0.1)
     monkeypatch.setattr(bundle_fetch, "PAUSE", 0.0)
@@ -140,13 +140,13 @@ def test_a_coordinator_that_stays_silent_is_an_error_and_what_has_come_stays(ses
     assert partial.read_bytes() == bundle.path.read_bytes()[:100]
 
 
-def test_a_window_of_parts_is_asked_for_at_once(session, hand, store, bundle):
+def test_a_window_of_parts_is_requested_at_once(session, hand, store, bundle):
     fetch(session, hand, store)
     assert PARTS < WINDOW
     assert sorted(asked(hand)) == [index * MAX_PART for index in range(-(-bundle.path.stat().st_size // MAX_PART))]
 
 
-def test_a_bundle_that_is_said_to_be_endless_writes_nothing(session, hand, store, bundle, monkeypatch):
+def test_a_bundle_of_absurd_length_writes_nothing(session, hand, store, bundle, monkeypatch):
     monkeypatch.setattr(hand, "total", lambda: 2**62)
     with pytest.raises(BundleError, match="is said to be 4,611,686,018,427 MB long, and at most 268 MB"):
         fetch(session, hand, store)
@@ -154,19 +154,19 @@ def test_a_bundle_that_is_said_to_be_endless_writes_nothing(session, hand, store
         assert not partial.stat().st_size
 
 
-def test_parts_of_another_length_are_of_something_else(session, hand, store, bundle, monkeypatch):
+def test_parts_that_name_another_length_are_ignored(session, hand, store, bundle, monkeypatch):
     monkeypatch.setattr(bundle_fetch, "PAUSE", 0.0)
     size, asked = bundle.path.stat().st_size, iter(range(10**6))
     monkeypatch.setattr(hand, "total", lambda: size + next(asked) % 2)
     assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
 
 
-def test_a_beginning_of_another_bundle_is_thrown_away(session, hand, store, bundle, random_bundle):
+def test_a_beginning_of_another_bundle_is_discarded(session, hand, store, bundle, random_bundle):
     begun(store, bundle, random_bundle.path.read_bytes()[: MAX_PART + 5])
     assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
 
 
-def test_a_disk_that_takes_no_more_is_one_line_and_what_has_come_stays(session, hand, store, bundle):
+def test_a_full_disk_is_one_line_and_the_parts_stay(session, hand, store, bundle):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_PART + 100, hard))
     try:

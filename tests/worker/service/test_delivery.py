@@ -1,4 +1,4 @@
-"""What a worker takes and what it delivers, whatever is lost, doubled or foreign."""
+"""A worker receives and delivers correctly although messages are lost, repeated or foreign."""
 
 import hashlib
 
@@ -10,15 +10,15 @@ from tests.support.samples import MSGPACK
 from tests.support.stage import drained, wait_for
 
 
-def test_a_result_is_repeated_until_its_verdict_and_then_no_more(stage, cached):
+def test_a_result_is_repeated_until_its_verdict(stage, cached):
     hand = stage.hand()
     stage.worker()
     hand.ready()
     first, second = hand.job(0), hand.job(1)
     hand.send(1, first)
-    told = [hand.result(first) for _ in range(3)]
-    assert told[0].fitness is not None
-    assert told[0] == told[1] == told[2]
+    results = [hand.result(first) for _ in range(3)]
+    assert results[0].fitness is not None
+    assert results[0] == results[1] == results[2]
     assert hand.beat(lambda beat: beat.unacked).unacked == (tag(first),)
     hand.send(2, second, accepted=(first,))
     hand.beat(lambda beat: tag(first) not in beat.unacked and beat.seen == 2)
@@ -26,7 +26,7 @@ def test_a_result_is_repeated_until_its_verdict_and_then_no_more(stage, cached):
         assert hand.results(second) == {second.digest}
 
 
-def test_a_batch_number_that_came_already_is_ignored(stage, cached):
+def test_a_repeated_batch_number_is_ignored(stage, cached):
     hand = stage.hand()
     stage.worker()
     hand.ready()
@@ -38,7 +38,7 @@ def test_a_batch_number_that_came_already_is_ignored(stage, cached):
     assert hand.beat(lambda beat: beat.seen == 2 and not beat.running).unacked == (tag(first), tag(last))
 
 
-def test_a_lost_batch_shows_in_the_beats_until_it_is_sent_again(stage, cached):
+def test_heartbeats_show_a_lost_batch_until_it_is_sent_again(stage, cached):
     hand = stage.hand()
     stage.worker()
     hand.ready()
@@ -52,7 +52,7 @@ def test_a_lost_batch_shows_in_the_beats_until_it_is_sent_again(stage, cached):
     assert hand.beat(lambda beat: beat.seen != 1).seen == 3
 
 
-def test_what_is_foreign_or_malformed_is_dropped_and_counted(stage, cached):
+def test_foreign_and_malformed_messages_are_dropped_and_counted(stage, cached):
     hand = stage.hand()
     made, _ = stage.worker()
     hand.ready()
@@ -66,7 +66,7 @@ def test_what_is_foreign_or_malformed_is_dropped_and_counted(stage, cached):
     assert made.inbox.dropped == {"foreign coordinator": 2, "not msgpack": 2, "oversize": 1, "wrong fields": 1}
 
 
-def test_a_job_that_is_not_what_its_digest_says_is_an_error(stage, cached):
+def test_a_job_whose_content_differs_from_its_digest_is_an_error(stage, cached):
     hand = stage.hand()
     stage.worker()
     hand.ready()
@@ -75,7 +75,7 @@ def test_a_job_that_is_not_what_its_digest_says_is_an_error(stage, cached):
     assert "digest" in hand.result(job).error
 
 
-def test_a_drive_is_uploaded_again_until_its_verdict_and_then_no_more(stage, cached):
+def test_a_rollout_is_uploaded_repeatedly_until_its_verdict(stage, cached):
     hand = stage.hand(tasks.HEAVY)
     stage.worker()
     hand.ready()
@@ -102,7 +102,7 @@ def test_a_cancelled_job_is_not_started(stage, cached):
     assert hand.results(running, last) == {running.digest, last.digest}
 
 
-def test_its_queue_stands_still_while_too_many_results_have_no_verdict(stage, cached):
+def test_nothing_starts_while_too_many_results_have_no_verdict(stage, cached):
     hand = stage.hand()
     stage.worker()
     hand.ready()
@@ -114,23 +114,23 @@ def test_its_queue_stands_still_while_too_many_results_have_no_verdict(stage, ca
     hand.beat(lambda beat: beat.unacked == tuple(tag(job) for job in jobs[5:]))
 
 
-def test_a_failing_task_leaves_its_traceback_in_the_log_once_with_the_job_that_met_it(stage, said, cached):
+def test_a_failing_task_logs_its_traceback_once_with_its_job(stage, said, cached):
     hand = stage.hand(tasks.RAISING)
     stage.worker()
     hand.ready()
     jobs = [hand.job(number) for number in range(3)]
     hand.send(1, *jobs)
     hand.results(*jobs)
-    told = wait_for(said, "the road has ended")
-    assert told.startswith(
+    logged = wait_for(said, "the road has ended")
+    assert logged.startswith(
         f"task {tasks.RAISING}: RuntimeError: the road has ended (score in generation 7, candidate 2"
     )
-    assert f"seed {jobs[0].seeds[0]})" in told
-    assert 'raise RuntimeError("the road has ended")' in told
+    assert f"seed {jobs[0].seeds[0]})" in logged
+    assert 'raise RuntimeError("the road has ended")' in logged
     assert not [line for line in drained(said) if "Traceback" in line]
 
 
-def test_a_crash_names_the_job_that_it_was_in(stage, said, cached):
+def test_a_crash_names_its_job(stage, said, cached):
     hand = stage.hand(tasks.CRASHING)
     stage.worker()
     hand.ready()

@@ -1,4 +1,4 @@
-"""A worker that fetches its run's world model: damage, and what an earlier download left."""
+"""A worker fetches its run's world model: damaged parts, and files of earlier downloads."""
 
 import pytest
 
@@ -23,7 +23,7 @@ def test_a_damaged_part_costs_one_more_download(stage, said):
     assert asked.count(2 * MAX_PART) == 2
 
 
-def test_a_bundle_that_is_always_damaged_is_an_error_that_says_so(stage):
+def test_a_bundle_that_is_always_damaged_is_an_error(stage):
     hand = stage.hand()
     hand.damage = lambda offset, data: data[::-1]
     _, served = stage.worker(exit_when_done=True)
@@ -32,7 +32,7 @@ def test_a_bundle_that_is_always_damaged_is_an_error_that_says_so(stage):
     assert "damaged 3 times" in str(error)
 
 
-def test_it_asks_again_for_a_bundle_that_never_came_whole(stage, said):
+def test_it_asks_again_for_a_bundle_that_arrived_damaged(stage, said):
     hand = stage.hand()
     hand.damage = lambda offset, data: data[::-1]
     stage.worker()
@@ -41,8 +41,8 @@ def test_it_asks_again_for_a_bundle_that_never_came_whole(stage, said):
     assert hand.ready().slots == 1
 
 
-def test_rubbish_beside_the_truth_keeps_no_worker_from_it(stage, said):
-    """Somebody answers first for every part, with bytes of nothing."""
+def test_wrong_parts_of_a_stranger_do_not_prevent_the_download(stage, said):
+    """A stranger answers first for every part, with wrong bytes."""
     hand = stage.hand()
     head = {"run_uid": hand.run_uid, "incarnation": 1, "sha256": bytes.fromhex(stage.bundle.sha256)}
 
@@ -60,7 +60,7 @@ def test_rubbish_beside_the_truth_keeps_no_worker_from_it(stage, said):
 
 
 @pytest.mark.parametrize(("beginning", "first"), [(3 * MAX_PART + 17, 3 * MAX_PART + 17), (9 * MAX_PART, 9 * MAX_PART)])
-def test_an_interrupted_download_goes_on_and_a_longer_one_begins_again(stage, beginning, first):
+def test_an_interrupted_download_continues_and_a_too_long_one_restarts(stage, beginning, first):
     hand = stage.hand()
     with BundleStore(default_cache()).lock_download(stage.bundle.sha256) as path:
         path.write_bytes((stage.bundle.path.read_bytes() + bytes(9 * MAX_PART))[:beginning])

@@ -17,16 +17,16 @@ def raise_deeper(error, depth):
     raise error
 
 
-def test_a_failure_is_told_with_its_task_its_job_and_its_traceback():
-    told = FailureLog().format_if_new(raised(RuntimeError("the road has ended")), "moon", [job()])
-    first, *trace = told.splitlines()
+def test_a_failure_is_logged_with_its_task_its_job_and_its_traceback():
+    logged = FailureLog().format_if_new(raised(RuntimeError("the road has ended")), "moon", [job()])
+    first, *trace = logged.splitlines()
     assert first.startswith("task moon: RuntimeError: the road has ended (")
     assert "generation 7, candidate 2, seed 1048576)" in first
     assert trace[0].startswith("Traceback")
     assert trace[-1] == "RuntimeError: the road has ended"
 
 
-def test_each_kind_is_told_once_whatever_its_numbers():
+def test_each_kind_is_logged_once():
     failures = FailureLog()
     assert failures.format_if_new(raised(ValueError("lap 1")), "moon", [job()])
     assert failures.format_if_new(raised(ValueError("lap 2")), "moon", [job(1)]) is None
@@ -36,22 +36,22 @@ def test_each_kind_is_told_once_whatever_its_numbers():
     )
 
 
-def test_of_jobs_that_were_scored_together_the_first_is_named_and_the_others_counted():
-    told = FailureLog().format_if_new(raised(ValueError("lap 1")), "moon", [job(), job(1), job(2)])
-    assert "seed 1048576, or one of 2 jobs scored with it)" in told
+def test_the_first_of_several_jobs_is_named_and_the_others_are_counted():
+    logged = FailureLog().format_if_new(raised(ValueError("lap 1")), "moon", [job(), job(1), job(2)])
+    assert "seed 1048576, or one of 2 jobs scored with it)" in logged
     assert "as a slot started" in FailureLog().format_if_new(raised(ValueError("lap 1")), "moon", [])
 
 
-def test_a_log_is_bounded():
+def test_the_log_is_bounded():
     failures = FailureLog()
-    told = [
+    logged = [
         failures.format_if_new(ScoringFailure("text", str(kind), "trace"), "moon", []) for kind in range(2 * MAX_KINDS)
     ]
-    assert sum(text is not None for text in told) == MAX_KINDS
+    assert sum(text is not None for text in logged) == MAX_KINDS
     assert len(raised(RuntimeError("x" * 100_000)).trace) == MAX_TRACE
 
 
-def test_an_error_that_cannot_travel_as_it_is_travels_all_the_same():
+def test_an_error_that_cannot_be_encoded_is_replaced():
     failure = raised(OSError("no file \udcff\nsecond line"))
     assert failure.text.encode() == b"OSError: no file ?"
     assert failure.trace.encode()

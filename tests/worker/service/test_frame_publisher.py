@@ -1,4 +1,4 @@
-"""What a worker shows while somebody subscribes, and that nothing of it changes or delays anything."""
+"""The frames that a worker sends while somebody subscribes; they change and delay nothing."""
 
 import multiprocessing
 import queue
@@ -25,7 +25,7 @@ ACTION = (0.0, 1.0)
 
 
 class Viewer:
-    """Subscribes to all that a worker shows."""
+    """A subscriber to a worker's frames."""
 
     def __init__(self, hand, worker=None):
         self._frames = queue.SimpleQueue()
@@ -48,7 +48,7 @@ class Viewer:
 
 @pytest.fixture
 def hand(stage):
-    """A coordinator that nobody takes for silent."""
+    """A coordinator that is never considered silent."""
     made = stage.hand(tasks.PAINTED)
     made.intervals = Intervals(beat=10.0, repeat=0.1)
     return made
@@ -67,7 +67,7 @@ def viewer():
         each.close()
 
 
-def test_a_viewer_is_shown_the_job_that_runs_and_what_it_sees(stage, hand, cached, viewer):
+def test_a_viewer_sees_the_running_job_and_its_observation(stage, hand, cached, viewer):
     stage.worker()
     hand.ready()
     watching = viewer(hand)
@@ -96,7 +96,7 @@ def test_scores_are_the_same_bits_while_two_viewers_come_and_go_or_are_killed(st
     one, other = viewer(hand), viewer(hand)
     hand.send(2, *(hand.job(episode) for episode in range(1, 4)), accepted=(hand.job(0),))
     one.frame()
-    one.close()  # without a word to anybody
+    one.close()  # without notice
     other.frame()
     other.leave()
     for episode in range(1, 4):
@@ -105,14 +105,14 @@ def test_scores_are_the_same_bits_while_two_viewers_come_and_go_or_are_killed(st
     assert hand.result(hand.job(0)).fitness == plain.fitness
 
 
-def test_frames_are_no_news_that_a_coordinator_owes_an_answer_to(stage, cached, viewer):
+def test_frames_do_not_restart_the_coordinators_silence(stage, cached, viewer):
     """A worker that has results without a verdict says hello again after five silent beats, watched or not."""
     hand = stage.hand(tasks.PAINTED)
     stage.worker()
     hand.ready()
     watching = viewer(hand)
     hand.send(1, *(hand.job(episode) for episode in range(8)))
-    hand.result(hand.job(0))  # of which no verdict will tell
+    hand.result(hand.job(0))  # without a verdict
     hand.hello()
     watching.frame()
 
@@ -125,7 +125,7 @@ def test_after_a_slot_was_killed_in_the_middle_the_next_child_is_watched(stage, 
     hand.send(1, *jobs)
     watching.frame()
     (child,) = multiprocessing.active_children()
-    child.kill()  # in whichever job it has come to by now
+    child.kill()  # in any job
     killed = hand.failure()
     assert "slot crashed" in killed.error
     later = {tag(job) for job in jobs[[job.digest for job in jobs].index(killed.digest) + 1 :]}
@@ -133,7 +133,7 @@ def test_after_a_slot_was_killed_in_the_middle_the_next_child_is_watched(stage, 
     assert (unpack_picture(frame) == frame.step).all()
 
 
-def test_of_two_slots_one_is_shown(stage, hand, cached, viewer):
+def test_one_of_two_slots_is_shown(stage, hand, cached, viewer):
     stage.worker(slots=2)
     hand.hello()
     hand.beat(lambda beat: beat.capacity == 2)
@@ -151,7 +151,7 @@ def slot(small_bundle):
 
 
 def shown_by(slot):
-    """The words that a slot's child says of one turn, its result last."""
+    """The messages of a slot's child about one group, its result last."""
     slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
     seen = []
     while True:
@@ -161,7 +161,7 @@ def shown_by(slot):
         seen.append(event.message)
 
 
-def test_a_child_that_nobody_watches_says_nothing_but_its_result(slot):
+def test_an_unwatched_child_sends_only_its_result(slot):
     unwatched, fitness = shown_by(slot)
     assert unwatched == []
     slot.slot.show(True)
@@ -173,14 +173,14 @@ def test_a_child_that_nobody_watches_says_nothing_but_its_result(slot):
 
 
 @pytest.mark.parametrize("task", ["car-racing", "dream", "gym:CartPole-v1"])
-def test_a_real_slot_gives_the_same_bits_watched_and_not(random_bundle, task):
+def test_a_slot_gives_the_same_bits_watched_and_not(random_bundle, task):
     events, announced = queue.SimpleQueue(), ("car-racing", "dream", "gym")
     sha256, path = ("", None) if task.startswith("gym") else (random_bundle.sha256, random_bundle.path)
     shape = ControllerShape(4, 2) if path is None else random_bundle.controller_shape
     spec = TaskSpec(task, sha256, 60, 0, controller=None if path else shape)
     vector = np.random.default_rng(0).normal(0, 0.1, shape.size).astype("<f4").tobytes()
     slot = Slot(0, spec, path, events, announced)
-    told, frames = [], 0
+    outcomes, frames = [], 0
     while not slot.ready:
         slot.handle(events.get(timeout=DEADLINE)[1])
     for shown in (False, True, False):
@@ -189,10 +189,10 @@ def test_a_real_slot_gives_the_same_bits_watched_and_not(random_bundle, task):
         while not (results := slot.handle(event := events.get(timeout=DEADLINE)[1])):
             assert shown
             frames += slot.find_job(event.child_number, event.message) is not None
-        told.append([(each.fitness, each.steps, each.error) for each in results])
+        outcomes.append([(each.fitness, each.steps, each.error) for each in results])
     slot.stop()
-    assert told[0] == told[1] == told[2]
-    assert told[0][0][2] is None
+    assert outcomes[0] == outcomes[1] == outcomes[2]
+    assert outcomes[0][0][2] is None
     assert frames >= 1
 
 
@@ -203,9 +203,9 @@ class Clock:
         return self.now
 
 
-def test_showing_takes_no_more_than_a_hundredth_of_the_time_however_dear_a_picture_is():
-    clock, told = Clock(), []
-    sampler = FrameSampler(told.append, lambda: True, clock, clock)
+def test_expensive_frames_take_at_most_a_hundredth_of_the_time():
+    clock, frames = Clock(), []
+    sampler = FrameSampler(frames.append, lambda: True, clock, clock)
 
     def look():
         clock.now += 0.05
@@ -215,24 +215,24 @@ def test_showing_takes_no_more_than_a_hundredth_of_the_time_however_dear_a_pictu
         if sampler.is_due():
             sampler.observe(0, look)
         clock.now += 0.001
-    assert 0.05 * len(told) <= 1.1 * MAX_TIME_SHARE * clock.now
-    assert len(told) > 10
+    assert 0.05 * len(frames) <= 1.1 * MAX_TIME_SHARE * clock.now
+    assert len(frames) > 10
 
 
-def test_cheap_pictures_come_ten_a_second_and_none_where_nobody_wants_them_any_more():
-    clock, told, wanted = Clock(), [], [True]
-    sampler = FrameSampler(told.append, lambda: wanted[0], clock, clock)
+def test_cheap_frames_come_ten_a_second_while_somebody_watches():
+    clock, frames, wanted = Clock(), [], [True]
+    sampler = FrameSampler(frames.append, lambda: wanted[0], clock, clock)
     while clock.now < 10:
         if sampler.is_due():
             sampler.observe(0, lambda: StepSnapshot(0, 0.0, ACTION))
         clock.now += 0.001
-    assert len(told) == pytest.approx(10 / FRAME_INTERVAL, abs=3)
+    assert len(frames) == pytest.approx(10 / FRAME_INTERVAL, abs=3)
     wanted[0] = False
     clock.now += 10
     assert not sampler.is_due()
 
 
-def test_what_goes_wrong_as_a_step_is_shown_fails_no_job():
+def test_an_error_while_sampling_fails_no_job():
     sampler = FrameSampler(lambda _seen: 1 / 0, lambda: True)
     sampler.observe(0, lambda: StepSnapshot(0, 0.0, ACTION))
     assert not sampler.is_due()

@@ -1,4 +1,4 @@
-"""What a coordinator says, or a task of its worker, ends no worker."""
+"""Neither a coordinator's message nor a task ends a worker."""
 
 from dreamfleet.common.protocol.codec import encode
 from dreamfleet.common.protocol.messages import Result, ResultBatch
@@ -9,7 +9,7 @@ from tests.support.samples import HEAD
 from tests.support.stage import wait_for
 
 
-def test_a_batch_that_raises_costs_itself_alone(stage, cached, said, monkeypatch):
+def test_a_batch_that_raises_costs_only_itself(stage, cached, said, monkeypatch):
     hand = stage.hand()
     stage.worker()
     hand.ready()
@@ -22,7 +22,7 @@ def test_a_batch_that_raises_costs_itself_alone(stage, cached, said, monkeypatch
     assert hand.result(hand.job()).fitness is not None
 
 
-def test_results_with_long_errors_are_spread_over_messages_that_hold_them():
+def test_results_with_long_errors_are_split_into_messages():
     outbox = Outbox(1.0)
     for number in range(200):
         outbox.add(Result(number.to_bytes(32), None, 0, 0.0, "ü" * MAX_TEXT, None))

@@ -1,4 +1,4 @@
-"""What a child does with a turn, without a child."""
+"""Scoring a group of jobs, without a child process."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ WORK = [(job(number), VECTOR) for number in range(3)]
 
 
 class Scorer:
-    """Gives the scores that it was made with, after one step each."""
+    """Returns given scores, after one step each."""
 
     def __init__(self, *scores):
         self._scores = scores
@@ -50,19 +50,19 @@ def test_each_job_has_its_own_result_and_an_equal_share_of_the_time():
         ([Score(1.0, 1)] * 2 + [None], "AttributeError"),
     ],
 )
-def test_scores_that_no_coordinator_could_count_are_the_tasks_error(scores, said):
+def test_invalid_scores_are_the_tasks_error(scores, said):
     done = score_group(Scorer(*scores), 5, WORK, ignore)
     assert [each.fitness for each in done.results] == [None] * 3
     assert all(said in each.error for each in done.results)
     assert said in done.failure.trace
 
 
-def test_scores_of_numpys_types_travel_as_plain_numbers():
+def test_scores_of_numpy_types_become_plain_numbers():
     done = score_group(Scorer(*[Score(np.float32(0.5), np.int64(7))] * 3), 5, WORK, ignore)
     assert {(type(each.fitness), type(each.steps)) for each in done.results} == {(float, int)}
 
 
-def test_a_turn_that_is_given_up_has_no_results_and_no_failure():
+def test_an_abandoned_group_has_no_results_and_no_failure():
     def count(made):
         if made == 2:
             raise AbandonedError
@@ -71,7 +71,7 @@ def test_a_turn_that_is_given_up_has_no_results_and_no_failure():
     assert (done.results, done.failure) == ((), None)
 
 
-def test_steps_that_were_made_before_an_error_are_shared_out():
+def test_steps_before_an_error_are_divided_among_the_jobs():
     class Failing(Scorer):
         def score_all(self, episodes, on_step, temperature):
             on_step(9)

@@ -1,4 +1,4 @@
-"""How a worker comes to a run: it waits, is welcomed or refused."""
+"""How a worker joins a run: it waits, is welcomed or is refused."""
 
 import os
 import queue
@@ -21,12 +21,12 @@ from tests.support.hand import DEADLINE, SECOND, Hand
 from tests.support.processes import free_port
 from tests.support.stage import drained, wait_for
 
-SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest that there are
+SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest valid ones
 
 
 @dataclass(frozen=True)
 class OfTomorrow(TaskSpec):
-    """A specification with what a later version adds to it."""
+    """A specification with a field of a later version."""
 
     later: float = 0.5
 
@@ -37,7 +37,7 @@ def test_it_waits_for_a_coordinator_that_starts_later(stage, said, cached):
     assert stage.hand().ready().slots == 1
 
 
-def test_a_slot_that_can_score_is_told_at_once(stage, cached):
+def test_a_slot_that_can_score_is_reported_at_once(stage, cached):
     hand = stage.hand()
     hand.intervals = SLOW_BEATS
     stage.worker()
@@ -70,7 +70,7 @@ def test_without_a_name_several_runs_are_listed_until_one_is_left(stage, said, c
     other.close()
 
 
-def test_it_says_hello_again_about_the_packages_that_the_runs_fingerprint_names(stage, cached):
+def test_it_says_hello_again_with_the_packages_of_the_runs_fingerprint(stage, cached):
     hand = stage.hand()
     hand.packages = ("numpy", "no-such-package")
     stage.worker()
@@ -82,7 +82,7 @@ def test_it_says_hello_again_about_the_packages_that_the_runs_fingerprint_names(
     assert hand.beat(lambda beat: beat.capacity > 0).slots == 1
 
 
-def test_a_refusal_is_told_once_and_again_as_the_reason_changes_and_asked_about_until_it_is_over(stage, said, cached):
+def test_a_refusal_is_logged_once_for_each_reason_and_the_run_is_asked_again(stage, said, cached):
     hand = stage.hand()
     hand.refusal = ("your moon is full", "wait a week")
     stage.worker()
@@ -97,7 +97,7 @@ def test_a_refusal_is_told_once_and_again_as_the_reason_changes_and_asked_about_
 
 
 def test_one_answer_of_several_is_enough_to_join(stage, cached):
-    """Somebody who answers for everything, and says that he knows all, answers first and refuses."""
+    """A stranger that claims to answer every query completely answers first, and refuses."""
     hand = stage.hand()
     refusal = replace(samples.JSON["hello-reply"], run="test", accepted=False, why="go away", remedy="far away")
     with open_session(Network(connect=(hand.endpoint,))) as session:
@@ -111,7 +111,7 @@ def say(query, reply):
         query.reply(query.key_expr, encode_json(reply))
 
 
-def test_one_that_shall_leave_when_it_is_done_is_ended_by_a_refusal_with_the_reason_and_the_remedy(stage):
+def test_a_refusal_ends_a_worker_with_exit_when_done(stage):
     stage.hand().refusal = ("your moon is full", "wait a week")
     _, served = stage.worker(exit_when_done=True)
     error = served.exception(DEADLINE)
@@ -119,7 +119,7 @@ def test_one_that_shall_leave_when_it_is_done_is_ended_by_a_refusal_with_the_rea
     assert "your moon is full; wait a week" in str(error)
 
 
-def test_a_run_that_is_told_in_a_later_versions_words_is_refused_rather_than_scored_otherwise(stage):
+def test_a_run_whose_task_a_later_version_describes_is_refused(stage):
     hand = stage.hand()
     hand.spec = OfTomorrow(**vars(hand.spec))
     _, served = stage.worker(exit_when_done=True)
@@ -128,7 +128,7 @@ def test_a_run_that_is_told_in_a_later_versions_words_is_refused_rather_than_sco
     assert "cannot read the status of run (wrong fields); install dreamfleet" in str(error)
 
 
-def test_of_any_run_one_that_refuses_is_left_to_others(stage, said, cached):
+def test_with_any_a_run_that_refuses_is_skipped(stage, said, cached):
     picky = stage.hand(run="picky")
     picky.refusal = ("your moon is full", "wait a week")
     other = stage.also(picky, run="second")
@@ -138,24 +138,24 @@ def test_of_any_run_one_that_refuses_is_left_to_others(stage, said, cached):
     other.ready()
 
 
-def test_a_name_is_what_the_run_knows_it_by(stage, cached):
+def test_a_name_is_its_identity_in_the_run(stage, cached):
     hand = stage.hand()
     stage.worker(name="hostB")
     assert hand.hello().worker.startswith("hostB/")
 
 
-def test_a_name_that_cannot_be_kept_is_refused():
+def test_an_invalid_name_is_refused():
     with pytest.raises(UsageError, match="'big host' cannot name a worker"):
         WorkerConfig(name="big host")
 
 
-def test_a_task_that_it_is_told_of_and_cannot_load_is_an_error_at_once():
+def test_a_task_that_is_given_and_cannot_be_loaded_is_an_error_at_once():
     with pytest.raises(UsageError, match=r"'tests\.support\.tasks:Moon' cannot be loaded"):
         Worker(WorkerConfig(), Network(), ("tests.support.tasks:Moon",))
 
 
 def foreign(tmp_path, monkeypatch):
-    """A module that leaves a mark when it is imported, and the mark."""
+    """A module that writes a file when it is imported, and that file."""
     mark = tmp_path / "imported"
     (tmp_path / "foreign_world.py").write_text(
         f"open({str(mark)!r}, 'w').close()\ndef World():\n    raise SystemExit\n"
@@ -173,7 +173,7 @@ def test_a_task_that_it_did_not_announce_is_never_imported(stage, cached, tmp_pa
     assert not mark.exists()
 
 
-def test_a_worker_of_any_run_leaves_one_of_an_unannounced_task_to_others(stage, said, cached):
+def test_with_any_a_run_of_an_unannounced_task_is_skipped(stage, said, cached):
     hand = stage.hand("os:abort", run="evil")
     other = stage.also(hand, run="second")
     other.slots = 1
@@ -192,7 +192,7 @@ def test_a_child_imports_no_task_that_its_worker_did_not_announce(tmp_path, monk
     assert not mark.exists()
 
 
-def test_a_world_model_of_a_world_that_it_did_not_announce_imports_nothing(stage, tmp_path, monkeypatch):
+def test_a_world_model_of_an_unannounced_task_imports_nothing(stage, tmp_path, monkeypatch):
     mark, small = foreign(tmp_path, monkeypatch), stage.bundle
     parts = {name: small.read(name) for name in small.manifest.parts}
     world = replace(small.manifest, task="foreign_world:World")
@@ -203,7 +203,7 @@ def test_a_world_model_of_a_world_that_it_did_not_announce_imports_nothing(stage
     assert not mark.exists()
 
 
-def test_it_names_its_class_with_all_that_it_says_once_a_child_has_found_it_out(stage, cached):
+def test_it_sends_its_host_class_once_a_child_has_determined_it(stage, cached):
     hand = stage.hand()
     stage.worker()
     assert hand.hello().host_class == ""
@@ -217,7 +217,7 @@ def test_it_names_its_class_with_all_that_it_says_once_a_child_has_found_it_out(
     assert hand.hello().host_class == beat.host_class
 
 
-def test_a_coordinator_from_before_classes_hears_nothing_of_them(stage, cached):
+def test_a_coordinator_without_host_classes_gets_none(stage, cached):
     hand = stage.hand()
     hand.classes = False
     stage.worker()

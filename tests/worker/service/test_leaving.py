@@ -9,7 +9,7 @@ from tests.support.stage import drained, wait_for
 
 
 @pytest.mark.parametrize("when", ["before it joined", "afterwards"])
-def test_it_leaves_when_its_run_is_over_if_it_shall(stage, cached, monkeypatch, when):
+def test_with_exit_when_done_it_leaves_when_its_run_is_over(stage, cached, monkeypatch, when):
     monkeypatch.setattr(membership, "COORDINATOR_GONE_AFTER", 0.3)
     hand = stage.hand()
     if when == "before it joined":
@@ -22,7 +22,7 @@ def test_it_leaves_when_its_run_is_over_if_it_shall(stage, cached, monkeypatch, 
     assert served.result(DEADLINE) is None
 
 
-def test_told_to_stop_it_finishes_what_runs_and_delivers(stage, cached):
+def test_stopped_once_it_finishes_running_jobs_and_delivers(stage, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     made, served = stage.worker()
     hand.ready()
@@ -37,7 +37,7 @@ def test_told_to_stop_it_finishes_what_runs_and_delivers(stage, cached):
     assert served.result(DEADLINE) is None
 
 
-def test_told_twice_it_leaves_what_runs(stage, said, cached):
+def test_stopped_twice_it_abandons_running_jobs(stage, said, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     made, served = stage.worker()
     hand.ready()
@@ -49,7 +49,7 @@ def test_told_twice_it_leaves_what_runs(stage, said, cached):
     wait_for(said, ": 0 jobs")
 
 
-def test_told_to_stop_it_leaves_a_download(stage):
+def test_stopped_once_it_abandons_a_download(stage):
     hand = stage.hand()
     hand.damage = lambda offset, data: None
     made, served = stage.worker()
@@ -58,7 +58,7 @@ def test_told_to_stop_it_leaves_a_download(stage):
     assert served.result(2) is None
 
 
-def test_jobs_that_come_while_it_drains_are_handed_back(stage, cached):
+def test_jobs_that_arrive_while_it_drains_go_back(stage, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     made, _ = stage.worker()
     hand.ready()
@@ -72,14 +72,14 @@ def test_jobs_that_come_while_it_drains_are_handed_back(stage, cached):
 
 
 @pytest.mark.parametrize("coordinator", [False, True])
-def test_its_lifetime_ends_although_no_run_has_come(stage, coordinator):
+def test_its_lifetime_ends_without_a_run_too(stage, coordinator):
     if coordinator:
         stage.hand(run="another")
     _, served = stage.worker(lifetime=0.5)
     assert served.result(DEADLINE) is None
 
 
-def test_the_next_run_does_not_hear_the_last_words_of_the_last_runs_slots(stage, said, cached, monkeypatch):
+def test_late_events_of_the_last_runs_slots_do_not_reach_the_next_run(stage, said, cached, monkeypatch):
     monkeypatch.setattr(membership, "COORDINATOR_GONE_AFTER", 0.3)
     hand = stage.hand(run="one")
     hand.slots = 0
@@ -87,7 +87,7 @@ def test_the_next_run_does_not_hear_the_last_words_of_the_last_runs_slots(stage,
     hand.ready()
     other = stage.also(hand, run="two")
     hand.vanish()
-    hand.slots = 1  # as if another worker served it: the next run is the one that has none
+    hand.slots = 1  # as if another worker served it; the next run has no slots
     other.ready()
     other.send(1, other.job())
     assert other.result(other.job()).fitness is not None

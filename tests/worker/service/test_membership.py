@@ -1,4 +1,4 @@
-"""When a worker says hello again, drains and leaves, in any order of what may happen to it."""
+"""When a worker says hello again, drains and leaves, for any order of events."""
 
 import math
 
@@ -25,7 +25,7 @@ UPLOADING = WorkerLoad(idle=True, awaits_verdict=True, uploading=True)
 
 
 def joined(visible=True, **terms):
-    """At time 0, in the first life of a coordinator."""
+    """A member at time 0, in the first life of its coordinator."""
     made = Membership(LeaveConditions(**terms), now=0.0)
     made.join("first", BEAT, now=0.0)
     if visible:
@@ -33,14 +33,14 @@ def joined(visible=True, **terms):
     return made
 
 
-def test_a_member_whose_coordinator_is_in_sight_and_speaks_says_nothing():
+def test_it_says_no_hello_while_its_coordinator_is_in_sight_and_active():
     member = joined()
     for second in range(1, 20):
         member.note_activity(float(second))
         assert not any(member.must_rejoin(float(second), hands) for hands in (IDLE, BUSY, OWED))
 
 
-def test_a_run_that_ends_with_its_workers_is_left_at_once_and_the_next_one_is_not():
+def test_it_leaves_a_run_that_ends_at_once_and_not_the_next_one():
     member = joined()
     member.end_run()
     assert member.is_over(1.0, busy=True)
@@ -49,7 +49,7 @@ def test_a_run_that_ends_with_its_workers_is_left_at_once_and_the_next_one_is_no
 
 
 @pytest.mark.parametrize(("hands", "after"), [(IDLE, PATIENCE), (OWED, PATIENCE), (UPLOADING, PATIENCE + UPLOAD_GRACE)])
-def test_silence_that_means_something_makes_it_ask_whether_it_is_known(hands, after):
+def test_silence_of_a_coordinator_that_owes_an_answer_makes_it_say_hello(hands, after):
     member = joined()
     assert not member.must_rejoin(after, hands)
     assert member.must_rejoin(after + 0.1, hands)
@@ -59,7 +59,7 @@ def test_silence_while_jobs_run_means_nothing():
     assert not joined().must_rejoin(1e6, BUSY)
 
 
-def test_a_coordinator_that_was_out_of_sight_is_asked_at_once_and_only_when_it_is_back():
+def test_it_says_hello_when_the_coordinator_is_back_in_sight():
     member = joined()
     member.remove_coordinator("first", 1.0)
     assert not member.must_rejoin(1.0, BUSY)
@@ -70,7 +70,7 @@ def test_a_coordinator_that_was_out_of_sight_is_asked_at_once_and_only_when_it_i
     assert not member.must_rejoin(1.1, BUSY)
 
 
-def test_another_life_of_the_coordinator_is_asked_and_then_obeyed():
+def test_it_says_hello_to_another_life_of_the_coordinator():
     member = joined()
     member.remove_coordinator("first", 1.0)
     assert not member.add_coordinator("second")
@@ -79,7 +79,7 @@ def test_another_life_of_the_coordinator_is_asked_and_then_obeyed():
     assert not member.must_rejoin(1.1, BUSY)
 
 
-def test_a_question_without_an_answer_is_asked_again_after_a_pause():
+def test_an_unanswered_hello_is_repeated_after_a_pause():
     member = joined()
     member.remove_coordinator("first", 1.0)
     member.add_coordinator("first")
@@ -88,7 +88,7 @@ def test_a_question_without_an_answer_is_asked_again_after_a_pause():
     assert member.must_rejoin(3.0, BUSY)
 
 
-def test_told_once_it_drains_until_all_is_delivered():
+def test_stopped_once_it_drains_until_all_is_delivered():
     member = joined(drain_timeout=30.0)
     assert not member.start_draining_if_due(1.0)
     member.stop()
@@ -100,7 +100,7 @@ def test_told_once_it_drains_until_all_is_delivered():
     assert member.is_over(31.1, busy=True), "but not for ever"
 
 
-def test_told_twice_it_leaves_at_once():
+def test_stopped_twice_it_leaves_at_once():
     member = joined()
     member.stop()
     member.stop()
@@ -117,7 +117,7 @@ def test_it_drains_at_the_end_of_its_lifetime_which_begins_before_any_run():
 
 
 @pytest.mark.parametrize("seen", [True, False])
-def test_it_leaves_a_run_that_is_gone_if_it_shall(seen):
+def test_it_leaves_a_run_without_a_coordinator_if_configured(seen):
     leaves, stays = (joined(visible=seen, leaves_without_coordinator=each) for each in (True, False))
     for member in (leaves, stays):
         if seen:
@@ -126,14 +126,14 @@ def test_it_leaves_a_run_that_is_gone_if_it_shall(seen):
         since = 1e6 if seen else 0.0
         member.remove_coordinator(
             "never seen", since + COORDINATOR_GONE_AFTER
-        )  # a token that is lost twice starts no clock anew
+        )  # losing a token twice does not restart the clock
         assert not member.is_over(since + COORDINATOR_GONE_AFTER, busy=True)
     assert leaves.is_over(since + COORDINATOR_GONE_AFTER + 0.1, busy=True)
     assert not stays.is_over(math.inf, busy=False)
 
 
 class AnyOrder(RuleBasedStateMachine):
-    """A worker among coordinators that come and go, beside a plain account of what happened."""
+    """A worker among coordinators that come and go, compared with a simple model of what happened."""
 
     nonces = st.sampled_from(["first", "second", "third"])
     hands = st.builds(WorkerLoad, idle=st.booleans(), awaits_verdict=st.booleans(), uploading=st.booleans())
@@ -170,7 +170,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.now += seconds
 
     @rule()
-    def it_is_told_to_stop(self):
+    def it_is_stopped(self):
         self.member.stop()
         self.stops += 1
 
@@ -220,7 +220,7 @@ class AnyOrder(RuleBasedStateMachine):
             elif self.drains:
                 alone = (
                     not self.seen and self.now - self.alone > COORDINATOR_GONE_AFTER
-                )  # nobody takes what it would deliver
+                )  # nobody could receive its results
                 assert is_over == (not busy or self.now > self.drain_until or alone)
             else:
                 assert is_over == (not self.seen and self.now - self.alone > COORDINATOR_GONE_AFTER)

@@ -1,12 +1,27 @@
-from dreamfleet.common.protocol.messages import Result
-from dreamfleet.worker.service.outbox import MAX_RESULTS, Outbox
+import hashlib
+from itertools import pairwise
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dreamfleet.common.protocol.messages import MAX_PART, Result
+from dreamfleet.worker.service.outbox import (
+    BURST_INTERVAL,
+    MAX_BURST,
+    MAX_RESULTS,
+    MAX_ROUND_DELAY,
+    Outbox,
+    UploadQueue,
+)
+
+DIGEST, OTHER = b"\x01" * 32, b"\x02" * 32
 
 
 def result(number):
     return Result(number.to_bytes(32, "little"), 1.0, 10, 0.1, None, None)
 
 
-def test_a_result_leaves_at_once_and_again_until_its_verdict():
+def test_a_result_is_due_at_once_and_again_until_its_verdict():
     outbox = Outbox(repeat=1.0)
     outbox.add(result(1))
     assert outbox.due(0.0) == [(result(1),)]
@@ -17,7 +32,7 @@ def test_a_result_leaves_at_once_and_again_until_its_verdict():
     assert len(outbox) == 0
 
 
-def test_repetitions_of_what_nobody_answers_become_rarer():
+def test_unanswered_results_are_repeated_less_and_less_often():
     outbox = Outbox(repeat=1.0)
     outbox.add(result(1))
     assert sum(len(outbox.due(second / 10)) for second in range(600)) < 12
@@ -30,7 +45,7 @@ def test_many_results_are_cut_into_messages():
     assert [len(results) for results in outbox.due(0.0)] == [MAX_RESULTS, 5]
 
 
-def test_a_new_coordinator_hears_everything_again():
+def test_a_new_coordinator_gets_every_result_again():
     outbox = Outbox(repeat=100.0)
     outbox.add(result(1))
     outbox.due(0.0)
@@ -40,3 +55,57 @@ def test_a_new_coordinator_hears_everything_again():
 
 def test_verdicts_on_nothing_are_harmless():
     Outbox(repeat=1.0).acknowledge([b"x" * 32])
+
+
+def drain(uploads, now, seconds):
+    """Everything that is sent from `now` on, with its time."""
+    sent = []
+    for turn in range(round(seconds / BURST_INTERVAL) + 1):
+        sent += [(now + turn * BURST_INTERVAL, part) for part in uploads.due(now + turn * BURST_INTERVAL)]
+    return sent
+
+
+@given(st.integers(1, 3 * MAX_PART))
+def test_a_round_is_the_whole_file_in_parts(length):
+    data = bytes(length)
+    uploads = UploadQueue(repeat=100.0)
+    uploads.add(DIGEST, data)
+    parts = [part for _, part in drain(uploads, 0.0, 1.0)]
+    assert b"".join(part.data for part in parts) == data
+    assert [part.offset for part in parts] == list(range(0, length, MAX_PART))
+    assert {(part.total, part.sha256) for part in parts} == {(length, hashlib.sha256(data).digest())}
+
+
+def test_a_large_file_leaves_in_bursts():
+    uploads = UploadQueue(repeat=100.0)
+    uploads.add(DIGEST, bytes((MAX_BURST + 1) * MAX_PART))
+    assert len(uploads.due(0.0)) == MAX_BURST
+    assert uploads.due(BURST_INTERVAL / 2) == []
+    assert len(uploads.due(BURST_INTERVAL)) == 1
+
+
+def test_rounds_come_with_longer_and_longer_pauses_until_the_verdict():
+    uploads = UploadQueue(repeat=1.0)
+    uploads.add(DIGEST, b"drive")
+    times = [when for when, _ in drain(uploads, 0.0, 40.0)]
+    pauses = [round(after - before) for before, after in pairwise(times)]
+    assert pauses == [1, 2, 4, *[MAX_ROUND_DELAY] * 4]
+    uploads.acknowledge([DIGEST])
+    assert drain(uploads, 100.0, 40.0) == []
+    assert len(uploads) == 0
+
+
+def test_a_new_coordinator_gets_every_file_from_its_beginning():
+    uploads = UploadQueue(repeat=100.0)
+    uploads.add(DIGEST, bytes((MAX_BURST + 1) * MAX_PART))
+    uploads.due(0.0)
+    uploads.resend_all()
+    assert [part.offset for part in uploads.due(1.0)] == list(range(0, MAX_BURST * MAX_PART, MAX_PART))
+
+
+def test_the_verdict_on_one_file_leaves_the_other():
+    uploads = UploadQueue(repeat=100.0)
+    uploads.add(DIGEST, b"one")
+    uploads.add(OTHER, b"other")
+    uploads.acknowledge([DIGEST, b"x" * 32])
+    assert [part.data for part in uploads.due(0.0)] == [b"other"]

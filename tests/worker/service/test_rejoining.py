@@ -1,4 +1,4 @@
-"""A worker and the next life of its coordinator, or a coordinator that may have forgotten it."""
+"""A worker after its coordinator restarted, or may have forgotten it."""
 
 from dataclasses import replace
 from time import monotonic
@@ -14,7 +14,7 @@ from tests.support.hand import DEADLINE, SECOND, tag
 from tests.support.relay import Relay
 from tests.support.stage import wait_for
 
-SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest that there are
+SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest valid ones
 
 
 def test_it_follows_its_run_into_the_coordinators_next_life(stage, cached):
@@ -38,7 +38,7 @@ def test_it_follows_its_run_into_the_coordinators_next_life(stage, cached):
     assert hand.result(queued).fitness is not None
 
 
-def test_a_worker_that_did_not_hear_that_it_was_welcomed_again_asks_once_it_sees_it_by_the_batches(stage, cached):
+def test_a_batch_of_a_newer_numbering_makes_it_say_hello(stage, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     stage.worker()
     hand.ready()
@@ -58,7 +58,7 @@ def test_a_worker_that_did_not_hear_that_it_was_welcomed_again_asks_once_it_sees
     assert queued.digest not in hand.results(hand.job(4)), "a batch of the numbering before was late"
 
 
-def test_a_coordinators_next_life_hears_a_drive_from_the_beginning(stage, cached):
+def test_the_coordinators_next_life_gets_a_rollout_from_its_beginning(stage, cached):
     hand = stage.hand(tasks.HEAVY)
     stage.worker()
     hand.ready()
@@ -82,7 +82,7 @@ def relay(stage):
 
 def test_a_cut_connection_makes_it_say_hello_again(stage, relay, cached):
     hand = stage.hand()
-    hand.intervals = SLOW_BEATS  # so that no silence is long enough to be what it notices
+    hand.intervals = SLOW_BEATS  # so long that silence cannot be what makes it say hello
     stage.worker(relay.endpoint)
     hand.ready()
     first, second = hand.job(0), hand.job(1)
@@ -98,7 +98,7 @@ def test_a_cut_connection_makes_it_say_hello_again(stage, relay, cached):
 
 
 @pytest.mark.parametrize("owed", [True, False])
-def test_a_coordinator_that_has_nothing_to_say_is_asked_whether_it_knows_the_worker(stage, cached, owed):
+def test_it_says_hello_to_a_silent_coordinator(stage, cached, owed):
     hand = stage.hand()
     stage.worker()
     hand.ready()
@@ -120,7 +120,7 @@ def test_another_run_of_the_same_name_is_joined_anew(stage, said, cached):
     assert not served.done()
 
 
-def test_another_run_of_the_same_name_ends_one_that_shall_leave_when_its_own_is_over(stage, cached):
+def test_another_run_of_the_same_name_ends_a_worker_with_exit_when_done(stage, cached):
     hand = stage.hand()
     _, served = stage.worker(exit_when_done=True)
     hand.ready()
@@ -130,7 +130,7 @@ def test_another_run_of_the_same_name_ends_one_that_shall_leave_when_its_own_is_
     assert isinstance(served.exception(DEADLINE), RefusedError)
 
 
-def test_somebody_who_answers_as_another_run_does_not_part_it_from_its_own(stage, relay, cached):
+def test_a_stranger_that_answers_as_another_run_does_not_end_its_membership(stage, relay, cached):
     hand = stage.hand()
     stage.worker(relay.endpoint)
     hand.ready()

@@ -101,7 +101,7 @@ def test_it_scores_and_the_same_job_gives_the_same_bits(harness):
     assert first.fitness == second.fitness != other.fitness
 
 
-def test_a_kept_drive_is_what_a_candidate_would_drive(harness):
+def test_a_collected_rollout_is_the_drive_of_the_candidate(harness):
     slot = harness(tasks.TOY)
     scored = slot.score()
     slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
@@ -115,7 +115,7 @@ def test_a_kept_drive_is_what_a_candidate_would_drive(harness):
     assert slot.outcome()[1] == file, "equal drives give equal files"
 
 
-def test_a_failed_drive_is_an_error_without_a_file(harness):
+def test_a_failed_collection_is_an_error_without_a_file(harness):
     slot = harness(tasks.RAISING)
     slot.wait_ready()
     slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
@@ -144,7 +144,7 @@ def test_a_crash_costs_one_job_and_another_child_takes_its_place(harness):
         assert (result.fitness, result.error) == (None, f"slot crashed (signal {signal.SIGSEGV.value})")
 
 
-def test_a_child_that_is_heard_no_more_and_lives_on_is_replaced(harness):
+def test_a_child_that_lives_but_closed_its_pipe_is_replaced(harness):
     slot = harness(tasks.SILENT)
     slot.wait_ready()
     pid = slot.slot.pid
@@ -170,7 +170,7 @@ def test_a_killed_child_is_replaced_alone(harness):
     assert slot.score().fitness is not None
 
 
-def test_a_job_that_is_given_up_ends_without_a_result_and_the_child_lives_on(harness):
+def test_an_abandoned_job_has_no_result_and_the_child_lives_on(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
     pid = slot.slot.pid
@@ -182,7 +182,7 @@ def test_a_job_that_is_given_up_ends_without_a_result_and_the_child_lives_on(har
     assert slot.slot.pid == pid
 
 
-def test_after_short_turns_the_next_one_waits_in_the_child(harness):
+def test_after_short_groups_the_next_one_is_queued_in_the_child(harness):
     slot = harness(tasks.TOY)
     slot.wait_ready()
     assert not slot.slot.can_queue_another
@@ -194,7 +194,7 @@ def test_after_short_turns_the_next_one_waits_in_the_child(harness):
     assert [slot.result().digest for _ in range(2)] == [job(number, spec=slot.spec).digest for number in (1, 2)]
 
 
-def test_a_crash_leaves_what_waits_to_the_next_child(harness):
+def test_after_a_crash_the_next_child_gets_the_queued_group(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
     for number in (0, 1):
@@ -206,7 +206,7 @@ def test_a_crash_leaves_what_waits_to_the_next_child(harness):
     assert scored.fitness is not None
 
 
-def test_of_a_turn_of_several_jobs_all_must_be_given_up_to_end_it(harness):
+def test_a_group_ends_only_when_all_its_jobs_are_abandoned(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
     jobs = [job(number, spec=slot.spec) for number in range(2)]
@@ -230,7 +230,7 @@ def test_a_hung_job_is_killed_and_its_child_replaced(harness):
     slot.slot.submit([(stalling, VECTOR)])
     now = monotonic()
     slot.slot.check(now + 4.0, 0.0)
-    slot.slot.check(now + 8.0, 4.0)  # the host stood still for four of the eight seconds
+    slot.slot.check(now + 8.0, 4.0)  # the host was suspended for four of the eight seconds
     assert slot.slot.running
     slot.slot.check(now + 9.5, 0.0)
     result = slot.result()
@@ -260,19 +260,19 @@ def test_a_child_that_cannot_start_ends_with_its_reason(harness, tmp_path):
         slot.slot.handle(last)
 
 
-def test_a_child_that_is_stopped_as_it_starts_is_replaced_after_a_generous_while(harness):
+def test_a_child_that_hangs_as_it_starts_is_replaced(harness):
     slot = harness(tasks.TOY)
     pid, now = slot.slot.pid, monotonic()
     os.kill(pid, signal.SIGSTOP)
     slot.slot.check(now + START_LIMIT - 1.0, 0.0)
-    slot.slot.check(now + 2 * START_LIMIT, START_LIMIT)  # so long did the host itself stand still
+    slot.slot.check(now + 2 * START_LIMIT, START_LIMIT)  # the host was suspended for that time
     slot.slot.check(now + 2 * START_LIMIT + 2.0, 0.0)
     slot.slot.handle(slot.gone())
     assert slot.score().fitness is not None
     assert slot.slot.pid != pid
 
 
-def test_a_slot_waits_a_while_for_descriptors_and_then_says_what_is_lacking(harness, random_bundle):
+def test_a_slot_retries_without_descriptors_and_then_names_the_cause(harness, random_bundle):
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     hash_of(random_bundle.path)
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
@@ -297,7 +297,7 @@ def test_a_slot_waits_a_while_for_descriptors_and_then_says_what_is_lacking(harn
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-def test_a_child_that_is_killed_again_and_again_before_it_did_anything_keeps_no_host_busy(harness):
+def test_children_that_end_without_a_result_are_replaced_after_growing_pauses(harness):
     slot = harness(tasks.TOY)
     for number in range(4):
         slot.wait_ready()
@@ -310,7 +310,7 @@ def test_a_child_that_is_killed_again_and_again_before_it_did_anything_keeps_no_
     assert slot.score().fitness is not None
 
 
-def test_a_child_that_needs_longer_to_start_is_given_longer_the_next_time(harness):
+def test_the_time_limit_of_a_start_grows_after_a_failure(harness):
     slot = harness(tasks.TOY)
     os.kill(slot.slot.pid, signal.SIGSTOP)
     slot.slot.check(monotonic() + START_LIMIT + 2.0, 0.0)
@@ -328,14 +328,14 @@ def test_a_child_that_ends_as_it_starts_blames_no_job(harness):
         slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
     os.kill(slot.slot.pid, signal.SIGKILL)
     assert slot.result().error == "slot crashed (signal 9)"
-    os.kill(slot.slot.pid, signal.SIGKILL)  # the next child, to which the second job has gone, and which starts
+    os.kill(slot.slot.pid, signal.SIGKILL)  # the next child, which is starting and has the second job
     scored = slot.result()
     assert scored.digest == job(1, spec=slot.spec).digest
     assert scored.fitness is not None
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_what_asks_the_worker_to_leave_does_not_end_a_child_that_starts(harness, number):
+def test_signals_for_the_worker_do_not_end_a_starting_child(harness, number):
     slot = harness(tasks.TOY)
     pid = slot.slot.pid
     os.kill(pid, number)
@@ -388,7 +388,7 @@ def test_a_bundle_that_was_swapped_is_never_scored_with(harness, random_bundle, 
 
 
 @pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(b"no bundle")])
-def test_a_bundle_that_others_took_away_or_damaged_is_obtained_again(harness, random_bundle, tmp_path, damage):
+def test_a_removed_or_damaged_bundle_is_fetched_again(harness, random_bundle, tmp_path, damage):
     path = tmp_path / "cached.zip"
     shutil.copyfile(random_bundle.path, path)
     slot = harness(tasks.TOY, path, restore_bundle=lambda: shutil.copyfile(random_bundle.path, path))

@@ -39,7 +39,7 @@ class FormerInInstance(Toy):
 
 
 class FormerWithoutBase:
-    """It has the contract's methods, and is no subclass of `Task`."""
+    """It has the methods of a task without being a subclass of `Task`."""
 
     name, world, width = "former without base", Toy.world, 2
     world_of, make_environment, make_policy = Former.world_of, Toy.make_environment, Toy.make_policy

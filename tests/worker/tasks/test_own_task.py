@@ -1,4 +1,4 @@
-"""docs/tasks.md's package, installed as anybody's is."""
+"""The example package of docs/tasks.md, installed with pip."""
 
 import os
 import re

@@ -63,9 +63,7 @@ def test_a_bundle_of_another_task_or_of_pictures_that_it_does_not_give_is_refuse
 
 
 @pytest.mark.parametrize("preprocessing", [BOX, RAW])
-def test_environment_and_judge_observe_gymnasiums_own_environment_behind_the_bundles_preprocessing(
-    tmp_path, preprocessing
-):
+def test_both_environments_observe_gymnasiums_pictures_preprocessed(tmp_path, preprocessing):
     vae = VAEConfig(picture=preprocessing.size, latent=4, channels=(2, 2, 2, 2))
     bundle = write_random_bundle(tmp_path / "b.zip", vae=vae, rnn=MDNRNNConfig(latent=4, hidden=4))
     task, plain = find_task("car-racing"), gymnasium.make("CarRacing-v3")
@@ -85,7 +83,7 @@ def test_environment_and_judge_observe_gymnasiums_own_environment_behind_the_bun
         each.close()
 
 
-def test_an_episode_begins_from_nothing_whatever_was_driven_before(random_bundle):
+def test_an_episode_does_not_depend_on_earlier_ones(random_bundle):
     policy = find_task("car-racing").make_policy(Assignment.of("car-racing", random_bundle))
     random = np.random.default_rng(1)
     parameters = random.normal(size=random_bundle.controller_shape.size).astype(np.float32)
@@ -98,7 +96,7 @@ def test_an_episode_begins_from_nothing_whatever_was_driven_before(random_bundle
     assert (episodes[0][0] != episodes[0][-1]).any(), "the state changes what the same picture leads to"
 
 
-def test_a_job_is_scored_under_the_controller_that_its_run_names(random_bundle):
+def test_a_job_is_scored_with_the_controller_shape_of_its_run(random_bundle):
     shape = random_bundle.shape_of("z", 4)
     scorer = Scorer(TaskSpec("car-racing", random_bundle.sha256, 5, 0, shape), random_bundle)
     assert scorer.score("score", np.zeros(shape.size, np.float32), 3).steps == 5
@@ -108,7 +106,7 @@ def test_a_job_is_scored_under_the_controller_that_its_run_names(random_bundle):
 
 
 def varied(bundle, task="car-racing", horizon=5, **named):
-    """A specification of a variant, and a vector that it scores."""
+    """A specification with a variant, and a parameter vector."""
     variant = Variant(**named)
     shape = bundle.shape_of("zh", 0, variant)
     spec = TaskSpec(task, bundle.sha256, horizon, 0, shape, options=variant.options, version=variant.version)
@@ -116,7 +114,7 @@ def varied(bundle, task="car-racing", horizon=5, **named):
 
 
 def judged(spec, bundle, vector, episode_config):
-    """The score of a course in the task's judge."""
+    """The score of an episode in the task's evaluation environment."""
     task, assignment = find_task(spec.task), Assignment(spec, bundle)
     judge = task.make_evaluation_environment(assignment)
     found = score(judge, task.make_policy(assignment), vector, episode_config)
@@ -125,7 +123,7 @@ def judged(spec, bundle, vector, episode_config):
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_a_job_is_scored_under_the_variant_that_its_run_names(random_bundle, name):
+def test_a_job_is_scored_with_the_variant_of_its_run(random_bundle, name):
     spec, vector = varied(random_bundle, **vars(VARIANTS[name]))
     scorer = Scorer(spec, random_bundle)
     scores = [scorer.score("score", vector, 3) for _ in range(2)]
@@ -178,7 +176,7 @@ def test_a_lap_that_is_over_costs_no_more_time(random_bundle):
     environment.close()
 
 
-def test_who_knows_no_variants_does_not_score_one_as_if_it_were_plain(random_bundle):
+def test_an_older_worker_does_not_score_a_variant(random_bundle):
     spec, _ = varied(random_bundle, decide_every=4)
     assert (spec.version, spec.controller) == (2, random_bundle.default_shape)
     with pytest.raises(UsageError, match="version 1 of task car-racing, here is version 2"):
@@ -199,7 +197,7 @@ def test_a_controller_of_another_size_is_refused(random_bundle):
         find_task("car-racing").make_policy(Assignment.of("car-racing", random_bundle)).begin(np.zeros(15, np.float32))
 
 
-def test_a_turn_is_scored_at_its_jobs_temperature_as_a_run_of_that_temperature_scores(random_bundle):
+def test_a_group_is_scored_at_its_jobs_temperature(random_bundle):
     spec = TaskSpec("dream", random_bundle.sha256, 20, 0, temperature=1.0)
     random = np.random.default_rng(1)
     jobs = [("score", random.normal(size=867).astype(np.float32), seed) for seed in (1, 2, 3)]
@@ -213,7 +211,7 @@ def test_a_turn_is_scored_at_its_jobs_temperature_as_a_run_of_that_temperature_s
 
 
 @pytest.mark.parametrize(("task", "horizons"), [("dream", (20, 7, 20)), ("car-racing", (4, 2, 4))])
-def test_a_turn_is_as_long_as_its_stage_and_scored_as_a_run_of_that_horizon_scores(random_bundle, task, horizons):
+def test_a_group_is_scored_with_its_stages_horizon(random_bundle, task, horizons):
     spec = TaskSpec(task, random_bundle.sha256, horizons[0], 0)
     jobs = [("score", np.random.default_rng(1).normal(size=867).astype(np.float32), seed) for seed in (1, 2)]
     scorer = Scorer(spec, random_bundle)
@@ -224,7 +222,7 @@ def test_a_turn_is_as_long_as_its_stage_and_scored_as_a_run_of_that_horizon_scor
     scorer.close()
 
 
-def test_only_what_is_scored_or_kept_is_cut_by_a_stages_horizon_and_patience(random_bundle):
+def test_evaluations_ignore_a_stages_horizon_and_patience(random_bundle):
     spec = TaskSpec("car-racing", random_bundle.sha256, 1000, 0)
     scorer, stage = Scorer(spec, random_bundle), spec.with_overrides(horizon=300, patience=40)
     for kind in ("score", "collect"):
@@ -235,6 +233,6 @@ def test_only_what_is_scored_or_kept_is_cut_by_a_stages_horizon_and_patience(ran
 
 
 @pytest.mark.parametrize("name", ["os:abort", "sys:exit", "tests.support.tasks:steps_made"])
-def test_what_is_no_class_is_never_called_as_a_task(name):
+def test_an_attribute_that_is_no_class_is_never_called(name):
     with pytest.raises(UsageError, match="is no task: it is no class"):
         find_task(name)

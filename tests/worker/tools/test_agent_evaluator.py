@@ -1,4 +1,4 @@
-"""A judge tells how an episode was driven, and drives it as it would unwatched."""
+"""An evaluator reports how an episode was driven, and the statistics change nothing."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def tiny():
 
 
 @pytest.mark.parametrize("task", ["car-racing", "dream"])
-def test_it_tells_speed_and_brake_of_a_drive_that_is_the_same_unwatched(tiny, monkeypatch, tmp_path, task):
+def test_it_reports_speed_and_brake_of_a_drive_that_is_the_same_unwatched(tiny, monkeypatch, tmp_path, task):
     monkeypatch.setattr(judging, "EpisodeConfig", lambda seed, _horizon: EpisodeConfig(seed, STEPS))
     controller = find_controller("tiny", tmp_path)[0]
     parameters = controller.parameters.copy()
@@ -44,7 +44,7 @@ def test_it_tells_speed_and_brake_of_a_drive_that_is_the_same_unwatched(tiny, mo
     assert 0 <= drive.speed < 20
 
 
-def test_of_a_world_that_tells_nothing_nothing_is_told():
+def test_a_world_without_a_true_state_has_no_statistics():
     watch = DriveStatistics(World(STEERING_GAS_BRAKE, action_names=("steer", "gas", "brake")), None)
     watch.on_transition(moment({"lap_finished": True}))
     assert watch.drive(3, Score(5.0, 1)) == EpisodeResult(3, 5.0, 1)
@@ -53,7 +53,7 @@ def test_of_a_world_that_tells_nothing_nothing_is_told():
 @pytest.mark.parametrize(
     ("last", "finished"), [({"lap_finished": True}, True), ({"lap_finished": False}, False), ({}, False)]
 )
-def test_a_lap_is_finished_where_the_environment_says_so_as_it_ends(last, finished):
+def test_a_lap_is_finished_if_the_environment_says_so_at_the_end(last, finished):
     watch = DriveStatistics(find_task("car-racing").world, lambda: {"speed": 30.0})
     for info in ({}, last):
         watch.on_transition(moment(info))
@@ -61,8 +61,8 @@ def test_a_lap_is_finished_where_the_environment_says_so_as_it_ends(last, finish
     assert (drive.finished, drive.speed, drive.braking) == (finished, 30.0, 0.0)
 
 
-def test_gymnasium_says_so_of_a_lap():
-    """The rule that is relied on: all tiles visited, and the flag in `info`; off the field it is there, and false."""
+def test_gymnasium_reports_a_finished_lap():
+    """gymnasium's flag in `info`: true when all tiles were visited, false when the car left the field."""
     environment = gymnasium.make("CarRacing-v3")
     environment.reset(seed=1)
     inner = environment.unwrapped

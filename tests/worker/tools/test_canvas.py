@@ -22,7 +22,7 @@ def plain(colour):
     return np.full((64, 64, 3), colour, np.uint8)
 
 
-def test_a_frame_shows_the_track_what_is_seen_and_what_is_decoded():
+def test_a_frame_shows_the_track_the_observation_and_the_decoded_latent():
     green = plain(GREEN)
     green[:, ::2] = 0  # an edge a pixel: enlarging must not blur it
     frame = Canvas(SEED).draw(DriveFrame(plain(RED), ACTION, 7, 12.5, ModelPictures(green, plain(BLUE))))
@@ -34,7 +34,7 @@ def test_a_frame_shows_the_track_what_is_seen_and_what_is_decoded():
 
 
 @pytest.mark.parametrize("since", [0, 9900])
-def test_a_dream_is_whole_below_them_and_its_label_within_the_frame(since):
+def test_a_dreamt_picture_and_its_label_fit_into_the_frame(since):
     moment = DriveFrame(
         plain(RED), ACTION, 7, 12.5, ModelPictures(plain(GREEN), plain(BLUE), DreamPicture(plain(WHITE), since))
     )

@@ -29,7 +29,7 @@ def controller(random_bundle):
     return make
 
 
-def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
+def test_scores_are_those_of_the_evaluation_environment(controller, random_bundle):
     task = find_task(tasks.JUDGED)
     alone = {
         seed: episode.score(
@@ -54,7 +54,7 @@ def test_scores_are_the_judges_whoever_drove_them(controller, random_bundle):
         (tasks.RAISING, RuntimeError, "road has ended"),
     ],
 )
-def test_what_goes_wrong_in_a_process_ends_the_evaluation_and_says_why(controller, random_bundle, task, error, says):
+def test_an_error_in_a_process_ends_the_evaluation_with_the_reason(controller, random_bundle, task, error, says):
     with pytest.raises(error, match=says):
         list(evaluate(make_agent(controller(task), random_bundle), SEEDS, 2))
 
@@ -74,7 +74,7 @@ def test_a_controller_that_does_not_fit_is_refused(random_bundle):
         find_bundle_of(small, str(random_bundle.path))
 
 
-def test_the_verb_reports_every_score_and_warns_of_tracks_that_are_no_test_tracks(
+def test_the_verb_reports_every_score_and_warns_about_tracks_outside_the_test_set(
     processes, controller, random_bundle, tmp_path
 ):
     controller().save(tmp_path / "toy.npz")
@@ -90,7 +90,7 @@ def test_the_verb_reports_every_score_and_warns_of_tracks_that_are_no_test_track
     assert (report["task"], report["bundle"]) == (tasks.TOY, random_bundle.sha256)
 
 
-def test_what_it_writes_is_what_it_prints_and_drives_again_to_the_bit(processes, controller, random_bundle, tmp_path):
+def test_the_report_is_what_it_prints_and_can_be_repeated_to_the_bit(processes, controller, random_bundle, tmp_path):
     controller().save(tmp_path / "toy.npz")
     (tmp_path / "bundle.zip").write_bytes(random_bundle.path.read_bytes())
     out = tmp_path / "results" / "toy.json"
@@ -116,7 +116,7 @@ def test_what_it_writes_is_what_it_prints_and_drives_again_to_the_bit(processes,
     assert (code, "records drives by the world model efefefefefef" in err) == (1, True)
 
 
-def test_where_no_report_can_be_written_is_said_before_anybody_drives(processes, controller, random_bundle, tmp_path):
+def test_an_unwritable_report_is_an_error_before_the_first_episode(processes, controller, random_bundle, tmp_path):
     controller(tasks.HANGING).save(tmp_path / "toy.npz")
     judged = ("evaluate", "--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--out", tmp_path)
     code, _, err = processes.call(*judged)

@@ -1,4 +1,4 @@
-"""What is shown live: of a worker's frames, and of drives for the viewer; and where it goes."""
+"""Live frames of workers and of drives for the viewer, and their outputs."""
 
 import io
 import json
@@ -31,64 +31,64 @@ PARAMETERS = np.random.default_rng(0).normal(0, 0.1, 867).astype(np.float32)
 
 
 class Once:
-    """Sees the tenth step."""
+    """Observes the tenth step."""
 
     def __init__(self):
-        self.glimpse, self._asked = None, 0
+        self.step, self._asked = None, 0
 
     def is_due(self):
         self._asked += 1
         return self._asked == 10
 
     def observe(self, _episode, look):
-        self.glimpse = look()
+        self.step = look()
 
 
-def sight_of(bundle, task, **more):
-    """A worker's frame of a moment of the real task."""
+def live_frame_of(bundle, task, **more):
+    """A worker's frame of one step of a task."""
     scorer, eyes = Scorer(TaskSpec(task, bundle.sha256, 20, 0, temperature=1.0), bundle), Once()
     scorer.observer = eyes
     scorer.score("score", PARAMETERS, 2**20)
     scorer.close()
-    seen = eyes.glimpse
+    seen = eyes.step
     picture = (1, 1, b"") if seen.picture is None else pack_picture(seen.picture)
     numbers = [each.astype("<f4").tobytes() for each in (seen.latent, seen.state, PARAMETERS)]
-    told = {
+    facts = {
         "slot": 0, "tag": b"ABCDEFGH", "step": seen.step, "reward": seen.score, "height": picture[0],
         "width": picture[1], "picture": picture[2], "packed": bool(picture[2]), "generation": 7, "candidate": 2,
         "seed": 2**20, "action": tuple(map(float, seen.action)), "latent": numbers[0], "state": numbers[1],
         "parameters": numbers[2], **more,
     }  # fmt: skip
-    return LiveFrame.of("host-a/0a1b2c3d", decode(ViewFrame, encode(ViewFrame(**HEAD, **told))))
+    return LiveFrame.of("host-a/0a1b2c3d", decode(ViewFrame, encode(ViewFrame(**HEAD, **facts))))
 
 
 @pytest.mark.parametrize("task", ["car-racing", "dream"])
-def test_a_workers_frame_is_decoded_and_dreamt_on_by_the_viewer(random_bundle, task):
-    sight, imagination = sight_of(random_bundle, task), LiveDreamer(random_bundle, 1.0)
-    imagined = imagination.decode_and_dream(sight)
-    assert (imagined.decoded == Decoder(random_bundle).decode(sight.latent[None])[0]).all()
-    assert [ahead for ahead, _ in imagined.dreamt] == list(AHEAD)
-    assert len({picture.tobytes() for _, picture in imagined.dreamt}) == len(AHEAD)
+def test_the_viewer_decodes_a_workers_frame_and_continues_it_as_a_dream(random_bundle, task):
+    live, dreamer = live_frame_of(random_bundle, task), LiveDreamer(random_bundle, 1.0)
+    dream = dreamer.decode_and_dream(live)
+    assert (dream.decoded == Decoder(random_bundle).decode(live.latent[None])[0]).all()
+    assert [ahead for ahead, _ in dream.dreamt] == list(AHEAD)
+    assert len({picture.tobytes() for _, picture in dream.dreamt}) == len(AHEAD)
     assert all(
         np.array_equal(one[1], other[1])
-        for one, other in zip(imagined.dreamt, imagination.decode_and_dream(sight).dreamt, strict=True)
+        for one, other in zip(dream.dreamt, dreamer.decode_and_dream(live).dreamt, strict=True)
     )
-    shown = LiveCanvas("night", ("steer", "gas", "brake"), imagination).draw(sight)
+    shown = LiveCanvas("night", ("steer", "gas", "brake"), dreamer).draw(live)
     assert shown.picture.shape == (*SIZE[::-1], 3)
     assert shown.facts == {
         "run": "night", "worker": "host-a/0a1b2c3d", "kind": "score", "generation": 7, "candidate": 2, "seed": 2**20,
-        "step": 9, "score": sight.frame.reward,
+        "step": 9, "score": live.frame.reward,
     }  # fmt: skip
-    assert (sight.picture is None) == (task == "dream")
+    assert (live.picture is None) == (task == "dream")
 
 
 @pytest.mark.parametrize(
     "more", [{"latent": bytes(8)}, {"latent": b""}, {"state": bytes(8)}, {"parameters": bytes(16)}, {"picture": b""}]
 )
-def test_a_frame_that_is_of_another_world_model_is_shown_as_far_as_it_goes(random_bundle, more):
-    sight = sight_of(random_bundle, "car-racing", **({"packed": False} if "picture" in more else {}), **more)
-    glass = LiveCanvas("n" * 63, ("steer", "gas", "brake"), LiveDreamer(random_bundle, 1.0))
-    assert glass.draw(sight).picture.shape == (*SIZE[::-1], 3)
+def test_a_frame_of_another_world_model_is_shown_without_the_model(random_bundle, more):
+    live = live_frame_of(random_bundle, "car-racing", **({"packed": False} if "picture" in more else {}), **more)
+    canvas = LiveCanvas("n" * 63, ("steer", "gas", "brake"), LiveDreamer(random_bundle, 1.0))
+    assert canvas.draw(live).picture.shape == (*SIZE[::-1], 3)
 
 
 def driver(bundle):
@@ -97,7 +97,7 @@ def driver(bundle):
     return lambda: (agent, {"controller": "mine"})
 
 
-def test_a_controller_is_shown_at_the_worlds_pace_and_scores_as_it_would_unseen(random_bundle, monkeypatch):
+def test_a_controller_is_shown_in_real_time_and_scores_the_same(random_bundle, monkeypatch):
     drive = driver(random_bundle)
     agent, _ = drive()
     shown = list(islice(driven_frames(drive, ParallelDreamConfig(), 10, SEED), 8))
@@ -113,7 +113,7 @@ def test_a_controller_is_shown_at_the_worlds_pace_and_scores_as_it_would_unseen(
 PICTURES = [CaptionedFrame(np.full((40, 60, 3), value, np.uint8), {"step": value}) for value in (10, 200, 90)]
 
 
-def test_stills_lie_in_a_folder_beside_what_they_show(tmp_path):
+def test_pictures_are_in_a_folder_with_their_facts(tmp_path):
     with open_sink(str(tmp_path / "new" / "stills"), 10, io.BytesIO()) as show:
         assert all(show(each) for each in (None, *PICTURES))
     assert sorted(path.name for path in (tmp_path / "new" / "stills").iterdir()) == [
@@ -131,7 +131,7 @@ def test_a_video_has_every_picture(tmp_path):
         assert len(list(container.decode(stream))) == 3
 
 
-def test_a_stream_is_read_back_picture_by_picture_and_ends_where_its_reader_leaves(tmp_path):
+def test_a_stream_has_every_picture_and_ends_when_its_reader_leaves(tmp_path):
     out = io.BytesIO()
     with open_sink("-", 10, out) as show:
         assert all(show(each) for each in (None, *PICTURES))
@@ -150,7 +150,7 @@ def test_a_stream_is_read_back_picture_by_picture_and_ends_where_its_reader_leav
         assert not show(PICTURES[0])
 
 
-def test_places_where_nothing_can_be_written_are_refused(tmp_path):
+def test_unwritable_outputs_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     for name in ("live.webm", "file", "file/stills", "file/live.mp4"):
         with pytest.raises(DreamfleetError, match="--out"), open_sink(str(tmp_path / name), 10, io.BytesIO()):

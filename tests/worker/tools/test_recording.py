@@ -25,15 +25,15 @@ def controller(random_bundle):
     return Controller(shape, parameters, "car-racing", random_bundle.sha256)
 
 
-def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_bundle, tmp_path):
-    told, agent = [], make_agent(controller, random_bundle)
-    score = record(agent, SEED, STEPS, tmp_path / "new" / "drive.mp4", on_step=told.append)
+def test_a_video_has_one_frame_a_step_and_the_drives_score(controller, random_bundle, tmp_path):
+    steps, agent = [], make_agent(controller, random_bundle)
+    score = record(agent, SEED, STEPS, tmp_path / "new" / "drive.mp4", on_step=steps.append)
     task, assignment = find_task("car-racing"), Assignment.of("car-racing", random_bundle)
     judge = task.make_evaluation_environment(assignment)
     driven = episode.score(judge, task.make_policy(assignment), controller.parameters, EpisodeConfig(SEED, STEPS))
     judge.close()
     assert score == driven.fitness
-    assert told == list(range(1, STEPS + 1))
+    assert steps == list(range(1, STEPS + 1))
     with av.open(str(tmp_path / "new" / "drive.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
@@ -42,15 +42,15 @@ def test_a_video_has_a_frame_a_step_and_the_drives_own_score(controller, random_
 
 
 @pytest.mark.parametrize("after", [0, 3])
-def test_a_recording_that_is_told_to_stop_can_be_played_as_far_as_it_came(controller, random_bundle, tmp_path, after):
-    told = [0]
+def test_a_stopped_recording_is_playable(controller, random_bundle, tmp_path, after):
+    steps = [0]
     record(
-        make_agent(controller, random_bundle), SEED, STEPS, tmp_path / "drive.mp4", on_step=told.append,
-        stop=lambda: told[-1] >= after,
+        make_agent(controller, random_bundle), SEED, STEPS, tmp_path / "drive.mp4", on_step=steps.append,
+        stop=lambda: steps[-1] >= after,
     )  # fmt: skip
-    assert told[-1] == max(after, 1)
+    assert steps[-1] == max(after, 1)
     with av.open(str(tmp_path / "drive.mp4")) as container:
-        assert len(list(container.decode(container.streams.video[0]))) == told[-1]
+        assert len(list(container.decode(container.streams.video[0]))) == steps[-1]
 
 
 def test_a_controller_that_was_evolved_in_the_dream_is_recorded_in_reality(controller, random_bundle, tmp_path):
@@ -61,7 +61,7 @@ def test_a_controller_that_was_evolved_in_the_dream_is_recorded_in_reality(contr
     assert scores[0] == scores[1]
 
 
-def test_a_bundle_that_cannot_dream_is_recorded_with_two_pictures(controller, random_bundle, tmp_path):
+def test_a_bundle_without_a_dream_is_recorded_with_two_pictures(controller, random_bundle, tmp_path):
     manifest = random_bundle.manifest
     parts = {name: random_bundle.read(name) for name in manifest.parts if name != DREAM_GRAPH}
     awake = write_bundle(tmp_path / "awake.zip", replace(manifest, parts={}), parts)

@@ -18,7 +18,7 @@ def finished_run(processes, random_bundle):
     return processes.runs / "test"
 
 
-def test_a_fitness_that_is_not_what_was_stored_is_told_and_exits_1(processes, finished_run):
+def test_a_fitness_that_differs_from_the_stored_one_is_reported_and_exits_1(processes, finished_run):
     replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
     code, out, _ = processes.call(*replay)
     assert (code, out.count("same bits")) == (0, 2)
@@ -32,7 +32,7 @@ def test_a_fitness_that_is_not_what_was_stored_is_told_and_exits_1(processes, fi
     assert "candidate 5/0" in err
 
 
-def test_what_a_host_of_another_class_scored_is_counted_and_compared_if_that_is_asked(processes, finished_run):
+def test_results_of_another_host_class_are_counted_and_optionally_compared(processes, finished_run):
     with sqlite3.connect(finished_run / JOURNAL) as connection:
         connection.execute("UPDATE result SET fitness = fitness + 0.5, host_class = 'there' WHERE episode = 1")
     connection.close()

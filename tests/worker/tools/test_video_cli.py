@@ -1,4 +1,4 @@
-"""`record` and `baseline record` take the same tracks and answer alike."""
+"""`record` and `baseline record` take the same arguments and print the same answers."""
 
 import json
 
@@ -22,7 +22,7 @@ def verb(request, random_bundle, tmp_path):
     return ["record", "--controller", str(path), "--bundle", str(random_bundle.path)]
 
 
-def told(capsys, verb, *words):
+def answers(capsys, verb, *words):
     assert command_line.main([*verb, "--steps", str(STEPS), "--json", *map(str, words)]) == 0
     return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
@@ -32,14 +32,14 @@ def pictures(video):
         return [each.to_ndarray(format="rgb24").astype(int) for each in container.decode(container.streams.video[0])]
 
 
-def test_each_of_several_tracks_has_a_video_of_its_own(verb, tmp_path, capsys):
-    both = told(capsys, verb, "--seed", FIRST, SECOND, FIRST, "--out", tmp_path / "drive.mp4")
+def test_each_track_has_its_own_video(verb, tmp_path, capsys):
+    both = answers(capsys, verb, "--seed", FIRST, SECOND, FIRST, "--out", tmp_path / "drive.mp4")
     assert [each["seed"] for each in both] == [FIRST, SECOND]
     for each in both:
         video = tmp_path / f"drive-{each['seed']}.mp4"
         assert each["video"] == str(video)
         assert len(pictures(video)) == STEPS
-        alone = told(capsys, verb, "--seed", each["seed"], "--out", tmp_path / "alone.mp4")
+        alone = answers(capsys, verb, "--seed", each["seed"], "--out", tmp_path / "alone.mp4")
         assert alone == [{**each, "video": str(tmp_path / "alone.mp4")}]
         np.testing.assert_allclose(pictures(tmp_path / "alone.mp4"), pictures(video), atol=8)  # x264 differs by a bit
 
@@ -53,9 +53,7 @@ def test_each_of_several_tracks_has_a_video_of_its_own(verb, tmp_path, capsys):
         (("--out", "folder.mp4"), "--out folder.mp4 is a folder: name a file in it"),
     ],
 )
-def test_what_cannot_be_recorded_is_one_line_before_anything_is_driven(
-    verb, words, says, tmp_path, monkeypatch, capsys
-):
+def test_an_invalid_recording_is_one_line_before_the_first_step(verb, words, says, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.mp4").mkdir()
     assert command_line.main([*verb, *words]) == UsageError.exit_code
