@@ -1,7 +1,7 @@
-"""How warm a run dreams: its temperature is raised each time that evaluations of its mean fall.
+"""The temperature of a run's dreams, which rises each time that evaluations of the mean fall.
 
-A generation's temperature is a pure function of the run's settings and of evaluations that are finished before it
-opens, so that a life of the coordinator that is interrupted anywhere goes on to the bit.
+A generation's temperature is a pure function of the run's settings and of evaluations that finished before it opens.
+So a run that is interrupted anywhere continues bit-identically.
 """
 
 from __future__ import annotations
@@ -14,29 +14,26 @@ from dreamfleet.common.runs.stages import latest_usable_evaluation
 
 
 class TemperatureSchedule:
-    """The temperature of one generation after another: the run's own, perhaps raised.
+    """Computes the temperature of one generation after another, reading each evaluation once.
 
-    Each evaluation is looked at once, however long the run is.
-
-    Each evaluation that lies clearly behind the best one since the last raise multiplies the temperature by the run's
-    heat, up to `MAX_TEMPERATURE`. Only scheduled evaluations count: one that a
-    limit triggered depends on when a run was interrupted.
+    An evaluation clearly below the best one since the last increase multiplies the temperature by the run's `heat`, up
+    to `MAX_TEMPERATURE`. Only scheduled evaluations count, as the final one depends on when a run was interrupted.
     """
 
     def __init__(self, settings: RunSettings) -> None:
         self._settings = settings
         self._temperature = settings.task.temperature
-        self._best: StoredEvaluation | None = None  # since the last raise
-        self._next = settings.evaluate_every - 1  # the one to look at next, by its generation
+        self._best: StoredEvaluation | None = None  # since the last increase
+        self._next = settings.evaluate_every - 1  # generation of the next evaluation to read
 
     def required_evaluation(self, generation: int) -> int:
-        """The last evaluation, by its generation, that `generation`'s temperature depends on; negative: on none."""
+        """The generation of the last evaluation that `generation`'s temperature depends on; negative: none."""
         return -1 if self._settings.heat == 1 else latest_usable_evaluation(self._settings.evaluate_every, generation)
 
     def temperature_at(self, generation: int, finished: Mapping[int, StoredEvaluation]) -> float | None:
-        """`generation`'s temperature; `None` where a task has none. Ask for generations in rising order.
+        """The temperature of `generation`, `None` if the task has none; request generations in ascending order.
 
-        `finished` holds by generation at least the evaluations that this one depends on.
+        `finished` holds, by generation, at least the evaluations that it depends on.
         """
         last = self.required_evaluation(generation)
         if self._temperature is None or last < 0:

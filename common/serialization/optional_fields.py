@@ -1,4 +1,4 @@
-"""Fields that a later version added to a document: absent means the default, and a default is not written."""
+"""Optional fields, which later versions added: a missing one has its default, and a default is not written."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def optional_defaults(kind: Any) -> dict[str, Any]:
 
 
 def to_dict(document: Any) -> dict[str, Any]:
-    """A dataclass as a dictionary without optional fields at their default, also of dataclasses within."""
+    """A dataclass as nested dictionaries without optional fields at their default."""
     plain = asdict(document)
     _drop_defaults(document, plain)
     return plain
@@ -42,7 +42,7 @@ def _default(each: Field[Any]) -> Any:
 
 
 def known(hint: Any, plain: Any) -> Any:
-    """A plain document without the fields that the dataclasses of `hint` do not have, at any depth."""
+    """Remove the fields that the dataclasses of the type `hint` do not have, at any depth of a plain document."""
     origin = get_origin(hint)
     if origin is Annotated:
         return known(get_args(hint)[0], plain)

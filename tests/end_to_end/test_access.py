@@ -68,7 +68,7 @@ def test_each_may_do_what_its_role_says_and_the_run_is_none_the_worse(processes,
                         for who in ("first", "viewer", "operator")}  # fmt: skip
             kept = []
             for who, session in sessions.items():
-                for kind in (keys.result, keys.beat, keys.upload):
+                for kind in (keys.result, keys.heartbeat, keys.upload):
                     session.put(kind("safe", foreign), garbage)
                 session.put(keys.job("safe", own), encode(MSGPACK["job"]))
                 session.put(keys.event_status("safe"), garbage)

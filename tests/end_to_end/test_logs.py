@@ -18,7 +18,7 @@ def test_a_fleets_log_is_json_where_it_is_asked_for_and_tells_how_to_start_a_wor
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
         "--task", tasks.TOY, "--generations", 100000, "--log-format", "auto",
     )  # fmt: skip
-    told = json.loads(coordinator.wait_for("no worker is present"))
+    told = json.loads(coordinator.wait_for("no worker is there"))
     assert told["event"] == "no worker"
     program, *words = shlex.split(told["command"])
     assert program == "dreamfleet"

@@ -135,7 +135,7 @@ def test_limits_of_another_version_are_passed_over(strange):
         ),
         (
             {"state": "left"},
-            "its coordinator left; `dreamfleet coordinator --resume night` continues it (its log has the whole command)",
+            "its coordinator left; `dreamfleet coordinator --resume night` continues (its log has the full command)",
         ),
         (
             {"state": "ended", "why": "30 minutes", "best": None},

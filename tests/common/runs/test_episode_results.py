@@ -30,7 +30,7 @@ def scored(*scores, first=10_000, **others):
 def test_figures_are_of_all_drives_and_a_long_one_counts_for_more():
     found = EpisodeResults.of(reversed(DRIVES))
     assert found.seeds == (10_000, 10_001, 10_002)
-    assert (found.mean, found.median, found.least, found.most) == (670.0, 850.0, 250.0, 910.0)
+    assert (found.mean, found.median, found.worst, found.best) == (670.0, 850.0, 250.0, 910.0)
     assert found.std == pytest.approx(np.std(found.scores))
     assert found.error == pytest.approx(np.std(found.scores, ddof=1) / np.sqrt(3))
     assert (found.above(800), found.above(910), found.steps, found.finished) == (2 / 3, 0.0, 2000, 1)

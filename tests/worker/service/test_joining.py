@@ -125,7 +125,7 @@ def test_a_run_that_is_told_in_a_later_versions_words_is_refused_rather_than_sco
     _, served = stage.worker(exit_when_done=True)
     error = served.exception(DEADLINE)
     assert isinstance(error, RefusedError)
-    assert "cannot read the status of run (wrong fields); install dreamfleet" in str(error)
+    assert "in words that this version does not know (wrong fields); install dreamfleet" in str(error)
 
 
 def test_of_any_run_one_that_refuses_is_left_to_others(stage, said, cached):

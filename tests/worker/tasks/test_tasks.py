@@ -236,5 +236,5 @@ def test_only_what_is_scored_or_kept_is_cut_by_a_stages_horizon_and_patience(ran
 
 @pytest.mark.parametrize("name", ["os:abort", "sys:exit", "tests.support.tasks:steps_made"])
 def test_what_is_no_class_is_never_called_as_a_task(name):
-    with pytest.raises(UsageError, match="is no task: it is no class"):
+    with pytest.raises(UsageError, match="is not a task: it is not a class"):
         find_task(name)
