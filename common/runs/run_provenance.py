@@ -58,14 +58,14 @@ class RunProvenance:
 
     generations: Count  # closed ones
     effort: Effort  # of the run itself
-    start: StartProvenance | None = field(default=None, metadata=OPTIONAL)  # `None`: at zero
+    start: StartProvenance | None = field(default=None, metadata=OPTIONAL)  # `None`: zero
     fingerprint: str | None = field(default=None, metadata=OPTIONAL)  # of the first result's host
     # Whether hosts of several classes scored, or were allowed to: a repetition cannot be bit-identical.
     mixed: bool = field(default=False, metadata=OPTIONAL)
     versions: dict[str, str] | None = field(default=None, metadata=OPTIONAL)  # of the coordinator's packages
     # The first validation seed and the number of seeds, of an evaluation and of the confirmation.
     seeds: dict[str, tuple[int, ...]] | None = field(default=None, metadata=OPTIONAL)
-    subspace: str | None = field(default=None, metadata=OPTIONAL)  # that the search kept to, whole, as a journal has it
+    subspace: str | None = field(default=None, metadata=OPTIONAL)  # `Subspace.text`
     classes: HostClasses | None = field(default=None, metadata=OPTIONAL)  # of all results
 
     @property

@@ -54,7 +54,7 @@ class ScheduleState:
         )
 
     def required_evaluation(self, generation: int) -> int:
-        """The generation of the evaluation that must finish before `generation`, the next one, opens; negative: none."""
+        """The generation of the evaluation that must finish before the next `generation` opens; negative: none."""
         return max(self._heat.required_evaluation(generation), self.stages.required_evaluation(generation))
 
     def spec(self, generation: int) -> TaskSpec:

@@ -25,7 +25,7 @@ def knock(port, count):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a filter of Linux's kernel")
-def test_a_crowd_of_strangers_keeps_newcomers_out_for_seconds_and_nobody_else(tmp_path, caplog):
+def test_many_unauthenticated_connections_delay_only_new_ones(tmp_path, caplog):
     authority, port = Authority.create(tmp_path / "access"), free_port()
     authority.issue("coordinator", "home", tmp_path / "home.join")
     authority.issue("viewer", "eye", tmp_path / "eye.join", connect=["tls/127.0.0.1:7447"])
