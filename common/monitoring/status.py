@@ -13,9 +13,8 @@ from typing import Annotated, Any, Literal
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, HostClass
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
-from dreamfleet.common.serialization.constraints import Count, Length, Seconds, Text, Word
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, known
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import Count, Length, MalformedError, Seconds, Text, Word, from_plain
 
 STATUS_SCHEMA_VERSION = 2
 PARTS = ("", "generation", "workers", "history", "evaluations", "candidates", "best", "story")

@@ -14,7 +14,7 @@ from typing import Annotated
 
 from dreamfleet.common.printable import printable, truncate
 from dreamfleet.common.protocol.messages import HostClass
-from dreamfleet.common.serialization.constraints import Count, Length, Text
+from dreamfleet.common.serialization.validation import Count, Length, Text
 
 BY_FINGERPRINT = "fingerprint-"  # prefix of classes that are derived from a fingerprint
 MAX_LISTED = 4  # classes in a status, and fingerprints of each class

@@ -14,8 +14,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
-from dreamfleet.common.serialization.constraints import Between, Count, Digest, Length, Seconds, Text, Word
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
+from dreamfleet.common.serialization.validation import Between, Count, Digest, Length, Seconds, Text, Word
 
 MAX_MESSAGE = 48 * 1024
 MAX_PART = 40 * 1024  # leaves room for the rest of the message

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.protocol.tasks import DREAM
-from dreamfleet.common.serialization.constraints import Count
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, known
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import Count, MalformedError, from_plain
 
 START_EFFORT = "start_effort"  # name of a fact in the journal
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean, median, pstdev, stdev
 
-from dreamfleet.common.serialization.constraints import Count
+from dreamfleet.common.serialization.validation import Count
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
-from dreamfleet.common.serialization.constraints import Length, Seconds
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, known
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import Length, MalformedError, Seconds, from_plain
 
 SCORE_MARKS = (800, 900)  # scores of CarRacing whose exceeding share is reported
 MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment

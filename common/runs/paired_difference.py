@@ -75,7 +75,7 @@ class PairedDifference:
         found = f"{self.mean:+.1f} ± {self.error:.1f} (standard error) on {self.seeds} equal seeds"
         if self.is_significant:
             return f"{found}: {'better' if self.mean > 0 else 'worse'}"
-        return f"{found}: none, for a difference under {self.threshold_text} is none"
+        return f"{found}: not significant, as it is under {self.threshold_text}"
 
 
 def _scores_by_seed(evaluated: EpisodeResults) -> dict[int, float]:

@@ -14,9 +14,8 @@ from dreamfleet.common.errors import JournalError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import Horizon, Packages, Patience, Share, TaskSpec
-from dreamfleet.common.serialization.constraints import Between, Count, Length
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import Between, Count, Length, MalformedError, from_plain
 
 MAX_STAGES = 32  # of a schedule; statuses contain them too
 PopulationSize = Annotated[int, Between(2, 10**5)]

@@ -19,9 +19,8 @@ from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION
-from dreamfleet.common.serialization.constraints import Count
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, known
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import Count, MalformedError, from_plain
 
 RECEIPT = "receipt"  # key in a controller's provenance
 

@@ -5,21 +5,40 @@ from __future__ import annotations
 import math
 import types
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.serialization.constraints import Between, Length
 from dreamfleet.common.serialization.optional_fields import optional_defaults
 
 Check = Callable[[Any], Any]
-
-
 T = TypeVar("T")
-
-
 MAX_ITEMS = 4096  # of a list whose type has no bound
+MAX_TEXT = 2000  # characters: of an error, of why a worker is refused, of a fingerprint
+
+
+@dataclass(frozen=True)
+class Between:
+    """Inclusive bounds of a number."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Length:
+    """Inclusive bounds of the length of text (characters), bytes, or a list."""
+
+    low: int
+    high: int
+
+
+Count = Annotated[int, Between(0, 2**63 - 1)]
+Seconds = Annotated[float, Between(0.0, 1e9)]
+Digest = Annotated[bytes, Length(32, 32)]
+Word = Annotated[str, Length(1, 128)]
+Text = Annotated[str, Length(0, MAX_TEXT)]
 
 
 class MalformedError(DreamfleetError, ValueError):

@@ -110,10 +110,8 @@ def test_a_difference_is_paired_by_seed():
 def test_a_difference_under_two_standard_errors_is_not_significant():
     found = PairedDifference.between(scored(100, 500, 900).results, scored(200, 400, 930).results)
     assert not found.is_significant
-    assert found.description.endswith("none, for a difference under 4.4 standard errors of so few seeds is none")
-    assert PairedDifference(30, 1.0, 0.6).description.endswith(
-        "none, for a difference under two standard errors is none"
-    )
+    assert found.description.endswith("not significant, as it is under 4.4 standard errors of so few seeds")
+    assert PairedDifference(30, 1.0, 0.6).description.endswith("not significant, as it is under two standard errors")
     bounds = [round(PairedDifference(seeds, 0, 1).critical_value, 2) for seeds in (4, 8, 16)]
     assert bounds == [3.28, 2.43, 2.18]  # t itself: 3.31, 2.43, 2.18
     assert (
