@@ -1,6 +1,6 @@
 import logging
 
-from dreamfleet.common.host.error_counter import LONGEST, ErrorCounter
+from dreamfleet.common.host.error_counter import MAX_LOGGED_CHARS, ErrorCounter
 
 log = logging.getLogger("dreamfleet.test")
 
@@ -25,5 +25,5 @@ def test_logged_events_are_short_and_printable(caplog):
     ErrorCounter(log).record("hello", raised(ValueError("\x1b[2J" * 500)), "\x1b]0;title\x07" * 500)
     (line,) = (record.getMessage() for record in caplog.records)
     assert line.isprintable()
-    assert len(line) < 3 * LONGEST
+    assert len(line) < 3 * MAX_LOGGED_CHARS
     assert "test_error_counter.py" in line

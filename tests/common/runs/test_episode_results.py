@@ -143,7 +143,7 @@ def test_scores_out_of_range_are_no_report(tmp_path, scores):
     path.write_text(json.dumps({**json.loads(scored(1, 2, 3).to_json()), "drives": [
         {"seed": seed, "score": score, "steps": 9} for seed, score in enumerate(scores)
     ]}))  # fmt: skip
-    with pytest.raises(UsageError, match="no report"):
+    with pytest.raises(UsageError, match="not a report"):
         read_evaluation_report(path)
 
 
