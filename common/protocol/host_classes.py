@@ -76,7 +76,7 @@ class HostClasses:
         return [(printable(each.host_class), _describe_hosts(each)) for each in self.largest]
 
 
-def count(rows: Iterable[tuple[str, str, int]]) -> Counter[tuple[str, str]]:
+def count_results(rows: Iterable[tuple[str, str, int]]) -> Counter[tuple[str, str]]:
     """Sum a journal's rows of class, fingerprint and count; an empty class is derived from the fingerprint."""
     counted: Counter[tuple[str, str]] = Counter()
     for host_class, fingerprint, results in rows:

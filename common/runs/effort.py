@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.protocol.tasks import DREAM
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, known
-from dreamfleet.common.serialization.validation import Count, MalformedError, from_plain
+from dreamfleet.common.serialization.optional_fields import OPTIONAL
+from dreamfleet.common.serialization.validation import Count, MalformedError, from_plain_lenient
 
 START_EFFORT = "start_effort"  # name of a fact in the journal
 
@@ -71,7 +71,7 @@ class GenerationEffort:
 def parse_start_effort(kept: str | None) -> Effort | None:
     """Parse the fact `START_EFFORT`: the effort of earlier runs in a run's start; `None` if unknown."""
     try:
-        return None if kept is None else from_plain(Effort, known(Effort, json.loads(kept)))
+        return None if kept is None else from_plain_lenient(Effort, json.loads(kept))
     except (ValueError, MalformedError) as error:
         raise JournalError(f"the journal's effort of the run's start is damaged: {error}; restore it") from error
 

@@ -12,8 +12,8 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, known
-from dreamfleet.common.serialization.validation import Length, MalformedError, Seconds, from_plain
+from dreamfleet.common.serialization.optional_fields import OPTIONAL
+from dreamfleet.common.serialization.validation import Length, MalformedError, Seconds, from_plain_lenient
 
 SCORE_MARKS = (800, 900)  # scores of CarRacing whose exceeding share is reported
 MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment
@@ -92,7 +92,7 @@ def summary_figures(results: EpisodeResults) -> dict[str, Any]:
 def read_evaluation_report(path: Path) -> EvaluationReport:
     """Read a file that `evaluate --out` wrote; `UsageError` for anything else."""
     try:
-        found = from_plain(EvaluationReport, known(EvaluationReport, json.loads(read_text(path, MAX_BYTES))))
+        found = from_plain_lenient(EvaluationReport, json.loads(read_text(path, MAX_BYTES)))
         _check_drives(found.drives)
         return found
     except FileNotFoundError:

@@ -19,8 +19,8 @@ from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, known
-from dreamfleet.common.serialization.validation import Count, MalformedError, from_plain
+from dreamfleet.common.serialization.optional_fields import OPTIONAL
+from dreamfleet.common.serialization.validation import Count, MalformedError, from_plain_lenient
 
 RECEIPT = "receipt"  # key in a controller's provenance
 
@@ -82,7 +82,7 @@ def read_run_provenance(controller: Controller) -> RunProvenance:
     provenance = controller.provenance
     try:
         if RECEIPT in provenance:
-            return from_plain(RunProvenance, known(RunProvenance, provenance[RECEIPT]))
+            return from_plain_lenient(RunProvenance, provenance[RECEIPT])
         task, steps = read_run_settings(controller).task.task, int(provenance["steps"])
         effort = Effort(dreamt=steps) if task == DREAM else Effort(driven=steps)
         return RunProvenance(int(provenance["generation"]) + 1, effort)
@@ -93,7 +93,7 @@ def read_run_provenance(controller: Controller) -> RunProvenance:
 def read_run_settings(controller: Controller) -> RunSettings:
     """Read the settings of a controller's run; `ControllerError` if it has none."""
     try:
-        return from_plain(RunSettings, known(RunSettings, controller.provenance["settings"]))
+        return from_plain_lenient(RunSettings, controller.provenance["settings"])
     except (KeyError, ValueError, TypeError, MalformedError) as error:
         raise ControllerError(f"the controller does not contain its run's settings ({error})") from error
 

@@ -10,7 +10,7 @@ from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.serialization.optional_fields import optional_defaults
+from dreamfleet.common.serialization.optional_fields import drop_unknown_fields, optional_defaults
 
 Check = Callable[[Any], Any]
 T = TypeVar("T")
@@ -49,6 +49,11 @@ def from_plain(kind: type[T], plain: Any) -> T:
     """Build a dataclass from its plain form; `MalformedError` if that does not fit."""
     checked: T = checker_of(kind)(plain)
     return checked
+
+
+def from_plain_lenient(kind: type[T], plain: Any) -> T:
+    """Like `from_plain`, but ignores unknown fields at any depth, for documents of later versions."""
+    return from_plain(kind, drop_unknown_fields(kind, plain))
 
 
 def to_plain(value: Any) -> Any:
