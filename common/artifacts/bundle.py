@@ -29,9 +29,8 @@ from dreamfleet.common.errors import BundleError, ControllerError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import open_regular, read_regular
-from dreamfleet.common.serialization.constraints import Between, Word
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import Between, MalformedError, Word, from_plain
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -158,7 +157,7 @@ class Bundle:
             )
         if not {DREAM_GRAPH, LINEAR_CONTROLLER, LAYERED_CONTROLLER} <= self.manifest.parts.keys():
             raise BundleError(
-                f"{self.path.name} is from before other controllers than the linear one on z and h: build it again"
+                f"{self.path.name} is too old for controllers other than linear ones on z and h: build it again"
             )
         return Bundle(self.path, self.sha256, self.manifest, shape, variant)
 

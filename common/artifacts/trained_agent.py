@@ -14,8 +14,7 @@ from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.files.regular_files import open_regular, read_regular
-from dreamfleet.common.serialization.constraints import Between, Length, Word
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import Between, Length, MalformedError, Word, from_plain
 
 FORMAT = 1
 MANIFEST, NETWORK = "agent.json", "network.onnx"

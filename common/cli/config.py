@@ -73,13 +73,15 @@ def load(
     the dataclass's defaults.
     """
     known = _field_types(section)
-    chosen = given(section, name, file, environment)
+    chosen = configured_values(section, name, file, environment)
     chosen.update({key: value for key, value in vars(flags or argparse.Namespace()).items() if key in known})
     named = chosen.get("preset")
     return section(**{**(base or {}), **(preset(named) if preset and named is not None else {}), **chosen})
 
 
-def given(section: type[Any], name: str, file: Table | None, environment: Mapping[str, str] | None) -> dict[str, Any]:
+def configured_values(
+    section: type[Any], name: str, file: Table | None, environment: Mapping[str, str] | None
+) -> dict[str, Any]:
     """The checked values of the section `name` in the file and the environment."""
     known = _field_types(section)
     table = (file or {}).get(name, {}) if name else {key: (file or {})[key] for key in known if key in (file or {})}

@@ -76,7 +76,7 @@ class Archive:
         with self._archive.open(member) as file:
             data = file.read(member.file_size + 1)  # past its end: zipfile checks the checksum there
         if len(data) != member.file_size:
-            raise DamagedArchiveError(f"{name} is not as long as it says")
+            raise DamagedArchiveError(f"{name} does not have its declared length")
         return data
 
     def _find_member(self, name: str, max_bytes: int | None) -> ZipInfo:
@@ -121,7 +121,7 @@ def parse_array(data: bytes, name: str = "it") -> NDArray[Any]:
     try:
         dtype = np.dtype(found[1])
         if not dtype.itemsize or math.prod(shape) * dtype.itemsize != len(data) - start:
-            raise DamagedArchiveError(f"{name} is not as long as its header says")
+            raise DamagedArchiveError(f"{name} does not have the length in its header")
         flat = np.frombuffer(data, dtype, offset=start)
         array = flat.reshape(shape[::-1]).T if found[2] == "True" else flat.reshape(shape)
     except (TypeError, ValueError) as error:

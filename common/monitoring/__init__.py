@@ -1,1 +1,1 @@
-"""The status of a live run: asking for it, and views of it."""
+"""The status of live runs: querying it, and views of it."""

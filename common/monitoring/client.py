@@ -27,8 +27,7 @@ from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode_json
 from dreamfleet.common.protocol.messages import ControlReply
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
-from dreamfleet.common.serialization.optional_fields import known
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import MalformedError, from_plain_lenient
 from dreamfleet.common.transport.query import query_all
 from dreamfleet.common.transport.session import Network, enqueue_into, open_session
 
@@ -127,12 +126,12 @@ class Client:
 
     def workers(self, run: str) -> list[WorkerStatus]:
         """All workers that the coordinator of `run` knows, lost ones included."""
-        return [from_plain(WorkerStatus, known(WorkerStatus, row)) for row in self.fetch_rows("workers", run)]
+        return [from_plain_lenient(WorkerStatus, row) for row in self.fetch_rows("workers", run)]
 
     def history(self, run: str, offset: int = 0) -> list[StoredGeneration]:
         """The closed generations of `run` after the first `offset`, oldest first."""
         rows = self.fetch_rows("history", run, offset)
-        return [from_plain(StoredGeneration, known(StoredGeneration, row)) for row in rows]
+        return [from_plain_lenient(StoredGeneration, row) for row in rows]
 
     def events(
         self, run: str | None = None, worker: str = "", job: str = "", kinds: Collection[str] = ()
@@ -152,12 +151,12 @@ class Client:
                 f"the coordinator of run {document.get('run')} sends no events: a worker's join file has no right to "
                 "them, or its dreamfleet is older than this verb; use a viewer's, or install a newer one there"
             )
-        return [from_plain(Event, known(Event, row)) for row in rows], int(document.get("total", len(rows)))
+        return [from_plain_lenient(Event, row) for row in rows], int(document.get("total", len(rows)))
 
     def evaluations(self, run: str) -> list[StoredEvaluation]:
         """All finished evaluations of `run`, oldest first; `ConnectionFailedError` from older coordinators."""
         rows = self.fetch_rows("evaluations", run)
-        return [from_plain(StoredEvaluation, known(StoredEvaluation, row)) for row in rows]
+        return [from_plain_lenient(StoredEvaluation, row) for row in rows]
 
     def candidates(self, run: str, generation: int) -> list[Population]:
         """All candidates of a generation, in parts: the open one, or the one before it; for others, the open one's."""
@@ -165,7 +164,7 @@ class Client:
         seen = 0
         while not parts or seen < parts[0].total:
             document = self.document(run, "candidates", f"offset={seen};generation={generation}")
-            parts.append(from_plain(Population, known(Population, document)))
+            parts.append(from_plain_lenient(Population, document))
             seen += len(parts[-1].done)
             if not parts[-1].done:
                 break
@@ -255,7 +254,7 @@ def _decode_part(about: dict[str, Any]) -> bytes:
 
 def _decode_controller(about: dict[str, Any], data: bytes) -> Controller:
     try:
-        shape = from_plain(ControllerShape, known(ControllerShape, about["shape"]))
+        shape = from_plain_lenient(ControllerShape, about["shape"])
         parameters = np.frombuffer(data, dtype="<f4").astype(np.float32)
         controller = Controller(
             shape,

@@ -239,7 +239,9 @@ def _describe_ended(status: Status) -> str:
 
 
 def _describe_left(status: Status) -> str:
-    return f"its coordinator left; `dreamfleet coordinator --resume {status.run}` continues it (its log has the whole command)"
+    return (
+        f"its coordinator left; `dreamfleet coordinator --resume {status.run}` continues (its log has the full command)"
+    )
 
 
 STATE_DESCRIPTIONS: dict[str, Callable[[Status], str]] = {

@@ -13,9 +13,16 @@ from typing import Annotated, Any, Literal
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, HostClass
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
-from dreamfleet.common.serialization.constraints import Count, Length, Seconds, Text, Word
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, known
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.optional_fields import OPTIONAL
+from dreamfleet.common.serialization.validation import (
+    Count,
+    Length,
+    MalformedError,
+    Seconds,
+    Text,
+    Word,
+    from_plain_lenient,
+)
 
 STATUS_SCHEMA_VERSION = 2
 PARTS = ("", "generation", "workers", "history", "evaluations", "candidates", "best", "story")
@@ -242,7 +249,7 @@ def read_status(document: dict[str, Any]) -> Status:
     `MalformedError` says which version to install if it cannot be read.
     """
     try:
-        status = from_plain(Status, known(Status, document))
+        status = from_plain_lenient(Status, document)
         if not all(each.has_equal_columns for each in (status.population, status.last_population) if each is not None):
             raise MalformedError("columns of other lengths")
         return status

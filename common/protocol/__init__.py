@@ -1,1 +1,1 @@
-"""What travels over Zenoh: keys, messages, their encoding and bounds."""
+"""The Zenoh protocol: keys, messages, their encoding and their bounds."""

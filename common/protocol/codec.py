@@ -1,7 +1,7 @@
-"""Strict encoding of the messages: msgpack on the wire, JSON where people and tools read.
+"""Strict encoding and decoding of messages: msgpack, or JSON for documents that people and tools read.
 
-A message that is oversize, not msgpack, of another version, lacking or adding a field, of a wrong type, out of range,
-or carrying NaN never becomes an object. `CountingDecoder` counts such messages by reason; nothing is raised past it.
+A payload never becomes an object if it is oversize, not msgpack, of another version, lacks or adds a field, or has a
+value of a wrong type, out of range, or NaN. `CountingDecoder` counts such payloads by reason instead of raising.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ M = TypeVar("M", bound=Message)
 
 
 def encoding(kind: type[Any]) -> str:
-    """The Zenoh encoding that names a message's schema."""
+    """The Zenoh encoding string of a message type."""
     return f"application/msgpack;dreamfleet.{kind.SCHEMA}.v{PROTOCOL_VERSION}"
 
 
 def encode(message: Message) -> bytes:
-    """Msgpack of a message; our own messages are checked too, so that no peer has to drop them."""
+    """Encode a message as msgpack; `MalformedError` if it breaks its own schema, as a peer would drop it."""
     plain = to_plain(message)
     checker_of(type(message))(plain)
     payload: bytes = msgpack.packb({"v": PROTOCOL_VERSION, **plain})
@@ -36,12 +36,12 @@ def encode(message: Message) -> bytes:
 
 
 def decode(kind: type[M], payload: bytes) -> M:
-    """The message in `payload`, or `MalformedError`."""
+    """Decode a message; `MalformedError` if the payload does not fit the schema."""
     if len(payload) > MAX_MESSAGE:
         raise MalformedError("oversize")
     try:
         raw = msgpack.unpackb(payload, raw=False, strict_map_key=True, use_list=True)
-    except Exception as error:  # msgpack raises a dozen kinds of error, some of them not its own
+    except Exception as error:  # msgpack raises a dozen types of error, some built-in
         raise MalformedError("not msgpack") from error
     if not isinstance(raw, dict):
         raise MalformedError("not a message")
@@ -52,14 +52,14 @@ def decode(kind: type[M], payload: bytes) -> M:
 
 
 def encode_json(document: Any) -> bytes:
-    """JSON of a dataclass, checked as `encode` does."""
+    """Encode a dataclass as JSON, checked like `encode`."""
     plain = to_plain(document)
     checker_of(type(document))(plain)
     return json.dumps(plain, allow_nan=False).encode()
 
 
 def decode_json(kind: type[T], payload: bytes) -> T:
-    """The document in `payload`; fields that this version does not know are ignored, for hello must never change."""
+    """Decode a JSON document; unknown fields are ignored, so that later versions can add some to `hello`."""
     if len(payload) > MAX_MESSAGE:
         raise MalformedError("oversize")
     try:
@@ -74,13 +74,13 @@ def decode_json(kind: type[T], payload: bytes) -> T:
 
 
 class CountingDecoder:
-    """Decodes what arrives; counts what is not of the schema, by reason."""
+    """Decodes received payloads; counts malformed ones by reason in `dropped`."""
 
     def __init__(self) -> None:
         self.dropped: Counter[str] = Counter()
 
     def decode(self, kind: type[M], payload: bytes) -> M | None:
-        """The message, or `None` after counting why not."""
+        """Decode a message; `None` if it is malformed."""
         try:
             return decode(kind, payload)
         except MalformedError as error:
@@ -88,7 +88,7 @@ class CountingDecoder:
             return None
 
     def decode_json(self, kind: type[T], payload: bytes) -> T | None:
-        """The document, or `None` after counting why not."""
+        """Decode a JSON document; `None` if it is malformed."""
         try:
             return decode_json(kind, payload)
         except MalformedError as error:

@@ -1,4 +1,4 @@
-"""Pictures of live frames: made small for the wire, and looked at before they are believed."""
+"""Pictures of live frames: shrunk and packed for sending, checked when unpacked."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from dreamfleet.common.protocol.messages import MAX_PICTURE_SIDE, ViewFrame
 from dreamfleet.common.serialization.validation import MalformedError
 
-MAX_PACKED = 32 * 1024  # bytes: the rest of a frame has room beside it
-ZLIB_LEVEL = 1  # of zlib's levels: a picture that a model sees becomes a quarter within 0.1 ms
+MAX_PACKED = 32 * 1024  # bytes; leaves room for the rest of a frame
+ZLIB_LEVEL = 1  # shrinks a 64x64 picture to a quarter in 0.1 ms
 Picture = NDArray[np.uint8]
 
 
 def pack_picture(picture: Picture) -> tuple[int, int, bytes]:
-    """Height, width and deflated bytes of `(height, width, 3)`, made smaller by whole factors until it fits."""
+    """Height, width and deflated bytes of a picture `(height, width, 3)`, downsampled by a whole factor to fit."""
     factor = -(-max(picture.shape[:2]) // MAX_PICTURE_SIDE)
     while True:
         small = _downsample(picture, factor) if factor > 1 else picture
@@ -27,7 +27,7 @@ def pack_picture(picture: Picture) -> tuple[int, int, bytes]:
 
 
 def unpack_picture(frame: ViewFrame) -> Picture | None:
-    """The picture `(height, width, 3)`, `None` if there is none; `MalformedError` for bytes that are not of it."""
+    """The picture `(height, width, 3)` of a frame, `None` without one; `MalformedError` if its length is wrong."""
     if not frame.picture:
         return None
     size = frame.height * frame.width * 3
@@ -38,7 +38,7 @@ def unpack_picture(frame: ViewFrame) -> Picture | None:
 
 
 def _downsample(picture: Picture, factor: int) -> Picture:
-    """Each pixel the mean of `factor x factor`; a side that is no multiple loses its last pixels."""
+    """Average blocks of `factor x factor` pixels; a side that is no multiple loses its last pixels."""
     height, width = (max(1, side // factor) for side in picture.shape[:2])
     rows, columns = min(factor, picture.shape[0]), min(factor, picture.shape[1])
     total = np.zeros((height, width, 3), np.uint32)
@@ -49,9 +49,9 @@ def _downsample(picture: Picture, factor: int) -> Picture:
     return mean
 
 
-def _inflate(data: bytes, most: int) -> bytes:
-    """No more than `most` bytes and one are ever made, whatever the data would become."""
+def _inflate(data: bytes, max_bytes: int) -> bytes:
+    """Inflate to at most `max_bytes + 1` bytes, so that a zip bomb is harmless and too long data shows."""
     try:
-        return zlib.decompressobj().decompress(data, most + 1)
+        return zlib.decompressobj().decompress(data, max_bytes + 1)
     except zlib.error as error:
         raise MalformedError("not deflated") from error

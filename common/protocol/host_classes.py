@@ -1,8 +1,7 @@
-"""Classes of hosts: those of one class compute the same bits, as far as fixed inputs show it. Pure.
+"""Host classes: hosts of one class computed the same bits on fixed inputs. No input or output.
 
-A worker finds out its class by scoring (`worker/scoring/host_class_probe.py`) and sends it with its results. A worker
-from before there were classes, and a task that cannot be probed, are classed by the host's fingerprint: by what the
-host says of itself instead of what it computes.
+A worker computes its class by scoring these inputs (`worker/scoring/host_class_probe.py`) and sends it with its
+results. For older workers, and for tasks without such inputs, the class is derived from the host's fingerprint.
 """
 
 from __future__ import annotations
@@ -15,28 +14,28 @@ from typing import Annotated
 
 from dreamfleet.common.printable import printable, truncate
 from dreamfleet.common.protocol.messages import HostClass
-from dreamfleet.common.serialization.constraints import Count, Length, Text
+from dreamfleet.common.serialization.validation import Count, Length, Text
 
-BY_FINGERPRINT = "fingerprint-"  # how a class begins that nothing but a fingerprint tells
-MAX_LISTED = 4  # classes of a status, and fingerprints of each
-MAX_FINGERPRINT_CHARS = 200  # characters of a fingerprint there
+BY_FINGERPRINT = "fingerprint-"  # prefix of classes that are derived from a fingerprint
+MAX_LISTED = 4  # classes in a status, and fingerprints of each class
+MAX_FINGERPRINT_CHARS = 200  # of a fingerprint in a status
 
 ResultCounts = Mapping[tuple[str, str], int]
-"""Accepted results by class and fingerprint."""
+"""Numbers of accepted results by class and fingerprint."""
 
 
 @dataclass(frozen=True)
 class HostClassShare:
-    """The accepted results of one class's hosts."""
+    """One class's share of the accepted results."""
 
     host_class: HostClass
     results: Count
-    fingerprints: Annotated[tuple[Text, ...], Length(0, MAX_LISTED)]  # of these hosts, the most frequent ones
+    fingerprints: Annotated[tuple[Text, ...], Length(0, MAX_LISTED)]  # the most frequent ones of its hosts
 
 
 @dataclass(frozen=True)
 class HostClasses:
-    """What a run's accepted results are of: the largest classes first, at most `MOST_TOLD`, of so many."""
+    """The host classes of a run's accepted results: their number, and the `MAX_LISTED` largest, the largest first."""
 
     total: Count = 0
     largest: Annotated[tuple[HostClassShare, ...], Length(0, MAX_LISTED)] = ()
@@ -44,7 +43,7 @@ class HostClasses:
 
     @classmethod
     def of(cls, counted: ResultCounts) -> HostClasses:
-        """From results by class and fingerprint."""
+        """From the numbers of results by class and fingerprint."""
         sizes: Counter[str] = Counter()
         for (host_class, _), results in counted.items():
             sizes[host_class] += results
@@ -56,12 +55,12 @@ class HostClasses:
 
     @property
     def mixed(self) -> bool:
-        """Whether hosts whose bits differ have scored."""
+        """Whether hosts of several classes scored."""
         return self.total > 1
 
     @property
     def description(self) -> str:
-        """In words."""
+        """A text for display."""
         if not self.largest:
             return "no result yet"
         if not self.mixed:
@@ -73,12 +72,12 @@ class HostClasses:
 
     @property
     def rows(self) -> list[tuple[str, str]]:
-        """Each class with its results and hosts, in words."""
+        """Each listed class, and a text of its results and hosts."""
         return [(printable(each.host_class), _describe_hosts(each)) for each in self.largest]
 
 
-def count(rows: Iterable[tuple[str, str, int]]) -> Counter[tuple[str, str]]:
-    """Results by class and fingerprint, of a journal's rows: where a class is empty the fingerprint tells it."""
+def count_results(rows: Iterable[tuple[str, str, int]]) -> Counter[tuple[str, str]]:
+    """Sum a journal's rows of class, fingerprint and count; an empty class is derived from the fingerprint."""
     counted: Counter[tuple[str, str]] = Counter()
     for host_class, fingerprint, results in rows:
         counted[host_class or class_from_fingerprint(fingerprint), fingerprint] += results
@@ -86,19 +85,19 @@ def count(rows: Iterable[tuple[str, str, int]]) -> Counter[tuple[str, str]]:
 
 
 def class_from_fingerprint(fingerprint: str) -> str:
-    """The class of a host that says nothing but its fingerprint."""
+    """The class of a host of which only the fingerprint is known."""
     return BY_FINGERPRINT + hashlib.sha256(fingerprint.encode()).hexdigest()[:12]
 
 
-def effective_class(said: str | None, fingerprint: str, run: str | None) -> str:
-    """What a host of this fingerprint counts as that `said` its class, where the first result's class is `run`.
+def effective_class(reported: str | None, fingerprint: str, run: str | None) -> str:
+    """The class under which a host counts in a run; empty if it is not known yet.
 
-    `None` says nothing, an empty text that the class is not known yet: then neither is this, unless the run's first
-    result was classed by its fingerprint, as results from before classes are. Such a run goes on by fingerprints.
+    `reported` is the class that the host reported: `None` from older workers, empty if not known yet. `run` is the
+    class of the run's first result. If that was derived from a fingerprint, all classes of the run are.
     """
-    if said is None or (run or "").startswith(BY_FINGERPRINT):
+    if reported is None or (run or "").startswith(BY_FINGERPRINT):
         return class_from_fingerprint(fingerprint)
-    return said
+    return reported
 
 
 def _fingerprints(counted: ResultCounts, host_class: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Key expressions of protocol version 2, and the names that may stand in them."""
+"""Zenoh keys of protocol version 2, and the names that they may contain."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ def is_worker_identity(identity: str) -> bool:
 
 
 def new_worker_identity(name: str | None = None) -> str:
-    """Identity of a worker process: a name and 8 random hex digits of this life.
+    """A new identity `<name>/<life>` of a worker process; the life is 8 random hex digits.
 
-    Without a name it is the host's, in lower case and without what no key may hold; `UsageError` for a name that cannot
-    be kept as it is.
+    The default name is the host's in lower case, without characters that are invalid in keys. `UsageError` for an
+    invalid `name`.
     """
     if name is not None:
         return f"{check_worker_name(name)}/{secrets.token_hex(4)}"
@@ -54,12 +54,12 @@ def new_worker_identity(name: str | None = None) -> str:
 
 
 def hello(run: str) -> str:
-    """Where a worker asks to join; frozen for ever, outside the version. `*` asks every live run."""
+    """Worker to coordinator: query to join a run, or every live run with `*`. Outside the version; never changes."""
     return f"{ROOT}/hello/{run}"
 
 
 def secured_hello(run: str, worker: str) -> str:
-    """Where a worker asks to join a secured run, under its own name, to which the router holds it."""
+    """Worker to coordinator: query to join a secured run; the router checks the worker's name in the key."""
     return f"{ROOT}/hello/{run}/{worker}"
 
 
@@ -73,67 +73,67 @@ def result(run: str, worker: str) -> str:
     return f"{_PREFIX}/{run}/result/{worker}"
 
 
-def beat(run: str, worker: str) -> str:
-    """One worker to the coordinator: what it holds."""
+def heartbeat(run: str, worker: str) -> str:
+    """One worker to the coordinator: its jobs and load."""
     return f"{_PREFIX}/{run}/beat/{worker}"
 
 
 def live_worker(run: str, worker: str) -> str:
-    """Liveliness token of a worker."""
+    """A worker's liveliness token."""
     return f"{_PREFIX}/{run}/live/worker/{worker}"
 
 
 def live_coordinator(run: str, nonce: str) -> str:
-    """Liveliness token of a coordinator; the nonce makes a second one visible."""
+    """A coordinator's liveliness token; the nonce distinguishes two coordinators of one run."""
     return f"{_PREFIX}/{run}/live/coordinator/{nonce}"
 
 
 def claim(run: str, nonce: str) -> str:
-    """Where coordinators of one name ask each other who they are."""
+    """Query from one coordinator of a run to another: who are you."""
     return f"{_PREFIX}/{run}/claim/{nonce}"
 
 
 def status(run: str, part: str = "") -> str:
-    """Read-only JSON for people and tools; `part` is one of `dreamfleet.common.monitoring.status.PARTS`."""
+    """Query for a run's status, as JSON; `part` is one of `dreamfleet.common.monitoring.status.PARTS`."""
     return f"{_PREFIX}/{run}/status/{part}" if part else f"{_PREFIX}/{run}/status"
 
 
 def control(run: str, verb: str) -> str:
-    """Where pause, resume, drain and stop are asked for."""
+    """Query that requests `pause`, `resume`, `drain` or `stop`."""
     return f"{_PREFIX}/{run}/control/{verb}"
 
 
 def bundle(run: str, sha256: str) -> str:
-    """The frozen world model, in parts: parameters `offset` and `length`, in bytes."""
+    """Query for a part of the frozen world model: parameters `offset` and `length`, in bytes."""
     return f"{_PREFIX}/{run}/bundle/{sha256}"
 
 
 def upload(run: str, worker: str) -> str:
-    """One worker to the coordinator: what a job made that is larger than a result."""
+    """One worker to the coordinator: a job's output that is too large for a result."""
     return f"{_PREFIX}/{run}/upload/{worker}"
 
 
 def event_generation(run: str) -> str:
-    """Coordinator to anyone, as each generation ends."""
+    """Coordinator to everyone: each closed generation."""
     return f"{_PREFIX}/{run}/event/generation"
 
 
 def event_status(run: str) -> str:
-    """Coordinator to anyone, as it leaves: the last status."""
+    """Coordinator to everyone, as it leaves: the last status."""
     return f"{_PREFIX}/{run}/event/status"
 
 
 def view(run: str, worker: str) -> str:
-    """One worker to anyone: live frames, only while somebody subscribes."""
+    """One worker to everyone: live frames, while somebody subscribes."""
     return f"{_PREFIX}/{run}/view/{worker}"
 
 
 def all_workers(kind: str, run: str) -> str:
-    """Every worker's `result`, `beat`, `upload`, `view` or `live/worker` keys of a run."""
+    """The `result`, `beat`, `upload`, `view` or `live/worker` keys of all workers of a run."""
     return f"{_PREFIX}/{run}/{kind}/*/*"
 
 
 def worker_from_key(key: str) -> str:
-    """The identity `<name>/<life>`: the last two chunks of a worker's key."""
+    """The worker's identity `<name>/<life>` in a key: its last two chunks."""
     name, life = key.rsplit("/", 2)[-2:]
     return f"{name}/{life}"

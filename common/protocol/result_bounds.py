@@ -1,6 +1,6 @@
-"""What a result may say, so that everything computed from it is still a number that can be kept and told. Pure.
+"""Bounds of results, so that all statistics of them stay finite and storable. No input or output.
 
-Both sides look: the worker, so that its message is of the schema, and the coordinator, before anything is journalled.
+The worker checks them so that its message fits the schema, the coordinator before it writes the journal.
 """
 
 from __future__ import annotations
@@ -10,36 +10,36 @@ import sys
 
 from dreamfleet.common.protocol.messages import MAX_LEASES
 
-# Squared and summed over the largest run this is still far below 1.8e308, which a mean or a deviation must not reach.
+# Its square, summed over the largest run, is far below the largest double, 1.8e308.
 LARGEST_FITNESS = 1e100
-LONGEST_EPISODE = 10**6  # steps of a whole one; a scored one has the specification's horizon
+LONGEST_EPISODE = 10**6  # steps of a whole episode; the horizon bounds scored ones
 MAX_SECONDS = 1e9
-MAX_COUNT = 2**63 - 1  # what SQLite and every message's count can hold
+MAX_COUNT = 2**63 - 1  # the largest integer in SQLite and in messages
 
 
 def max_steps(horizon: int) -> int:
-    """Environment steps of one job at most: an episode's, or where a task counts them together a whole turn's."""
+    """Maximum environment steps of one job; a task that batches jobs may count the steps of a whole batch."""
     return horizon * MAX_LEASES
 
 
 def rejection_reason(fitness: float, steps: int, seconds: float, horizon: int) -> str | None:
-    """Why a result cannot count, in words; `None` if it can."""
+    """Why a result must be rejected; `None` if it is valid."""
     if not abs(fitness) <= LARGEST_FITNESS:  # false of NaN too
         return f"the episode gave the fitness {fitness:g}, which must lie within ±{LARGEST_FITNESS:g}: scale the reward"
     if not 0 <= steps <= max_steps(horizon):
-        return f"the episode counts {steps:.6g} steps, and may have {horizon} of them"
+        return f"the episode has {steps:.6g} steps, more than the allowed {horizon}"
     if not 0 <= seconds <= MAX_SECONDS:
-        return f"the episode took {seconds:g} seconds, which no clock says"
+        return f"the episode took {seconds:g} seconds, which is impossible"
     return None
 
 
 def clamp_count(number: int) -> int:
-    """A count as it can be kept and told: saturated."""
+    """Clamp a count to the range from 0 to `MAX_COUNT`."""
     return min(max(number, 0), MAX_COUNT)
 
 
 def to_finite(value: float | None) -> float:
-    """A stored number as it can be told: older journals hold infinity, and `NULL` for what was not a number."""
+    """Convert a stored number to a finite one: older journals hold infinity, and `NULL` for NaN."""
     if value is None or math.isnan(value):
         return 0.0
     return min(max(value, -sys.float_info.max), sys.float_info.max)

@@ -1,7 +1,7 @@
-"""Tasks by name, as both sides find them: which are registered, and what a new run must know of one.
+"""Looking up and loading tasks by name.
 
-A name is one that a package registers under the entry-point group `dreamfleet.tasks`; a family's name with what makes
-one of it (`gym:LunarLander-v3`); or `module:attribute`, for a task that no package registers.
+A name is one that a package registers in the entry-point group `dreamfleet.tasks`; a registered family with an argument
+(`gym:LunarLander-v3`); or `module:attribute`, for an unregistered task.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from dreamfleet.common.host.packages import install_command_for
 
 GROUP = "dreamfleet.tasks"
 _NAME = re.compile(r"[\w-][\w.-]*(:\S+)?", re.ASCII)
-GYM = "gym"  # the family of gymnasium's environments: they need no bundle
-DREAM = "dream"  # whose candidates take no step in reality
+GYM = "gym"  # the family of gymnasium's environments; they need no bundle
+DREAM = "dream"  # the task whose candidates are scored in the world model
 
 
 @dataclass(frozen=True)
 class Description:
-    """What a run freezes of a task that needs no bundle.
+    """The properties of a task without bundle that a run freezes.
 
     >>> from dreamfleet import Description
     >>> Description(observations=4, outputs=2, packages=("numpy", "gymnasium")).version
@@ -35,7 +35,7 @@ class Description:
 
     observations: int  # inputs of a controller
     outputs: int  # of a controller
-    packages: tuple[str, ...] = NUMERIC_PACKAGES  # whose versions a fitness may depend on
+    packages: tuple[str, ...] = NUMERIC_PACKAGES  # packages whose versions may change a fitness
     version: int = 1
     options: str = ""  # canonical JSON
 
@@ -46,18 +46,18 @@ def registered_tasks() -> dict[str, EntryPoint]:
 
 
 def family_of(name: str) -> str:
-    """What a worker announces to know a task: the registered name or family, or the whole of `module:attribute`."""
+    """The name under which workers announce a task: the registered name or family, else the whole name."""
     head, colon, _ = name.partition(":")
     return head if colon and head in registered_tasks() else name
 
 
 def is_unregistered(name: str) -> bool:
-    """Whether it is `module:attribute`, which a worker must be told of: nothing that is registered here."""
+    """Whether a task is an unregistered `module:attribute`, which workers must name with `--task`."""
     return ":" in name and family_of(name) == name
 
 
 def load_task(name: str) -> Any:
-    """The object that stands for a task; `UsageError` says what is known, or why it cannot be loaded."""
+    """Create the task of this name; `UsageError` if it is unknown or cannot be loaded."""
     points = registered_tasks()
     head, colon, rest = name.partition(":")
     try:
@@ -78,28 +78,28 @@ def load_task(name: str) -> Any:
 
 
 def _task_class(module: Any, name: str) -> Any:
-    """A task's class in a module; nothing else is called, for the name may come from a file that was passed on."""
+    """A task's class in a module; `TypeError` for anything else, as the name may come from an untrusted file."""
     found = getattr(module, name)
     if not isinstance(found, type):
-        raise TypeError(f"{name} of {module.__name__} is no task: it is no class")
+        raise TypeError(f"{name} of {module.__name__} is not a task: it is not a class")
     return found
 
 
 def is_self_describing(name: str) -> bool:
-    """Whether a task needs no bundle; `UsageError` for one that this host does not know."""
+    """Whether a task needs no bundle; `UsageError` if the task cannot be loaded here."""
     if family_of(name) == GYM:
         return True
     point = registered_tasks().get(name)
     if point is not None and point.dist is not None and point.dist.name == "dreamfleet":
-        return False  # not worth loading a simulator for
+        return False  # without importing a simulator
     try:
         return callable(getattr(load_task(name), "describe", None))
     except UsageError as error:
-        raise UsageError(f"{error}; where workers alone have it, name its world model with --bundle") from error
+        raise UsageError(f"{error}; if only workers have it, name its world model with --bundle") from error
 
 
 def check_task(name: str) -> None:
-    """`UsageError` for what cannot name a task, or nearly names a registered one."""
+    """`UsageError` for an invalid task name, or one that nearly is a registered name."""
     if not _NAME.fullmatch(name):
         raise UsageError(f"{name!r} cannot name a task: give a registered name, {GYM}:ENVIRONMENT, or module:attribute")
     points = registered_tasks()
@@ -112,9 +112,9 @@ def check_task(name: str) -> None:
 
 
 def describe_task(name: str, options: Mapping[str, Any]) -> Description:
-    """What a new run must know of a task that needs no bundle; `UsageError` if it does not say.
+    """The description of a task that needs no bundle; `UsageError` for a task without one.
 
-    The task's package must be installed where the run is begun, and only there and on workers.
+    Only the host that starts the run and the workers need the task's package.
     """
     task = load_task(name)
     if not callable(getattr(task, "describe", None)):

@@ -1,1 +1,1 @@
-"""Runs as they lie on disk, and what is computed from their records."""
+"""Runs on disk: their journals as typed records, schedules, provenance and evaluation reports."""

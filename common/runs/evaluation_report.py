@@ -1,4 +1,4 @@
-"""The document that `dreamfleet evaluate` writes: a controller's drives, and all that is needed to have them again."""
+"""The report that `dreamfleet evaluate` writes: a controller's episodes, and all that is needed to repeat them."""
 
 from __future__ import annotations
 
@@ -12,45 +12,44 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
-from dreamfleet.common.serialization.constraints import Length, Seconds
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, known
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.optional_fields import OPTIONAL
+from dreamfleet.common.serialization.validation import Length, MalformedError, Seconds, from_plain_lenient
 
-SCORE_MARKS = (800, 900)  # scores of CarRacing that people ask about
-MIN_EPISODES_TO_SOLVE = 100  # drives for a world to be called solved, as gymnasium's threshold has been understood
+SCORE_MARKS = (800, 900)  # scores of CarRacing whose exceeding share is reported
+MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment
 MAX_BYTES, MAX_EPISODES, MAX_SEED = 64 << 20, 10**5, 2**63
 Drives = Annotated[tuple[EpisodeResult, ...], Length(1, MAX_EPISODES)]
 
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """Who drove, in what and where, and what came of it, one drive a seed."""
+    """A controller, its environment and host, and its results, one episode a seed."""
 
-    name: str  # of the controller, as it was asked for
+    name: str  # of the controller on the command line
     controller: str  # SHA-256 of its parameters
-    task: str  # that it was evolved in
-    world: str  # the task that it was judged in: of one from a dream another
+    task: str  # that the controller was evolved in
+    world: str  # the task that it was evaluated in; another one if it was evolved in a dream
     bundle: str  # SHA-256; empty: none
-    fingerprint: str  # of the host that judged
+    fingerprint: str  # of the evaluating host
     version: str  # of dreamfleet
     seconds: Seconds
     drives: Drives
     judge: str = "gymnasium"
-    #: mean score at which gymnasium has the world for solved; `None`: it says none
+    #: mean score from which gymnasium calls the environment solved; `None` if it names none
     threshold: float | None = field(default=None, metadata=OPTIONAL)
 
     @cached_property
     def results(self) -> EpisodeResults:
-        """The drives with their figures."""
+        """The episodes with their statistics."""
         return EpisodeResults(self.drives)
 
     def to_json(self) -> str:
-        """One line: the figures, then the fields, of which the drives are most."""
+        """One line of JSON: the statistics, then all fields."""
         return json.dumps({**summary_figures(self.results), **asdict(self)}, allow_nan=False)
 
     @property
     def description(self) -> str:
-        """In words, for people: the score, how it was driven, and what by."""
+        """A text for display: the score, figures on driving, the threshold and the controller."""
         lines = (
             _describe_score(self.results),
             _describe_driving(self.results),
@@ -61,7 +60,7 @@ class EvaluationReport:
 
     @property
     def _describe_threshold(self) -> str:
-        """Whether that is gymnasium's mark, or how far from it; empty where the world has none."""
+        """Whether gymnasium's threshold is reached, or the distance to it; empty if there is none."""
         if self.threshold is None:
             return ""
         beyond, count = self.results.mean - self.threshold, len(self.drives)
@@ -80,37 +79,40 @@ class EvaluationReport:
 
 
 def summary_figures(results: EpisodeResults) -> dict[str, Any]:
-    """What is told of drives together; `error`, `finished`, `speed` and `braking` may be `None`."""
-    names = ("mean", "std", "error", "median", "least", "most", "steps", "finished", "speed", "braking")
-    found: dict[str, Any] = {"n": len(results.drives), **{name: getattr(results, name) for name in names}}
-    found |= {f"above_{mark}": results.above(mark) for mark in SCORE_MARKS}
-    return {**found, "scores": results.scores, "seeds": results.seeds}
+    """The statistics of episodes as JSON has them; `error`, `finished`, `speed` and `braking` may be `None`."""
+    return {
+        "n": len(results.drives), "mean": results.mean, "std": results.std, "error": results.error,
+        "median": results.median, "least": results.worst, "most": results.best, "steps": results.steps,
+        "finished": results.finished, "speed": results.speed, "braking": results.braking,
+        **{f"above_{mark}": results.above(mark) for mark in SCORE_MARKS},
+        "scores": results.scores, "seeds": results.seeds,
+    }  # fmt: skip
 
 
 def read_evaluation_report(path: Path) -> EvaluationReport:
-    """What `evaluate --out` wrote; `UsageError` for anything else."""
+    """Read a file that `evaluate --out` wrote; `UsageError` for anything else."""
     try:
-        found = from_plain(EvaluationReport, known(EvaluationReport, json.loads(read_text(path, MAX_BYTES))))
+        found = from_plain_lenient(EvaluationReport, json.loads(read_text(path, MAX_BYTES)))
         _check_drives(found.drives)
         return found
     except FileNotFoundError:
         raise UsageError(f"no report at {path}: `dreamfleet evaluate --out {path}` writes one") from None
     except (OSError, ValueError, TypeError, MalformedError, RecursionError) as error:
-        raise UsageError(f"{path} is no report of `dreamfleet evaluate --out` ({error}): write it again") from error
+        raise UsageError(f"{path} is not a report of `dreamfleet evaluate --out` ({error}): write it again") from error
 
 
 def check_seed_range(first_seed: int, episodes: int) -> None:
-    """`UsageError`, before anybody drives, for seeds of which no report could tell."""
+    """`UsageError` for seeds that no report can hold; call it before the episodes run."""
     if episodes > MAX_EPISODES or first_seed + episodes > MAX_SEED:
         raise UsageError(f"--episodes must be at most {MAX_EPISODES}, and seeds below {MAX_SEED}")
 
 
 def _check_drives(drives: tuple[EpisodeResult, ...]) -> None:
-    """`ValueError` for drives that nothing can be computed from."""
+    """`ValueError` for duplicate seeds and scores out of range."""
     if len({each.seed for each in drives}) < len(drives):
-        raise ValueError("a seed stands there twice")
-    if not all(abs(each.score) <= LARGEST_FITNESS for each in drives):  # false of NaN too
-        raise ValueError(f"a score lies beyond ±{LARGEST_FITNESS:g}")
+        raise ValueError("a seed occurs twice")
+    if not all(abs(each.score) <= LARGEST_FITNESS for each in drives):  # false for NaN too
+        raise ValueError(f"a score is beyond ±{LARGEST_FITNESS:g}")
 
 
 def _describe_score(found: EpisodeResults) -> str:
@@ -118,19 +120,19 @@ def _describe_score(found: EpisodeResults) -> str:
         return f"{found.mean:.1f} on one seed; judged by gymnasium's own environment"
     error = f" ± {found.error:.1f} (standard error)"
     return (
-        f"{found.mean:.1f}{error} on {len(found.drives)} seeds, {found.least:.0f} to {found.most:.0f}, "
+        f"{found.mean:.1f}{error} on {len(found.drives)} seeds, {found.worst:.0f} to {found.best:.0f}, "
         f"median {found.median:.0f}, standard deviation {found.std:.1f}; judged by gymnasium's own environment"
     )
 
 
 def _describe_driving(found: EpisodeResults) -> str:
-    """How it was driven, in a world that tells of it; empty in others."""
-    said = []
+    """The figures on driving that the environment reports; may be empty."""
+    parts = []
     if found.finished is not None:
-        said += [f"above {mark}: {found.above(mark):.0%}" for mark in SCORE_MARKS]
-        said.append(f"laps finished: {found.finished} of {len(found.drives)}")
+        parts += [f"above {mark}: {found.above(mark):.0%}" for mark in SCORE_MARKS]
+        parts.append(f"laps finished: {found.finished} of {len(found.drives)}")
     if found.speed is not None:
-        said.append(f"mean speed {found.speed:.1f}")
+        parts.append(f"mean speed {found.speed:.1f}")
     if found.braking is not None:
-        said.append(f"brake on in {found.braking:.0%} of the steps")
-    return ", ".join(said)
+        parts.append(f"brake on in {found.braking:.0%} of the steps")
+    return ", ".join(parts)

@@ -1,4 +1,4 @@
-"""Where what is named on the command line lies: controllers, world models and subspaces; files, runs, or what ships."""
+"""Finding controllers, world models and subspaces by the name of a file, a run, or a shipped artifact."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from dreamfleet.common.files.regular_files import is_file, path_exists
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command
 
-SUBSPACES = "subspaces"  # the folder of those that ship, each named as its world model
+SUBSPACES = "subspaces"  # the folder of shipped subspaces, each named as its world model
 
 
 def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]:
-    """The controller, and the bundle that lies beside it if one does; `ControllerError` for a trained agent."""
+    """The controller of this name, and the path of a bundle beside it; `ControllerError` for a trained agent."""
     found, beside = find_agent(name, runs_dir)
     if isinstance(found, TrainedAgent):
         raise ControllerError(
@@ -29,7 +29,7 @@ def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]
 
 
 def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Path | None]:
-    """Who is to drive, a controller or a trained agent, and the bundle that lies beside it if one does."""
+    """The controller or trained agent of this name, and the path beside it where a bundle may be."""
     path, run, shipped = Path(name), runs_dir / name, pretrained_folder() / f"{name}.npz"
     if is_file(path):
         return TrainedAgent.load(path) if is_agent(path) else Controller.load(path), path.parent / BUNDLE
@@ -39,24 +39,24 @@ def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Pa
         return Controller.load(shipped), None
     if is_file(run / JOURNAL):
         raise ControllerError(
-            f"run {name} has no controller yet: it is written as the first generation is closed; an older run's is "
-            f"written once it is continued: {resume_command(run)}"
+            f"run {name} has no controller yet: it is written when the first generation closes; an older run's is "
+            f"written when it is resumed: {resume_command(run)}"
         )
     names = ", ".join(sorted(each.stem for each in pretrained_folder().glob("*.npz"))) or "none"
     raise ControllerError(f"no controller {name!r}: give a file, a run, or one that ships: {names}")
 
 
 def find_evaluated_mean(name: str, runs_dir: Path, generation: int) -> tuple[Controller, Path]:
-    """The evaluated mean of a run's generation, and the bundle beside it; `JournalError` names those that were."""
+    """The mean of a run's evaluated generation, and its bundle's path; `JournalError` lists the evaluated ones."""
     with open_run(runs_dir, name) as run:
         evaluated = [each.generation for each in run.evaluations()]
         if generation not in evaluated:
             known = ", ".join(map(str, evaluated)) or "none yet"
             raise JournalError(f"generation {generation} of run {name} was not evaluated; those that were: {known}")
         spec, shape = run.spec, run.settings.controller
-        told = {"run_uid": run.uid, "generation": generation}
+        provenance = {"run_uid": run.uid, "generation": generation}
         mean = Controller(
-            shape, run.evaluated_mean(generation), spec.task, spec.bundle, told, spec.options, spec.version
+            shape, run.evaluated_mean(generation), spec.task, spec.bundle, provenance, spec.options, spec.version
         )
         return mean, run.bundle_path
 
@@ -64,9 +64,9 @@ def find_evaluated_mean(name: str, runs_dir: Path, generation: int) -> tuple[Con
 def find_bundle_of(
     controller: Controller | TrainedAgent, named: str | None, beside: Path | None = None
 ) -> Bundle | None:
-    """The world model that a controller was evolved with: as named, beside the controller, cached or shipped.
+    """The world model that a controller was evolved with: the `named` one, or one beside it, cached or shipped.
 
-    `None` for a task that needs none, and for a trained agent.
+    `None` for a trained agent, and if the controller's task needs none.
     """
     if isinstance(controller, TrainedAgent) or not controller.bundle:
         return None
@@ -85,12 +85,12 @@ def find_bundle_of(
 
 
 def shipped_subspace_name(bundle: str) -> str | None:
-    """The name of the subspace that ships for the world model of this name; `None`: none does."""
+    """The name of the shipped subspace for a shipped world model; `None` if there is none."""
     return bundle if is_file(pretrained_folder() / SUBSPACES / f"{bundle}.npz") else None
 
 
 def find_subspace(name: str) -> Subspace:
-    """The subspace that ships under this name, or the one in a file of it; `UsageError` if there is none."""
+    """A shipped subspace by name, or one by path; `UsageError` if there is none."""
     folder = pretrained_folder() / SUBSPACES
     shipped = folder / f"{name}.npz"
     if is_file(shipped):

@@ -1,4 +1,4 @@
-"""Whether one controller drives better than another, on the seeds that both drove."""
+"""Comparison of two controllers on the seeds that both were evaluated on."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from statistics import fmean, stdev
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.episode_results import EpisodeResults
 
-SIGNIFICANT_ERRORS = 2  # standard errors of many seeds: a smaller difference is none
-MANY_SEEDS = 30  # seeds
+SIGNIFICANT_ERRORS = 2  # critical value in standard errors, for many seeds
+MANY_SEEDS = 30
 
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """The mean of one controller's score less another's, seed by seed: what tracks have in common falls out."""
+    """The mean difference of two controllers' scores, paired by seed: the variance between tracks cancels."""
 
     seeds: int
     mean: float
@@ -24,12 +24,12 @@ class PairedDifference:
 
     @classmethod
     def between(cls, one: EpisodeResults, other: EpisodeResults) -> PairedDifference:
-        """Of the `other` less the `one`; `UsageError` where they share fewer than two seeds."""
+        """`other` minus `one`; `UsageError` if they share fewer than two seeds."""
         return cls.of(_scores_by_seed(one), _scores_by_seed(other))
 
     @classmethod
     def of(cls, one: Mapping[int, float], other: Mapping[int, float]) -> PairedDifference:
-        """As `between`, of scores by seed."""
+        """Like `between`, from scores by seed."""
         shared = sorted(one.keys() & other.keys())
         if len(shared) < 2:
             raise UsageError(
@@ -41,9 +41,9 @@ class PairedDifference:
 
     @property
     def critical_value(self) -> float:
-        """Standard errors that are no difference yet: two of many seeds, more of few.
+        """Standard errors that a significant difference must exceed: two for many seeds, more for few.
 
-        Student's t of as many degrees of freedom that chance exceeds as rarely as two deviations of a normal
+        Student's t with `seeds - 1` degrees of freedom at the probability of two standard deviations of a normal
         distribution, by its expansion in 1 / (seeds - 1) (Abramowitz & Stegun 26.7.5).
         """
         if self.seeds >= MANY_SEEDS:
@@ -55,7 +55,7 @@ class PairedDifference:
 
     @property
     def threshold_text(self) -> str:
-        """What a difference must be more than, in words."""
+        """The critical value as a text."""
         return (
             "two standard errors"
             if self.seeds >= MANY_SEEDS
@@ -64,18 +64,18 @@ class PairedDifference:
 
     @property
     def is_significant(self) -> bool:
-        """Whether it is more than chance gives."""
+        """Whether the difference exceeds the critical value."""
         return abs(self.mean) > self.critical_value * self.error
 
     @property
     def description(self) -> str:
-        """In words."""
+        """A text for display."""
         if self.mean == self.error == 0:
             return f"the same scores, to the bit, on {self.seeds} equal seeds"
         found = f"{self.mean:+.1f} ± {self.error:.1f} (standard error) on {self.seeds} equal seeds"
         if self.is_significant:
             return f"{found}: {'better' if self.mean > 0 else 'worse'}"
-        return f"{found}: none, for a difference under {self.threshold_text} is none"
+        return f"{found}: not significant, as it is under {self.threshold_text}"
 
 
 def _scores_by_seed(evaluated: EpisodeResults) -> dict[int, float]:

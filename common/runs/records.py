@@ -1,4 +1,4 @@
-"""What a run's journal holds, as types: its settings, results, generations, evaluations, its confirmed score."""
+"""The records in a run's journal as types: settings, results, generations, evaluations, the confirmed score."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from dreamfleet.common.errors import JournalError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import Horizon, Packages, Patience, Share, TaskSpec
-from dreamfleet.common.serialization.constraints import Between, Count, Length
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import Between, Count, Length, MalformedError, from_plain
 
-MAX_STAGES = 32  # of a schedule: a status carries them too
+MAX_STAGES = 32  # of a schedule; statuses contain them too
 PopulationSize = Annotated[int, Between(2, 10**5)]
 EpisodesPerCandidate = Annotated[int, Between(1, 10**4)]
 ConfirmationEpisodes = Annotated[int, Between(0, 10**4)]  # fresh tracks; 0: no confirmation
-EpisodeCount = Annotated[int, Between(1, 2**63 - 1)]  # that a score was taken over: of none there is no error
+EpisodeCount = Annotated[int, Between(1, 2**63 - 1)]  # at least 1: a standard error divides by it
 
 
 def stage_option(default: Any, text: str) -> Any:
@@ -56,12 +55,12 @@ class StageSettings:
 
     @property
     def end(self) -> StageSettings:
-        """The same without the settings that it changes."""
+        """Its end conditions alone."""
         return StageSettings(self.generations, self.steps, self.score)
 
     @property
     def has_end(self) -> bool:
-        """Whether anything ends it."""
+        """Whether it has an end condition."""
         return bool(self.generations or self.steps or self.score is not None)
 
 
@@ -71,7 +70,7 @@ STAGE_FIELDS = tuple(each.name for each in fields(StageSettings) if each.name no
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What is frozen with a run; a change asks for another run."""
+    """The settings that are frozen with a run."""
 
     task: TaskSpec
     controller: ControllerShape
@@ -82,31 +81,31 @@ class RunSettings:
     seed: Count
     evaluate_every: Count  # generations; 0: never
     evaluation_episodes: EpisodesPerCandidate
-    # Only the better half of the candidates drives the second half of the episodes.
+    # Only the better half of the candidates is scored in the second half of the episodes.
     racing: bool = field(default=False, metadata=OPTIONAL)
-    features: Literal["zh", "z"] = field(default="zh", metadata=OPTIONAL)  # what the controller sees
+    features: Literal["zh", "z"] = field(default="zh", metadata=OPTIONAL)  # inputs of the controller
     collect_every: Count = field(default=0, metadata=OPTIONAL)  # generations; 0: never
     collect_episodes: EpisodesPerCandidate = field(default=1, metadata=OPTIONAL)
     # Only older runs have one: the temperature was multiplied by it when evaluations fell. 1: never.
     heat: float = field(default=1.0, metadata=OPTIONAL)
-    packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions its fingerprint names
+    packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # in its fingerprint
     optimiser: str = field(default="cma", metadata=OPTIONAL)  # registered, or module:attribute
     optimiser_options: tuple[str, ...] = field(default=(), metadata=OPTIONAL)  # each as name=value
-    # Fresh tracks on which the reported mean is driven as the run ends; 0: never, as in runs from before this.
+    # Fresh tracks of the confirmation at the run's end; 0: none, as in older runs.
     confirm_episodes: ConfirmationEpisodes = field(default=0, metadata=OPTIONAL)
-    # Of a candidate's episodes in a dream: driven in the world that it dreams of, the first ones.
+    # Share of a candidate's episodes in a dream task that are scored in reality: its first ones.
     driven: Share = field(default=0.0, metadata=OPTIONAL)
-    subspace: str = field(default="", metadata=OPTIONAL)  # SHA-256 of the one that the search keeps to; empty: none
-    # Of a schedule; all of the above is the first one's, which names nothing itself. The last one has no end.
+    subspace: str = field(default="", metadata=OPTIONAL)  # SHA-256; empty: search all parameters
+    # A schedule. The settings above are its first stage's, which changes none. The last stage has no end.
     stages: Annotated[tuple[StageSettings, ...], Length(0, MAX_STAGES)] = field(default=(), metadata=OPTIONAL)
 
     def to_json(self) -> str:
-        """The text kept in the journal."""
+        """The text in the journal."""
         return json.dumps(to_dict(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> RunSettings:
-        """Read what `to_json` wrote; `JournalError` if it is damaged."""
+        """Parse the text of `to_json`; `JournalError` if it is damaged."""
         try:
             return from_plain(cls, json.loads(text))
         except (ValueError, TypeError, MalformedError, RecursionError) as error:
@@ -127,24 +126,24 @@ class StoredResult:
     seconds: float
     worker: str
     fingerprint: str
-    host_class: str  # of the host that scored
+    host_class: str  # of the worker's host
 
 
 @dataclass(frozen=True)
 class StoredCandidate:
-    """One candidate: what the strategy was told of it, and what its accepted results took."""
+    """One candidate: its fitness as the optimiser received it, and the effort of its accepted results."""
 
     generation: int
     number: int
     fitness: float | None  # `None` while its generation is open
-    episodes: int  # that were scored
+    episodes: int  # accepted results
     steps: int
-    seconds: float  # that slots worked
+    seconds: float  # slot time
 
 
 @dataclass(frozen=True)
 class StoredGeneration:
-    """Statistics of a closed generation over its candidates' fitness."""
+    """A closed generation: statistics of its candidates' fitness, step size, and effort."""
 
     number: int
     mean: float
@@ -171,23 +170,23 @@ class StoredEvaluation:
         return self.std / math.sqrt(self.episodes)
 
     def is_clearly_below(self, other: StoredEvaluation) -> bool:
-        """Whether it lies below the other one by more than two standard errors of the difference."""
+        """Whether its mean is below the other's by more than two standard errors of the difference."""
         return other.mean - self.mean > 2 * math.hypot(other.error, self.error)
 
 
 @dataclass(frozen=True)
 class StoredConfirmation:
-    """What a run reports as it ends: `generation`'s mean on fresh validation tracks, which took no part in any choice.
+    """The score that a run reports: of `generation`'s mean, on fresh validation tracks.
 
-    It was chosen among the evaluated means by other tracks. So `mean` is not the best of many looks but one look, and
-    its expected value is what the controller is worth.
+    Other tracks chose that mean among the evaluated ones, so `mean` is an unbiased estimate of its score and not the
+    best of many.
     """
 
     generation: int
     episodes: EpisodeCount
     mean: float
     std: float  # of the sample: `episodes - 1` in the denominator
-    closed: int  # generations that were closed by then: the evaluations of these were chosen among
+    closed: int  # generations closed before the choice, whose evaluated means it considered
 
     @property
     def error(self) -> float:
@@ -195,16 +194,16 @@ class StoredConfirmation:
         return self.std / math.sqrt(self.episodes)
 
     def covers(self, best: StoredEvaluation | None) -> bool:
-        """Whether the best evaluated mean was among those that were chosen among; else the run went on and is ahead."""
+        """Whether the choice considered the best evaluated mean; if not, the run has been continued since."""
         return best is None or best.generation < self.closed
 
     def to_json(self) -> str:
-        """The text kept in the journal."""
+        """The text in the journal."""
         return json.dumps(asdict(self), allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> StoredConfirmation:
-        """Read what `to_json` wrote; `JournalError` if it is damaged."""
+        """Parse the text of `to_json`; `JournalError` if it is damaged."""
         try:
             return from_plain(cls, json.loads(text))
         except (ValueError, TypeError, MalformedError) as error:
@@ -212,12 +211,12 @@ class StoredConfirmation:
 
 
 def best_evaluation(evaluations: Iterable[StoredEvaluation]) -> StoredEvaluation | None:
-    """The one of the highest mean; of equals the first."""
+    """The evaluation of the highest mean, the first of equal ones; `None` if there are none."""
     return max(evaluations, key=lambda each: each.mean, default=None)
 
 
 def expand_task_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain settings as they are shown: the task's options, which are JSON, as a part; the controller's shape once."""
+    """Plain settings for display: the task's JSON options parsed, and the controller's shape only once."""
     task = dict(settings.get("task", {}))
     with suppress(ValueError):
         task["options"] = json.loads(task.get("options") or "{}")
@@ -227,7 +226,7 @@ def expand_task_options(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def describe_score(found: StoredEvaluation | StoredConfirmation | None) -> str:
-    """A mean's score in words, and whether it can be trusted."""
+    """Describe the score of a mean, and whether it is confirmed or provisional."""
     if found is None:
         return "the last mean; it was not evaluated"
     score = f"generation {found.generation}'s mean scored {format_mean(found)}"
@@ -239,5 +238,5 @@ def describe_score(found: StoredEvaluation | StoredConfirmation | None) -> str:
 
 
 def format_mean(found: StoredEvaluation | StoredConfirmation) -> str:
-    """A mean with its standard error, which a single episode does not have."""
+    """Format a mean with its standard error, if it has more than one episode."""
     return f"{found.mean:.1f}" if found.episodes == 1 else f"{found.mean:.1f} ± {found.error:.1f}"

@@ -1,4 +1,4 @@
-"""Recorded scores and the same drives again: whether they agree."""
+"""Comparison of recorded scores with those of the same episodes repeated."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from dreamfleet.common.runs.paired_difference import PairedDifference
 
 @dataclass(frozen=True)
 class Reproduction:
-    """A recorded report, and what its controller drove now, on the same seeds or on some of them.
+    """A recorded report, and a new one of the same controller on all or some of its seeds.
 
-    On a host of the recorded fingerprint every drive must be the same to the bit, and so must a single one anywhere.
-    Elsewhere the mean may differ by two standard errors of the paired difference.
+    On a host of the recorded fingerprint every episode must be bit-identical. On other hosts the mean may differ by two
+    standard errors of the paired difference; a single episode must be bit-identical there too.
     """
 
     recorded: EvaluationReport
@@ -23,23 +23,23 @@ class Reproduction:
 
     @cached_property
     def pairs(self) -> tuple[tuple[EpisodeResult, EpisodeResult], ...]:
-        """Each drive as it was recorded, and again."""
+        """Each repeated episode with its record, which comes first."""
         before = {each.seed: each for each in self.recorded.drives}
         return tuple((before[each.seed], each) for each in self.repeated.drives)
 
     @property
     def same_fingerprint(self) -> bool:
-        """Whether equal bits are expected."""
+        """Whether the hosts' fingerprints are equal, so that equal bits are expected."""
         return self.recorded.fingerprint == self.repeated.fingerprint
 
     @property
     def differing_seeds(self) -> tuple[int, ...]:
-        """The seeds whose score or length is another."""
+        """The seeds whose score or number of steps differs."""
         return tuple(one.seed for one, other in self.pairs if (one.score, one.steps) != (other.score, other.steps))
 
     @property
     def difference(self) -> PairedDifference:
-        """Of now less the record; `UsageError` of a single seed."""
+        """The new scores minus the recorded ones; `UsageError` for a single seed."""
         return PairedDifference.between(EpisodeResults(tuple(one for one, _ in self.pairs)), self.repeated.results)
 
     @property
@@ -51,7 +51,7 @@ class Reproduction:
 
     @property
     def description(self) -> str:
-        """In words."""
+        """A text for display."""
         name, count, mean = self.recorded.name, len(self.pairs), self.repeated.results.mean
         if not self.differing_seeds:
             host = "" if self.same_fingerprint else ", though this host is of another fingerprint"

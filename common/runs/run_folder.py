@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.printable import join_some
-from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count
+from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
@@ -142,7 +142,7 @@ class RunFolder:
     @property
     def classes(self) -> HostClasses:
         """The host classes of the accepted results."""
-        return HostClasses.of(count(self._journal.rows("ssi", class_counts_query(self._class_column))))
+        return HostClasses.of(count_results(self._journal.rows("ssi", class_counts_query(self._class_column))))
 
     @property
     def bundle_path(self) -> Path:

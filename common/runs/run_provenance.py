@@ -1,6 +1,6 @@
-"""The receipt of a controller: what it takes to have the run again that it came from.
+"""The provenance of a controller: all that is needed to repeat its run.
 
-It lies in the provenance of a controller's file, beside the run's settings and its score.
+A controller's file holds it as `receipt`, beside the run's settings and the score.
 """
 
 from __future__ import annotations
@@ -19,30 +19,29 @@ from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION
-from dreamfleet.common.serialization.constraints import Count
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, known
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.optional_fields import OPTIONAL
+from dreamfleet.common.serialization.validation import Count, MalformedError, from_plain_lenient
 
-RECEIPT = "receipt"  # in a provenance
+RECEIPT = "receipt"  # key in a controller's provenance
 
 
 @dataclass(frozen=True)
 class StartProvenance:
-    """Where a run began instead of at zero."""
+    """The mean that a run started from, if not zero."""
 
     source: str
     sha256: str  # of the mean's little-endian doubles
-    mean: str  # these bytes, in base64
-    effort: Effort | None = field(default=None, metadata=OPTIONAL)  # what had been spent on it, where that is known
+    mean: str  # these bytes in base64
+    effort: Effort | None = field(default=None, metadata=OPTIONAL)  # of the runs before it, if known
 
     @classmethod
     def of(cls, source: str, mean: str, effort: Effort | None) -> StartProvenance:
-        """As a journal keeps it."""
+        """From a journal's values; `mean` is in base64."""
         return cls(source, hashlib.sha256(base64.b64decode(mean)).hexdigest(), mean, effort)
 
     @property
     def vector(self) -> NDArray[np.float64]:
-        """The mean `(size,)`; `ControllerError` where it is not the one that was hashed."""
+        """The mean `(size,)`; `ControllerError` if its hash is wrong."""
         try:
             data = base64.b64decode(self.mean, validate=True)
             if hashlib.sha256(data).hexdigest() != self.sha256:
@@ -54,53 +53,53 @@ class StartProvenance:
 
 @dataclass(frozen=True)
 class RunProvenance:
-    """What a run was when it wrote its controller."""
+    """The state of a run when it wrote its controller."""
 
-    generations: Count  # that were closed
+    generations: Count  # closed ones
     effort: Effort  # of the run itself
-    start: StartProvenance | None = field(default=None, metadata=OPTIONAL)  # `None`: at zero
-    fingerprint: str | None = field(default=None, metadata=OPTIONAL)  # of the host that scored first
-    # Hosts of other bits scored, or could: there is no second time to the bit.
+    start: StartProvenance | None = field(default=None, metadata=OPTIONAL)  # `None`: zero
+    fingerprint: str | None = field(default=None, metadata=OPTIONAL)  # of the first result's host
+    # Whether hosts of several classes scored, or were allowed to: a repetition cannot be bit-identical.
     mixed: bool = field(default=False, metadata=OPTIONAL)
-    versions: dict[str, str] | None = field(default=None, metadata=OPTIONAL)  # of what the coordinator computed with
-    # The first validation seed, and how many, of each evaluation and of the confirmation.
+    versions: dict[str, str] | None = field(default=None, metadata=OPTIONAL)  # of the coordinator's packages
+    # The first validation seed and the number of seeds, of an evaluation and of the confirmation.
     seeds: dict[str, tuple[int, ...]] | None = field(default=None, metadata=OPTIONAL)
-    subspace: str | None = field(default=None, metadata=OPTIONAL)  # that the search kept to, whole, as a journal has it
-    classes: HostClasses | None = field(default=None, metadata=OPTIONAL)  # of all hosts that scored
+    subspace: str | None = field(default=None, metadata=OPTIONAL)  # `Subspace.text`
+    classes: HostClasses | None = field(default=None, metadata=OPTIONAL)  # of all results
 
     @property
     def total(self) -> Effort:
-        """With what had been spent on the start."""
+        """The effort of this run and of those before its start."""
         before = None if self.start is None else self.start.effort
         return self.effort if before is None else before + self.effort
 
 
 def read_run_provenance(controller: Controller) -> RunProvenance:
-    """The receipt of a controller; `ControllerError` where it has none.
+    """Read the run provenance of a controller; `ControllerError` if it has none.
 
-    Of one from before there were receipts it is what follows from the rest, as if the run had ended with its mean.
+    For controllers of older versions it is derived from other fields, as if the run had ended with this mean.
     """
-    told = controller.provenance
+    provenance = controller.provenance
     try:
-        if RECEIPT in told:
-            return from_plain(RunProvenance, known(RunProvenance, told[RECEIPT]))
-        task, steps = read_run_settings(controller).task.task, int(told["steps"])
+        if RECEIPT in provenance:
+            return from_plain_lenient(RunProvenance, provenance[RECEIPT])
+        task, steps = read_run_settings(controller).task.task, int(provenance["steps"])
         effort = Effort(dreamt=steps) if task == DREAM else Effort(driven=steps)
-        return RunProvenance(int(told["generation"]) + 1, effort)
+        return RunProvenance(int(provenance["generation"]) + 1, effort)
     except (KeyError, ValueError, TypeError, MalformedError) as error:
         raise ControllerError(f"the controller has no receipt of its run ({error}): it cannot be repeated") from error
 
 
 def read_run_settings(controller: Controller) -> RunSettings:
-    """The settings of the run that a controller came from; `ControllerError` where it names none."""
+    """Read the settings of a controller's run; `ControllerError` if it has none."""
     try:
-        return from_plain(RunSettings, known(RunSettings, controller.provenance["settings"]))
+        return from_plain_lenient(RunSettings, controller.provenance["settings"])
     except (KeyError, ValueError, TypeError, MalformedError) as error:
-        raise ControllerError(f"the controller does not tell its run's settings ({error})") from error
+        raise ControllerError(f"the controller does not contain its run's settings ({error})") from error
 
 
 def validation_seed_ranges(settings: RunSettings) -> dict[str, tuple[int, ...]]:
-    """The first validation seed, and how many, of each evaluation and of the confirmation."""
+    """The first validation seed and the number of seeds, of an evaluation and of the confirmation."""
     uses: dict[str, tuple[int, ...]] = {}
     if settings.evaluate_every:
         uses["evaluation"] = (VALIDATION.start, settings.evaluation_episodes)

@@ -1,4 +1,4 @@
-"""The journal's tables, and how an older journal becomes today's."""
+"""The journal's tables, and the migration of older journals."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sqlite3
 
 from dreamfleet.common.errors import JournalError
 
-APPLICATION_ID = 0x64666C74  # "dflt": SQLite's own mark of whose file this is
+APPLICATION_ID = 0x64666C74  # "dflt": marks the SQLite file as ours
 MIGRATIONS = (
     """
     CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
@@ -36,12 +36,12 @@ MIGRATIONS = (
     """,
     "ALTER TABLE result ADD COLUMN host_class TEXT NOT NULL DEFAULT '';",
 )
-"""Entry i brings a journal from version i to i + 1; only ever appended to."""
+"""Entry i migrates a journal from version i to i + 1. Append only."""
 VERSION = len(MIGRATIONS)
-HOST_CLASS_VERSION = 3  # the version since which results name their host's class; empty: its fingerprint tells it
+HOST_CLASS_VERSION = 3  # the first version whose results have a host class; empty: derive it from the fingerprint
 
 
-# What would run as a table is read: somebody's own query, which need not end.
+# Objects that execute somebody else's SQL, possibly for ever, when a table is read.
 _FOREIGN = (
     "SELECT count(*) FROM sqlite_master WHERE type NOT IN ('table', 'index') "
     "OR sql LIKE 'CREATE VIRTUAL%' OR sql LIKE '%GENERATED%'"
@@ -65,7 +65,7 @@ def check_schema(connection: sqlite3.Connection, path: object) -> int:
 
 
 def migrate(connection: sqlite3.Connection, version: int) -> None:
-    """Bring an open journal from `version` to today's, each step whole or not at all."""
+    """Migrate an open journal from `version` to the current one, each step in a transaction."""
     for number, script in enumerate(MIGRATIONS[version:], start=version + 1):
         connection.executescript(
             f"BEGIN IMMEDIATE; {script} PRAGMA application_id = {APPLICATION_ID}; "

@@ -1,6 +1,6 @@
-"""Under which terms each generation of a run is asked and scored: its stage, and how warm it dreams.
+"""The scoring parameters of each generation of a run: its stage, and the temperature of its dream.
 
-Terms are a pure function of the run's settings and of what is finished before the generation opens.
+They are a pure function of the run's settings and of the generations and evaluations finished before it opens.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from dreamfleet.common.runs.stages import BegunStage, Stage, StageTracker, lates
 
 @dataclass(frozen=True)
 class ScoringParams:
-    """Those of one generation."""
+    """The scoring parameters of one generation."""
 
-    spec: TaskSpec  # what its candidates are scored in, but for the episodes that a dream's stage drives
+    spec: TaskSpec  # of its candidates' episodes; `episode_spec` adds the driven ones
     begun: BegunStage
 
     @property
     def stage(self) -> Stage:
-        """Its stage."""
+        """The generation's stage."""
         return self.begun.stage
 
     def episode_spec(self, episode: int) -> TaskSpec:
-        """What one episode of a candidate is scored in."""
+        """The specification of one episode of a candidate."""
         return self.spec.with_overrides(driven=episode < self.stage.driven_episodes or None)
 
 
 class ScheduleState:
-    """The terms of one generation after another; ask for generations in rising order."""
+    """Computes the scoring parameters of one generation after another, in ascending order."""
 
     def __init__(self, settings: RunSettings) -> None:
         self.stages = StageTracker(settings)
@@ -42,21 +42,21 @@ class ScheduleState:
     def scoring_params(
         self, generation: int, history: Sequence[StoredGeneration], finished: Mapping[int, StoredEvaluation]
     ) -> ScoringParams:
-        """Those of `generation`.
+        """The scoring parameters of `generation`.
 
-        `history` holds at least the generations before it, from the first on, and `finished` by generation the
-        evaluations that it depends on.
+        `history` holds at least all generations before it; `finished`, by generation, at least the evaluations that it
+        depends on.
         """
         begun = self.stages.advance_to(generation, history, finished)
         temperature = _temperature_at(generation, self._settings, finished)
         return ScoringParams(begun.stage.spec(self._own).with_overrides(temperature), begun)
 
     def required_evaluation(self, generation: int) -> int:
-        """The evaluation, by its generation, without which `generation`, the next one, cannot open; negative: none."""
+        """The generation of the evaluation that must finish before the next `generation` opens; negative: none."""
         return max(_raising_evaluation(generation, self._settings), self.stages.required_evaluation(generation))
 
     def spec(self, generation: int) -> TaskSpec:
-        """What the mean after `generation` is driven in where it is driven as candidates are, not evaluated."""
+        """The specification of collecting rollouts with the mean after `generation`."""
         return self.stages.stage_of(generation).stage.spec(self._own)
 
 
@@ -94,5 +94,5 @@ def scoring_params_at(
 
 
 def scoring_params_of(run: RunFolder, generation: int) -> ScoringParams:
-    """The terms of a stored run's generation."""
+    """The scoring parameters of a stored run's generation."""
     return scoring_params_at(generation, run.settings, run.history(), run.evaluations())

@@ -1,6 +1,6 @@
-"""Who owns which episode seed, so that no controller is judged on a track that it was chosen on.
+"""The split of episode seeds, so that no controller is evaluated on a track that selected it.
 
-0-9999 belong to nobody; 10000-19999 test; 20000-999999 validation; training from 2**20 up.
+0-9999 unused; 10000-19999 test; 20000-999999 validation; training from 2**20 up.
 """
 
 from __future__ import annotations
@@ -9,40 +9,38 @@ import hashlib
 
 TEST = range(10_000, 20_000)
 VALIDATION = range(20_000, 1_000_000)
-CHOOSING_OFFSET, CONFIRMING_OFFSET = (
-    10_000,
-    20_000,
-)  # the first validation tracks of each; an evaluation has those before
+# Offsets of the first validation seeds for choosing and for confirming the report; evaluations use those before.
+CHOOSING_OFFSET, CONFIRMING_OFFSET = 10_000, 20_000
 TRAINING_FIRST = 2**20
-TRAINING_LAST = 2**53 - 1  # a JSON number keeps every one of them
+TRAINING_LAST = 2**53 - 1  # the largest integer that JSON represents exactly
 
 
 def training_seed(run_seed: int, generation: int, episode: int) -> int:
-    """Seed of one training episode: all candidates of a generation share it, no two generations do.
+    """The seed of one training episode, the same for all candidates of a generation.
 
-    A hash rather than a sum, so that runs with neighbouring seeds share no track.
+    A hash and not a sum, so that runs with neighbouring seeds share no track.
     """
     return _derive_seed(f"dreamfleet training {run_seed} {generation} {episode}")
 
 
 def collection_seed(run_seed: int, generation: int, episode: int) -> int:
-    """Seed of one rollout that is kept for training: a training track, and none that a candidate is scored on."""
+    """The seed of one collected rollout: a training track on which no candidate is scored."""
     return _derive_seed(f"dreamfleet collection {run_seed} {generation} {episode}")
 
 
 def search_seed(run_seed: int, stage: int) -> int:
-    """Seed of the search that a stage, counted from 1, begins anew: no stage draws what an earlier one drew.
+    """The optimiser's seed in a stage (from 1) that starts a new search: each stage has different random numbers.
 
-    The first one's is the run's own; the others' fit any library's 32 bits.
+    In the first stage it is the run's seed; in others it has 32 bits, as some libraries require.
     """
     return run_seed if stage == 1 else _derive_seed(f"dreamfleet search {run_seed} {stage}") % 2**32
 
 
 def validation_seeds(episodes: int, first: int = 0) -> tuple[int, ...]:
-    """So many validation seeds from the `first` on.
+    """`episodes` validation seeds from the offset `first` on.
 
-    Every evaluation has those from 0 on, so that its curve is comparable. What chooses between evaluated means uses
-    those from `CHOOSING_OFFSET` on. The reported score uses those from `CONFIRMING_OFFSET` on: they chose nothing.
+    All evaluations use those from 0 on, so that they are comparable. Choosing between evaluated means uses those from
+    `CHOOSING_OFFSET` on, the reported score those from `CONFIRMING_OFFSET` on, which influence no choice.
     """
     return tuple(VALIDATION[first : first + episodes])
 

@@ -1,8 +1,7 @@
-"""The stages of one run: what each is, and which of them a generation is in.
+"""The stages of a run's schedule, and the stage of each generation.
 
-A generation's stage is a pure function of the run's settings and of what is finished before it opens: the generations
-before it, and evaluations that are a whole interval old. So a life of the coordinator that is interrupted anywhere goes
-on to the bit.
+A generation's stage is a pure function of the run's settings, of the generations before it, and of evaluations that
+are at least one interval old. So a run that is interrupted anywhere continues bit-identically.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from dreamfleet.common.runs.records import STAGE_FIELDS, RunSettings, StageSetti
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage with all that counts in it, whichever stage named it."""
+    """One stage with all its settings, those of earlier stages included."""
 
     number: int  # from 1
     horizon: int
@@ -29,28 +28,28 @@ class Stage:
     population: int
     sigma0: float
     racing: bool
-    driven: float  # share of a candidate's episodes in a dream
-    search: int  # number of the stage that began the search which goes on in this one
+    driven: float  # share of a candidate's episodes in a dream task that are scored in reality
+    search: int  # number of the stage that started this stage's search
     end: StageSettings
-    whole: bool = True  # whether the search goes through all parameters, not in the run's subspace
+    whole: bool = True  # whether it searches all parameters, not the run's subspace
 
     @property
     def starts_new_search(self) -> bool:
-        """Whether it begins the search anew, from the mean that the stage before it came to."""
+        """Whether it starts a new search, from the last mean of the stage before."""
         return self.search == self.number
 
     @property
     def end_condition(self) -> str:
-        """What ends it, in words."""
+        """The end conditions as a text."""
         end = self.end
-        said = [plural(end.generations, "generation")] if end.generations else []
-        said += [f"{end.steps} environment steps"] if end.steps else []
-        said += [f"a score of {end.score:g}"] if end.score is not None else []
-        return f"until {' or '.join(said)}" if said else "to the end"
+        parts = [plural(end.generations, "generation")] if end.generations else []
+        parts += [f"{end.steps} environment steps"] if end.steps else []
+        parts += [f"a score of {end.score:g}"] if end.score is not None else []
+        return f"until {' or '.join(parts)}" if parts else "to the end"
 
     @property
     def description(self) -> str:
-        """In words, for people."""
+        """The settings as a text."""
         patience = f", patience {self.patience}" if self.patience else ""
         search = f"a new search with step size {self.sigma0:g}" if self.starts_new_search else "the search goes on"
         raced = ", racing" if self.racing else ""
@@ -61,25 +60,25 @@ class Stage:
 
     @property
     def driven_episodes(self) -> int:
-        """How many of a candidate's episodes in a dream are driven in the world that it dreams of: the first ones."""
+        """The number of a candidate's episodes in a dream task that are scored in reality: its first ones."""
         return round(self.driven * self.episodes)
 
-    def spec(self, own: TaskSpec) -> TaskSpec:
-        """The run's `own` specification under this stage's horizon and patience."""
-        return own.with_overrides(horizon=self.horizon, patience=self.patience)
+    def spec(self, run_spec: TaskSpec) -> TaskSpec:
+        """The run's specification with this stage's horizon and patience."""
+        return run_spec.with_overrides(horizon=self.horizon, patience=self.patience)
 
 
 @dataclass(frozen=True)
 class BegunStage:
-    """A stage that a run has come to."""
+    """A stage that a run has reached."""
 
     stage: Stage
     since: int  # its first generation
-    why: str = ""  # what the stage before it ended by, in words
+    why: str = ""  # the end condition of the stage before that was met
 
 
 def stages_of(settings: RunSettings) -> tuple[Stage, ...]:
-    """A run's stages in order; of a run without a schedule the one that it is."""
+    """A run's stages in order; a run without a schedule has one."""
     spec = settings.task
     found = [
         Stage(
@@ -104,14 +103,14 @@ def _next_stage(before: Stage, each: StageSettings) -> Stage:
 def begun_stages(
     settings: RunSettings, history: Sequence[StoredGeneration], evaluations: Iterable[StoredEvaluation]
 ) -> Sequence[BegunStage]:
-    """The stages that a run has come to, the one of its open generation last."""
+    """The stages that a run has reached, up to its open generation's."""
     stages = StageTracker(settings)
     stages.advance_to(len(history), history, {each.generation: each for each in evaluations})
     return stages.begun
 
 
 def describe_stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str, str]:
-    """Each stage of a schedule in words, and when it began, by its name."""
+    """Describe each stage of a schedule and when it began, by the stage's name."""
     found = {}
     for stage in stages_of(settings) if settings.stages else ():
         since = f"since generation {begun[stage.number - 1].since}" if stage.number <= len(begun) else "not begun"
@@ -120,7 +119,7 @@ def describe_stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[
 
 
 def describe_steps(horizon: int, driven: float, *, dreamt: bool) -> str:
-    """What an episode of a candidate is, in words: its steps, and in a run of dreams where they are made."""
+    """Describe the steps of a candidate's episodes; in a dream task also the share in reality."""
     if not dreamt:
         return f"{horizon} steps"
     if driven in (0, 1):
@@ -129,78 +128,78 @@ def describe_steps(horizon: int, driven: float, *, dreamt: bool) -> str:
 
 
 def join_distinct(values: Iterable[str]) -> str:
-    """What counted in one stage after another, in words; what stayed is said once."""
+    """Join the values of successive stages to a text; repeated values occur once."""
     return ", then ".join(value for value, _ in groupby(values))
 
 
 def longest_horizon(settings: RunSettings) -> int:
-    """Steps of a scored episode at most, in any stage."""
+    """The longest horizon of all stages."""
     return max(each.horizon for each in stages_of(settings))
 
 
 def latest_usable_evaluation(every: int, generation: int) -> int:
-    """The last evaluation, by its generation, that anything about `generation` may depend on; negative: none.
+    """The generation of the last evaluation on which the parameters of `generation` may depend; negative: none.
 
-    With one after each `every` generations it was scheduled at least so many generations earlier, which is the time
-    that driving it may take.
+    With an evaluation after each `every` generations, it began at least `every` generations earlier, so that it has
+    time to finish.
     """
     return (generation // every - 1) * every - 1 if every else -1
 
 
 class StageTracker:
-    """Which stage one generation after another is in; each closed generation and evaluation is looked at once."""
+    """Determines the stage of one generation after another, reading each closed generation and evaluation once."""
 
     def __init__(self, settings: RunSettings) -> None:
         self._every = settings.evaluate_every
         self._stages = stages_of(settings)
         self._begun = [BegunStage(self._stages[0], 0)]
-        self._seen = 0  # the latest generation that was asked for
-        self._steps = 0  # environment steps of the latest stage before it
+        self._generation = 0  # the latest one requested
+        self._steps = 0  # environment steps of the current stage before it
 
     def __len__(self) -> int:
         return len(self._stages)
 
     @property
     def begun(self) -> Sequence[BegunStage]:
-        """Those that had begun by the latest generation that was asked for."""
+        """The stages that had begun by the latest requested generation."""
         return self._begun
 
     def advance_to(
         self, generation: int, history: Sequence[StoredGeneration], finished: Mapping[int, StoredEvaluation]
     ) -> BegunStage:
-        """That of `generation`. Ask for generations in rising order.
+        """The stage of `generation`; request generations in ascending order.
 
-        `history` holds at least the generations before it, from the first on, and `finished` by generation the
-        evaluations that it depends on.
+        `history` holds at least all generations before it; `finished`, by generation, at least the evaluations that it
+        depends on.
         """
-        while self._seen < generation:
-            self._seen += 1
-            self._steps += sum(each.steps for each in history[self._seen - 1 : self._seen])
+        while self._generation < generation:
+            self._generation += 1
+            self._steps += sum(each.steps for each in history[self._generation - 1 : self._generation])
             if len(self._begun) < len(self._stages) and (why := self._end_reason(finished)):
-                self._begun.append(BegunStage(self._stages[len(self._begun)], self._seen, why))
+                self._begun.append(BegunStage(self._stages[len(self._begun)], self._generation, why))
                 self._steps = 0
         return self._begun[-1]
 
     def stage_of(self, generation: int) -> BegunStage:
-        """That of a generation which is not after the latest that was asked for."""
+        """The stage of a generation up to the latest requested one."""
         return self._begun[bisect(self._begun, generation, key=lambda each: each.since) - 1]
 
     def required_evaluation(self, generation: int) -> int:
-        """The evaluation, by its generation, that may begin another stage at `generation`; negative: none.
+        """The generation of the evaluation that may start another stage at `generation`; negative: none.
 
-        `generation` is the one after the latest that was asked for.
+        `generation` must be the one after the latest requested one.
         """
         latest, last = self._begun[-1], latest_usable_evaluation(self._every, generation)
         return last if latest.stage.end.score is not None and last >= latest.since else -1
 
     def _end_reason(self, finished: Mapping[int, StoredEvaluation]) -> str:
-        """What the latest stage ends by before generation `_seen`; empty where it goes on."""
+        """The end condition of the current stage that is met before `_generation`; empty if none is."""
         end, since = self._begun[-1].stage.end, self._begun[-1].since
-        if end.generations and self._seen - since >= end.generations:
-            return plural(self._seen - since, "generation")
+        if end.generations and self._generation - since >= end.generations:
+            return plural(self._generation - since, "generation")
         if end.steps and self._steps >= end.steps:
             return f"{self._steps} environment steps"
-        found = finished.get(self.required_evaluation(self._seen))
+        found = finished.get(self.required_evaluation(self._generation))
         if found is not None and end.score is not None and found.mean >= end.score:
             return f"the mean of generation {found.generation} reached {found.mean:.1f}"
         return ""

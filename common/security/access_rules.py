@@ -1,8 +1,8 @@
-"""Who may do what on the wire: the rules by role that a secured router holds everybody to, as Zenoh reads them.
+"""The access rules of a secured router, by role, as Zenoh's configuration.
 
-Zenoh's rules stand while a router runs, and name certificates one by one. So each role has a fixed number of seats that
-are ruled from the start, and a worker's name ends in its own: rules hold it to `*.17`, whoever has the file of seat 17
-and whenever that was issued. What is allowed to nobody is denied, silently.
+Zenoh's rules are fixed while a router runs, and list certificates one by one. So each role has a fixed number of seats
+with rules from the start. A worker's name ends in its seat, and the rules of seat 17 allow it only names `*.17`,
+whenever its join file was issued. Everything else is denied, silently.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.security.credentials import SEATS, identity
 
-INGRESS, EGRESS = "ingress", "egress"  # as the router sees it: from whom the rule is about, to whom
+INGRESS, EGRESS = "ingress", "egress"  # messages to the router from the rule's subject, and from the router to it
 ALL_MESSAGES = (
     "put", "delete", "query", "reply", "declare_subscriber", "declare_queryable", "liveliness_token",
     "liveliness_query", "declare_liveliness_subscriber",
@@ -28,7 +28,7 @@ _COORDINATORS = keys.live_coordinator(_ANY_RUN, "*")
 
 
 def access_control_config(passwords: bool, revoked_seats: Collection[str] = ()) -> dict[str, Any]:
-    """Zenoh's `access_control`; the seats in `revoked_seats` may do nothing. With `passwords` subjects are users."""
+    """Zenoh's `access_control`: by users with `passwords`, else by certificates; `revoked_seats` may do nothing."""
     rules = [
         _rule("trusted", (INGRESS, EGRESS), ALL_MESSAGES, (f"{keys.ROOT}/**",)),
         *_viewer_rules(),
@@ -44,17 +44,18 @@ def access_control_config(passwords: bool, revoked_seats: Collection[str] = ()) 
         if (who := identity("worker", number)) not in revoked_seats:
             rules.extend(_seat_rules(who, number))
             subjects.append({"id": who, of: [who]})
-            policies.append({"subjects": [who], "rules": [f"{who} {each}" for each in ("says", "hears", "is", "told")]})
+            policies.append({"subjects": [who], "rules": [f"{who} {each}" for each in _SEAT_RULES]})
     return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}
 
 
 _ROLES = {
     "coordinator": ("trusted",),
     "router": ("trusted",),
-    "viewer": ("look", "watch", "shown"),
-    "operator": ("look", "watch", "shown", "control", "controlled"),
-    "worker": ("work", "worked"),
+    "viewer": ("look", "watch", "see"),
+    "operator": ("look", "watch", "see", "control", "control replies"),
+    "worker": ("work", "work replies"),
 }
+_SEAT_RULES = ("sends", "receives", "is live", "gets")
 
 
 def _rule(name: str, flows: tuple[str, ...], messages: tuple[str, ...], on: tuple[str, ...]) -> dict[str, Any]:
@@ -63,28 +64,28 @@ def _rule(name: str, flows: tuple[str, ...], messages: tuple[str, ...], on: tupl
 
 
 def _viewer_rules() -> Iterator[dict[str, Any]]:
-    """Of who looks, and of who steers too."""
+    """The rules of viewers and operators."""
     yield _rule("look", (INGRESS,), ("query",), _STATUS)
     yield _rule("watch", (INGRESS,), ("declare_subscriber",), (*_EVENTS, _VIEWS))
-    yield _rule("shown", (EGRESS,), ("put", "reply", "declare_queryable"), (*_STATUS, *_EVENTS, _VIEWS))
+    yield _rule("see", (EGRESS,), ("put", "reply", "declare_queryable"), (*_STATUS, *_EVENTS, _VIEWS))
     yield _rule("control", (INGRESS,), ("query",), (_CONTROL, _BUNDLE))
-    yield _rule("controlled", (EGRESS,), ("reply", "declare_queryable"), (_CONTROL, _BUNDLE))
+    yield _rule("control replies", (EGRESS,), ("reply", "declare_queryable"), (_CONTROL, _BUNDLE))
 
 
 def _common_worker_rules() -> Iterator[dict[str, Any]]:
-    """What all workers have in common: they ask how runs are, fetch the world model, and see who coordinates."""
+    """The rules of all workers: query statuses, fetch the world model, and see live coordinators."""
     yield _rule("work", (INGRESS,), ("query", "liveliness_query", "declare_liveliness_subscriber"),
                 (_STATUS[0], _BUNDLE, _COORDINATORS))  # fmt: skip
-    yield _rule("worked", (EGRESS,), ("reply", "declare_queryable", "liveliness_token", "declare_subscriber"),
+    yield _rule("work replies", (EGRESS,), ("reply", "declare_queryable", "liveliness_token", "declare_subscriber"),
                 (_STATUS[0], _BUNDLE, _COORDINATORS, *_WORKER_MESSAGES))  # fmt: skip
 
 
 def _seat_rules(who: str, seat: int) -> Iterator[dict[str, Any]]:
-    """What one worker may, under names that end in its seat."""
+    """The rules of one worker's seat, for names that end in it."""
     worker = f"$*.{seat}/*"
     hello, job = keys.secured_hello(_ANY_RUN, worker), keys.job(_ANY_RUN, worker)
-    said = tuple(each(_ANY_RUN, worker) for each in (keys.result, keys.beat, keys.upload, keys.view))
-    yield _rule(f"{who} says", (INGRESS,), ("put",), said)
-    yield _rule(f"{who} hears", (INGRESS,), ("declare_subscriber", "query"), (job, hello))
-    yield _rule(f"{who} is", (INGRESS,), ("liveliness_token",), (keys.live_worker(_ANY_RUN, worker),))
-    yield _rule(f"{who} told", (EGRESS,), ("put", "reply", "declare_queryable"), (job, hello))
+    sent = tuple(each(_ANY_RUN, worker) for each in (keys.result, keys.heartbeat, keys.upload, keys.view))
+    yield _rule(f"{who} sends", (INGRESS,), ("put",), sent)
+    yield _rule(f"{who} receives", (INGRESS,), ("declare_subscriber", "query"), (job, hello))
+    yield _rule(f"{who} is live", (INGRESS,), ("liveliness_token",), (keys.live_worker(_ANY_RUN, worker),))
+    yield _rule(f"{who} gets", (EGRESS,), ("put", "reply", "declare_queryable"), (job, hello))

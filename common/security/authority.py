@@ -1,10 +1,10 @@
-"""A fleet's own certificate authority: a folder that makes join files, and says which of them count no more.
+"""A fleet's own certificate authority: a folder that issues and revokes join files.
 
-    ca.pem, ca.key   the authority itself; the key is what everything rests on, and needs to be on no other host
-    secret           where the fleet is joined by passwords: what these follow from
-    issued.json      what was issued and revoked; no secret
+    ca.pem, ca.key   the authority's certificate and private key; keep the key on this host only
+    secret           only with passwords: the secret that they are derived from
+    issued.json      the list of issued and revoked join files; not secret
 
-Keys are P-256, which whatever speaks TLS understands; certificates are X.509 v3 (RFC 5280).
+Keys are P-256, which every TLS library supports; certificates are X.509 v3 (RFC 5280).
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from dreamfleet.common.protocol.keys import check_worker_name
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, IssuedJoinFile
 from dreamfleet.common.security.credentials import SEATS, Credentials, derive_password, format_join_file, hash_authority
 
-AUTHORITY_YEARS = 10  # of the authority
-DEFAULT_DAYS = {"coordinator": 90, "router": 90, "operator": 90, "viewer": 90, "worker": 30}  # by default
-CLOCK_SKEW = timedelta(minutes=5)  # clocks differ
-LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")  # of every listener, for its own host
+AUTHORITY_YEARS = 10  # validity of the authority's certificate
+DEFAULT_DAYS = {"coordinator": 90, "router": 90, "operator": 90, "viewer": 90, "worker": 30}  # validity of join files
+CLOCK_SKEW = timedelta(minutes=5)  # certificates are valid from so long before their issue
+LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")  # in the certificate of every listener
 _CERTIFICATE, _KEY, _SECRET = "ca.pem", "ca.key", "secret"
 _MAX_FILE_BYTES = 64 * 1024
 _HOST = re.compile(r"(\*\.)?[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")
 
 
 class Authority:
-    """An authority in its folder."""
+    """A certificate authority in its folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Open it; `AccessError` if there is none, or it is damaged."""
+        """Open an existing authority; `AccessError` if there is none, or it is damaged."""
         self._folder = folder
         if not _authority_exists(folder):
             raise AccessError(
-                f"no authority in {folder}: `dreamfleet access init` makes one, --access-dir names another"
+                f"no authority in {folder}: `dreamfleet access init` creates one, --access-dir names another"
             )
         try:
             self._pem = read_text(folder / _CERTIFICATE, _MAX_FILE_BYTES)
@@ -62,14 +62,14 @@ class Authority:
         except (ValueError, TypeError) as error:
             raise AccessError(f"the authority in {folder} is damaged: restore the folder") from error
         if not isinstance(key, EllipticCurvePrivateKey):
-            raise AccessError(f"the authority in {folder} has a key of another kind: restore the folder")
+            raise AccessError(f"the authority in {folder} has a key of another type: restore the folder")
         if key.public_key() != self._certificate.public_key():
             raise AccessError(f"the authority in {folder} has the key of another certificate: restore the folder")
         self._key = key
 
     @classmethod
     def create(cls, folder: Path, *, passwords: bool = False) -> Authority:
-        """A new one; `UsageError` where there is one."""
+        """Create an authority; `UsageError` if the folder holds one."""
         if _authority_exists(folder):
             raise UsageError(f"{folder} holds an authority already: name another --access-dir")
         key, now = generate_private_key(SECP256R1()), datetime.now(UTC)
@@ -90,14 +90,17 @@ class Authority:
             if passwords:
                 _write_private(folder / _SECRET, secrets.token_hex(32).encode())
             CertificateLedger(hash_authority(pem.decode()), passwords).save(folder / LEDGER_FILE)
-            _write_private(folder / _KEY, _key_bytes(key))  # at last: it says that there is an authority
+            _write_private(folder / _KEY, _key_bytes(key))  # last: its presence marks a complete authority
         return cls(folder)
 
     def issue(
         self, role: str, name: str, out: Path, *, connect: Sequence[str] = (), hosts: Sequence[str] = (),
         days: float | None = None, now: datetime | None = None,
     ) -> Credentials:  # fmt: skip
-        """Write a join file, which must not be there yet; who had the name before keeps its seat, unless revoked."""
+        """Write a new join file to `out`; a name that has a seat already keeps it, unless that was revoked.
+
+        `UsageError` if the file exists.
+        """
         check_worker_name(name)
         days, now = DEFAULT_DAYS[role] if days is None else days, now or datetime.now(UTC)
         expires = (now + timedelta(days=days)).replace(microsecond=0)
@@ -113,7 +116,7 @@ class Authority:
                 pem = self._sign_certificate(who, key, serial, hosts, now)
                 who = replace(who, certificate=pem, key=_key_bytes(key).decode())
             if ledger.passwords and not self._secret:
-                raise AccessError(f"{self._folder / _SECRET} is missing, of which all passwords follow: restore it")
+                raise AccessError(f"{self._folder / _SECRET} is missing, and passwords are derived from it: restore it")
             if ledger.passwords:
                 who = (replace(who, secret=self._secret) if who.can_listen
                        else replace(who, password=derive_password(self._secret, who.identity)))  # fmt: skip
@@ -126,14 +129,17 @@ class Authority:
         return who
 
     def issued(self) -> tuple[IssuedJoinFile, ...]:
-        """All that was issued, the oldest first."""
+        """All issued join files, oldest first."""
         return CertificateLedger.load(self._folder / LEDGER_FILE).issued
 
     def revoke(self, name: str, role: str | None = None) -> tuple[IssuedJoinFile, ...]:
-        """Bar the seat that a name has; what that took back. `UsageError` if it is nobody's, or of several roles."""
+        """Revoke the join files of a name, and so its seat; returns them.
+
+        `UsageError` if the name has none, or has some of several roles and `role` is not given.
+        """
         with self._locked_ledger() as ledger:
-            standing = [each for each in ledger.issued if each.revoked is None]
-            found = [each for each in standing if each.name == name and role in (None, each.role)]
+            valid = [each for each in ledger.issued if each.revoked is None]
+            found = [each for each in valid if each.name == name and role in (None, each.role)]
             if not found:
                 raise UsageError(f"nothing is issued to {name!r} that is not revoked: see `dreamfleet access list`")
             if len(roles := sorted({each.role for each in found})) > 1:
@@ -162,16 +168,16 @@ class Authority:
 
     @contextmanager
     def _locked_ledger(self) -> Iterator[CertificateLedger]:
-        """The ledger, which nobody else changes meanwhile."""
+        """Load the ledger and lock it against changes."""
         with _locked(self._folder):
             ledger = CertificateLedger.load(self._folder / LEDGER_FILE)
             if ledger.authority != hash_authority(self._pem):
-                raise AccessError(f"{self._folder / LEDGER_FILE} is of another authority: restore the folder")
+                raise AccessError(f"{self._folder / LEDGER_FILE} belongs to another authority: restore the folder")
             yield ledger
 
 
 def _authority_exists(folder: Path) -> bool:
-    """Whether there is an authority; `AccessError` where that cannot be seen."""
+    """Whether a folder holds an authority; `AccessError` if it cannot be read."""
     try:
         return (folder / _KEY).exists()
     except OSError as error:
@@ -183,7 +189,7 @@ def _locked(folder: Path) -> AbstractContextManager[None]:
 
 
 def _assign_seat(ledger: CertificateLedger, role: str, name: str) -> int:
-    """The one that the name has, else the next one; none is given twice."""
+    """The seat of a name, else the next free one; revoked seats are never reused."""
     own = [each for each in ledger.issued if each.role == role]
     for each in own:
         if each.name == name and each.revoked is None:
@@ -191,7 +197,7 @@ def _assign_seat(ledger: CertificateLedger, role: str, name: str) -> int:
     seat = max((each.seat for each in own), default=0) + 1
     if seat > SEATS[role]:
         raise AccessError(
-            f"all {SEATS[role]} seats of role {role} are given: make another authority with `dreamfleet access init`"
+            f"all {SEATS[role]} seats of role {role} are taken: create another authority with `dreamfleet access init`"
         )
     return seat
 
@@ -223,8 +229,8 @@ def _alternative_name(text: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(text.strip("[]")))
     except ValueError:
         pass
-    if not _HOST.fullmatch(text):  # of other scripts it is the `xn--` form that is asked for
-        raise UsageError(f"--host {text!r} is no host: give a name or an address, without a port")
+    if not _HOST.fullmatch(text):  # internationalised names in their `xn--` form
+        raise UsageError(f"--host {text!r} is not a host: give a name or an address, without a port")
     return x509.DNSName(text)
 
 

@@ -1,4 +1,4 @@
-"""What an authority issued, and what it took back: a list without secrets, which a coordinator reads as it serves."""
+"""The list of an authority's issued and revoked join files. It holds no secrets; running coordinators reload it."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from dreamfleet.common.serialization.validation import MalformedError, from_plai
 log = logging.getLogger(__name__)
 LEDGER_FILE = "issued.json"  # in the authority's folder
 MAX_BYTES = 4_000_000
-CHECK_INTERVAL = 2.0  # seconds between looks at whether it changed
+CHECK_INTERVAL = 2.0  # seconds between checks for changes
 
 
 @dataclass(frozen=True)
 class IssuedJoinFile:
-    """A join file that was made; times in seconds since 1970."""
+    """An issued join file; times in seconds since 1970."""
 
     role: str
     seat: int
     name: str
-    serial: str  # of the certificate, in hex; empty where there is none
+    serial: str  # of the certificate, hexadecimal; empty without one
     expires: float
     revoked: float | None = None
 
     @property
     def identity(self) -> str:
-        """As the router knows it."""
+        """Its seat's identity at the router."""
         return identity(self.role, self.seat)
 
     @property
@@ -46,7 +46,7 @@ class IssuedJoinFile:
 
 @dataclass(frozen=True)
 class CertificateLedger:
-    """All that one authority issued, the oldest first."""
+    """All join files that one authority issued, oldest first."""
 
     authority: str  # hash of its certificate
     passwords: bool = False
@@ -54,7 +54,7 @@ class CertificateLedger:
 
     @classmethod
     def load(cls, path: Path) -> CertificateLedger:
-        """From its file; `AccessError` if that is damaged."""
+        """Read the ledger's file; `AccessError` if it is damaged."""
         try:
             document = json.loads(read_regular(path, MAX_BYTES))
             return from_plain(cls, document)
@@ -64,7 +64,7 @@ class CertificateLedger:
             raise AccessError(f"{path} is damaged: {error}; restore it") from error
 
     def save(self, path: Path) -> None:
-        """Write it whole; `AccessError` if that fails, and it is as before."""
+        """Write the ledger's file atomically; `AccessError` if that fails."""
         try:
             with atomic_write(path, private=True) as file:
                 file.write(json.dumps(asdict(self), indent=1).encode())
@@ -72,21 +72,21 @@ class CertificateLedger:
             raise AccessError(f"{path} cannot be written: {error.strerror}; nothing is changed") from error
 
     def revoked_seats(self) -> frozenset[str]:
-        """The seats that were taken back."""
+        """The identities of revoked seats."""
         return frozenset(each.identity for each in self.issued if each.revoked is not None)
 
     def with_revoked(self, wanted: Iterable[IssuedJoinFile], now: float) -> CertificateLedger:
-        """The same where some were taken back."""
+        """A copy in which some join files are revoked."""
         chosen = set(wanted)
         return replace(self, issued=tuple(replace(each, revoked=now) if each in chosen else each
                                           for each in self.issued))  # fmt: skip
 
 
 class RevocationWatcher:
-    """Which seats are barred, by a ledger that may change while this lives; without credentials nothing is."""
+    """The revoked seats by a ledger file, reloaded when it changes; none without credentials."""
 
     def __init__(self, folder: Path, credentials: Credentials | None) -> None:
-        """`AccessError` where the folder's ledger is damaged or another authority's: what it revoked would stand."""
+        """`AccessError` if the folder's ledger is damaged or another authority's: revoked seats would stay valid."""
         self._path = folder / LEDGER_FILE
         self._authority = credentials.authority if credentials else None
         self._next = float("-inf")
@@ -95,22 +95,22 @@ class RevocationWatcher:
         if credentials is None:
             return
         try:
-            there = self._path.exists()
-        except OSError as error:  # what it revoked would stand
+            exists = self._path.exists()
+        except OSError as error:
             raise AccessError(f"{self._path} cannot be read: {error.strerror}") from error
-        if not there:
+        if not exists:
             log.warning("there is no %s: nothing is revoked (--access-dir)", self._path)
         else:
             self._reload(time.monotonic())
 
     def reload_if_changed(self, now: float) -> None:
-        """Read it again if it changed; what cannot be read leaves what is known."""
+        """Reload the ledger if it changed; a damaged one only logs a warning."""
         if self._authority is None or now < self._next:
             return
         try:
             self._reload(now)
         except AccessError as error:
-            log.warning("%s; what was revoked until now stays so", error)
+            log.warning("%s; earlier revocations stay in force", error)
 
     def _reload(self, now: float) -> None:
         self._next = now + CHECK_INTERVAL
@@ -124,7 +124,7 @@ class RevocationWatcher:
         self._seen = seen
         ledger = CertificateLedger.load(self._path)
         if ledger.authority != self._authority:
-            raise AccessError(f"{self._path} is of another authority than the join file: name its own --access-dir")
+            raise AccessError(f"{self._path} belongs to another authority than the join file: name its --access-dir")
         for each in sorted(ledger.revoked_seats() - self.revoked_seats):
-            log.warning("%s is revoked: nothing that it says counts", each)
+            log.warning("%s is revoked: its messages are ignored", each)
         self.revoked_seats = ledger.revoked_seats()

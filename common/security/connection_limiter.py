@@ -1,10 +1,10 @@
-"""A gate before a secured router's port: strangers who connect and never prove who they are take nothing of a run.
+"""A limit on unauthenticated connections to a secured router's ports.
 
-Zenoh accepts every connection, holds it until its handshake ends or is out of time, and lets each one that failed cost
-all others 100 ms (https://github.com/eclipse-zenoh/zenoh/issues/2685): a few hundred closed connections keep newcomers
-out for a minute, and once a process has no descriptor left it never gets one back. So while more than
-`MAX_UNAUTHENTICATED` connections have not authenticated, the kernel drops the packets of new ones. Open connections
-stay, and a newcomer's kernel tries again by itself. Linux only: elsewhere there is no limit.
+Zenoh accepts every connection, keeps it until its handshake ends or times out, and delays all others by 100 ms for each
+failed one (https://github.com/eclipse-zenoh/zenoh/issues/2685). So a few hundred closed connections keep newcomers out
+for a minute, and a process that ran out of descriptors never recovers. While more than `MAX_UNAUTHENTICATED`
+connections are unauthenticated, a socket filter makes the kernel drop packets of new ones. Open connections stay, and a
+newcomer's kernel retries. Linux only: elsewhere there is no limit.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from time import sleep
 import zenoh
 
 log = logging.getLogger("dreamfleet.router")
-MAX_UNAUTHENTICATED = 32  # connections: at 100 ms each they are gone in three seconds
-SPARE_DESCRIPTORS = 16  # descriptors
-CHECK_INTERVAL = 0.02  # seconds from one look at the descriptors to the next
+MAX_UNAUTHENTICATED = 32  # at 100 ms each they are closed in three seconds
+SPARE_DESCRIPTORS = 16
+CHECK_INTERVAL = 0.02  # seconds between checks of the descriptors
 _OPEN = Path("/proc/self/fd")
 _ATTACH, _DETACH = 26, 27  # SO_ATTACH_FILTER and SO_DETACH_FILTER of Linux's asm-generic/socket.h
 _DROP_ALL = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0), 8)  # a socket filter: return 0 bytes
@@ -34,7 +34,7 @@ _FILTER = struct.pack("@HP", 1, ctypes.addressof(_DROP_ALL))
 
 
 def limit_connections(session: zenoh.Session, ports: Collection[int]) -> None:
-    """Keep a gate before the ports on which `session` listens, until it is closed."""
+    """Limit connections to the ports on which `session` listens, until it is closed."""
     if sys.platform == "linux":
         Thread(target=_ConnectionLimiter(session, ports).run, name="gate", daemon=True).start()
 
@@ -44,12 +44,12 @@ class _ConnectionLimiter:
         self._info, self._ports = session.info, ports
         self._listening = [each for each in self._port_descriptors() if self._is_listening(each)]
         self._open, self._unauthenticated = 0, 0
-        # Where a process has none left, Zenoh hears of that alone and ends no handshake: then it gets these back.
+        # Out of descriptors, Zenoh only reports that and completes no handshake; closing these lets it continue.
         self._spare = _open_spare_descriptors()
         self._blocked = False
 
     def run(self) -> None:
-        while any(map(self._is_listening, self._listening)):  # whoever asks a session that is being closed, breaks it
+        while any(map(self._is_listening, self._listening)):  # querying a session that is being closed breaks it
             if self._is_crowded() != self._blocked:
                 self._set_blocked(not self._blocked)
             sleep(CHECK_INTERVAL)
@@ -63,7 +63,7 @@ class _ConnectionLimiter:
                     len(self._port_descriptors()) - len(self._listening) - len(self._info.transports())
                 )
                 self._open = found
-        except OSError:  # no descriptor is left
+        except OSError:  # out of descriptors
             return True
         return self._unauthenticated > MAX_UNAUTHENTICATED
 
@@ -76,21 +76,21 @@ class _ConnectionLimiter:
                     self._close_waiting(listening)
         if blocked:
             self._close_spare()
-            log.warning("more than %d connections prove nothing: newcomers wait", MAX_UNAUTHENTICATED,
+            log.warning("more than %d connections are unauthenticated: new ones wait", MAX_UNAUTHENTICATED,
                         extra={"facts": {"event": "crowd", "unproven": self._unauthenticated}})  # fmt: skip
         else:
             self._spare = _open_spare_descriptors()
 
     def _close_waiting(self, listening: socket.socket) -> None:
-        """Close what waits to be accepted, or it would take the spare ones; Zenoh may be faster and take some."""
+        """Close waiting connections, which would take the spare descriptors; Zenoh may accept some of them first."""
         while self._spare:
             os.close(self._spare.pop())
             try:
                 while True:
                     listening.accept()[0].close()
-            except BlockingIOError:  # nothing waits
+            except BlockingIOError:  # none waits
                 return
-            except OSError:  # it took this one
+            except OSError:  # Zenoh took the descriptor
                 continue
 
     def _close_spare(self) -> None:
@@ -98,11 +98,11 @@ class _ConnectionLimiter:
             os.close(self._spare.pop())
 
     def _port_descriptors(self) -> list[int]:
-        """The descriptors of what listens at the ports, and of whoever connected there."""
+        """The descriptors of the listening sockets at the ports, and of connections to them."""
         return [number for each in _OPEN.iterdir() if _local_port(number := int(each.name)) in self._ports]
 
     def _is_listening(self, number: int) -> bool:
-        """Whether this is still the descriptor of what listens at one of the ports."""
+        """Whether this is still the descriptor of a listening socket at one of the ports."""
         if _local_port(number) in self._ports:
             with suppress(OSError), _as_socket(number) as found:
                 return bool(found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
@@ -118,7 +118,7 @@ def _open_spare_descriptors() -> list[int]:
 
 
 def _local_port(number: int) -> int:
-    """The port of this host that a descriptor has; 0 of one that is no internet socket, or is gone."""
+    """The local port of a descriptor; 0 if it is closed or no internet socket."""
     with suppress(OSError), _as_socket(number) as found:
         if found.family in (socket.AF_INET, socket.AF_INET6):
             return int(found.getsockname()[1])
@@ -127,7 +127,7 @@ def _local_port(number: int) -> int:
 
 @contextmanager
 def _as_socket(number: int) -> Iterator[socket.socket]:
-    """Another's descriptor as a socket."""
+    """A descriptor of somebody else as a socket; it stays open."""
     found = socket.socket(fileno=number)
     try:
         yield found

@@ -1,8 +1,8 @@
-"""Who a process is to a secured fleet: what one join file holds, and how it is read.
+"""Credentials of a secured fleet: the contents of join files, and reading them.
 
-A join file is TOML, mode 600, written by `dreamfleet access issue`. Its seat is the number behind its role; the router
-knows the two as `worker.17`, which is the certificate's common name, or the user where passwords are in force. Reading
-one needs no package of the extra `access`.
+A join file is TOML, mode 600, written by `dreamfleet access issue`. Role and seat form its identity at the router, such
+as `worker.17`: the certificate's common name, or the user name with passwords. Reading one does not need the extra
+`access`.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from dreamfleet.common.files.regular_files import open_regular
 from dreamfleet.common.protocol.keys import check_worker_name
 
 VERSION = 1
-# The seats of a role that a router keeps: whoever has one is known to it when it starts, also before the file is made.
+# Number of seats of each role. A router knows all seats when it starts, also those issued later.
 SEATS = {"coordinator": 50, "router": 50, "operator": 100, "viewer": 100, "worker": 500}
 ROLES = tuple(SEATS)
 LISTENERS = ("coordinator", "router")
 MAX_BYTES = 64 * 1024  # of a join file
-EXPIRY_WARNING = timedelta(days=7)  # before the end, when people are warned
+EXPIRY_WARNING = timedelta(days=7)  # before the end, from when on warnings are logged
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """What a join file says: a role's seat until `expires`, where to connect, and what proves it, as PEM texts.
+    """The contents of a join file: a seat of a role until `expires`, addresses, and secrets (PEM texts).
 
-    With certificates `certificate` and `key` prove it. With passwords a listener has these for its own side, and
-    `secret`, of which every seat's password follows; all others have nothing but their `password`.
+    In a fleet with certificates all roles have `certificate` and `key`. With passwords listeners have these and
+    `secret`, from which every seat's password is derived; other roles have only their `password`.
     """
 
     role: str
     seat: int
-    name: str  # as it was issued
+    name: str  # as issued
     expires: datetime
     ca: str = field(repr=False)
     connect: tuple[str, ...] = ()
@@ -52,7 +52,7 @@ class Credentials:
 
     @property
     def identity(self) -> str:
-        """As the router knows it, such as `worker.17`."""
+        """The identity at the router, such as `worker.17`."""
         return identity(self.role, self.seat)
 
     @property
@@ -62,37 +62,37 @@ class Credentials:
 
     @property
     def can_listen(self) -> bool:
-        """Whether it can be a fleet's router."""
+        """Whether its role may listen as the fleet's router."""
         return self.role in LISTENERS
 
     @property
     def uses_passwords(self) -> bool:
-        """Whether this fleet is joined by passwords rather than by certificates."""
+        """Whether the fleet uses passwords rather than certificates."""
         return bool(self.password or self.secret)
 
     def time_left(self, now: datetime) -> timedelta:
-        """How long it is still good for."""
+        """The time until it expires."""
         return self.expires - now
 
 
 def identity(role: str, seat: int) -> str:
-    """A seat as the router knows it."""
+    """The identity of a seat at the router."""
     return f"{role}.{seat}"
 
 
 def worker_seat_identity(worker: str) -> str:
-    """The identity that a worker `<label>.<seat>/<life>` of a secured fleet has at the router."""
+    """The identity at the router of a secured fleet's worker `<label>.<seat>/<life>`."""
     return f"worker.{worker.partition('/')[0].rpartition('.')[2]}"
 
 
 def add_seat_to_name(label: str, credentials: Credentials) -> str:
-    """A worker's name in a secured fleet, whose router holds it to the seat that this name ends in."""
+    """A worker's name in a secured fleet: it must end in the worker's seat."""
     end = f".{credentials.seat if credentials.role == 'worker' else credentials.role}"
     return check_worker_name(label[: 63 - len(end)] + end)
 
 
 def derive_password(secret: str, who: str) -> str:
-    """The password of an identity."""
+    """The password of an identity: HMAC-SHA-256 under the fleet's secret."""
     return hmac.new(bytes.fromhex(secret), who.encode(), hashlib.sha256).hexdigest()
 
 
@@ -102,7 +102,7 @@ def hash_authority(ca: str) -> str:
 
 
 def describe_time_left(left: timedelta) -> str:
-    """For how long something is good, in words."""
+    """Format the time until something expires."""
     if left <= timedelta():
         return "expired"
     hours = int(left.total_seconds() // 3600)
@@ -110,17 +110,17 @@ def describe_time_left(left: timedelta) -> str:
 
 
 def read_join_file(path: Path, now: datetime | None = None) -> Credentials:
-    """What a join file holds; `AccessError` if it is none, may be read by others, or has expired at `now`."""
+    """Read a join file; `AccessError` if it is invalid, readable by others, or expired at `now`."""
     try:
         with open_regular(path, MAX_BYTES) as file:
             found = os.fstat(file.fileno())
             document = tomllib.loads(file.read(MAX_BYTES).decode())
     except FileNotFoundError:
-        raise AccessError(f"no join file at {path}: `dreamfleet access issue` makes one") from None
+        raise AccessError(f"no join file at {path}: `dreamfleet access issue` creates one") from None
     except OSError as error:
         raise AccessError(f"{path} cannot be read as a join file: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:  # what it says may be a secret
-        raise AccessError(f"{path} is no join file: it is no TOML; have another issued") from error
+    except (ValueError, RecursionError) as error:  # not quoted: it may contain secrets
+        raise AccessError(f"{path} is no join file: it is not TOML; have another issued") from error
     _check_private(path, found)
     credentials = _parse_credentials(path, document)
     if credentials.time_left(now or datetime.now(UTC)) <= timedelta():
@@ -131,10 +131,10 @@ def read_join_file(path: Path, now: datetime | None = None) -> Credentials:
 
 
 def _check_private(path: Path, found: os.stat_result) -> None:
-    """Refuse what others may read, as ssh does: a file of another owner, such as a mounted secret, is that one's."""
+    """`AccessError` if others can read the file, as in ssh; the group may if the owner differs (mounted secrets)."""
     own = found.st_uid == os.geteuid()
     if found.st_mode & (stat.S_IRWXO | (stat.S_IRWXG if own else 0)):
-        raise AccessError(f"{path} may be read by others: chmod 600 {path}, or have another issued if they did")
+        raise AccessError(f"{path} is readable by others: chmod 600 {path}, or have another issued if they read it")
 
 
 def _parse_credentials(path: Path, document: dict[str, Any]) -> Credentials:
@@ -147,29 +147,29 @@ def _parse_credentials(path: Path, document: dict[str, Any]) -> Credentials:
         if name not in document and default is MISSING:
             raise AccessError(f"{path} is no join file: {name!r} is missing")
         if type(document.get(name, default)) is not kind:
-            raise AccessError(f"{path} is no join file: {name!r} is not of its kind")
+            raise AccessError(f"{path} is no join file: {name!r} has the wrong type")
     if unknown := sorted(set(document) - set(kinds)):
         raise AccessError(f"{path} is no join file: {unknown[0]!r} is unknown")
     values = {**document, "connect": tuple(document.get("connect", ()))}
     if values["role"] not in SEATS or not 1 <= values["seat"] <= SEATS[values["role"]] or not values["expires"].tzinfo:
-        raise AccessError(f"{path} is no join file: its role, seat or end means nothing here")
+        raise AccessError(f"{path} is no join file: its role, seat or end is invalid")
     if not all(isinstance(each, str) for each in values["connect"]):
-        raise AccessError(f"{path} is no join file: 'connect' is not of its kind")
+        raise AccessError(f"{path} is no join file: 'connect' has the wrong type")
     credentials = Credentials(**values)
-    proved = bool(credentials.certificate and credentials.key)
-    if not (proved or credentials.password) or (credentials.can_listen and not proved):
-        raise AccessError(f"{path} is no join file: what proves its role is missing")
+    has_certificate = bool(credentials.certificate and credentials.key)
+    if not (has_certificate or credentials.password) or (credentials.can_listen and not has_certificate):
+        raise AccessError(f"{path} is no join file: its certificate, key or password is missing")
     try:
         bytes.fromhex(credentials.secret)
     except ValueError:
-        raise AccessError(f"{path} is no join file: 'secret' is not of its kind") from None
+        raise AccessError(f"{path} is no join file: 'secret' is not hexadecimal") from None
     return credentials
 
 
 def format_join_file(credentials: Credentials) -> str:
-    """A join file's text."""
+    """Format credentials as the text of a join file."""
     lines = [
-        f"# dreamfleet: whoever holds this file is {credentials.role} {credentials.name}. Keep it to yourself.",
+        f"# dreamfleet: this file is the secret of {credentials.role} {credentials.name}. Do not share it.",
         f"version = {VERSION}",
         f'role = "{credentials.role}"',
         f"seat = {credentials.seat}",

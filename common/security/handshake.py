@@ -1,4 +1,4 @@
-"""Why a router does not let somebody in, in words: Zenoh says only that nobody could be reached."""
+"""Diagnosis of failed connections: Zenoh reports only that it could not connect."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ PATIENCE = 2.0  # seconds
 
 
 def diagnose_connection(endpoints: Iterable[str], credentials: Credentials | None) -> str | None:
-    """What is wrong at the first endpoint where somebody listens who did not let this side in; `None` if unknown."""
+    """Describe why the first listening endpoint rejects this side; `None` if unknown."""
     for endpoint in endpoints:
         host, _, port = endpoint.partition("/")[2].rpartition(":")
         try:
             link = socket.create_connection((host.strip("[]"), int(port)), PATIENCE)
-        except (OSError, ValueError):  # a name that no host can have
+        except (OSError, ValueError):  # ValueError: an invalid host name
             continue
         with link:
             if credentials is not None:
                 why = _diagnose_tls(link, host, credentials)
-                return f"{endpoint} lets {credentials.identity} ({credentials.name}) not in: {why}"
+                return f"{endpoint} rejects {credentials.identity} ({credentials.name}): {why}"
             if _speaks_tls(link):
                 return (
-                    f"{endpoint} speaks TLS: who joins its fleet has a join file; have one issued (`dreamfleet access "
-                    "issue`), and give --join FILE, which says where to connect, for --connect"
+                    f"{endpoint} speaks TLS: its fleet needs a join file; have one issued (`dreamfleet access "
+                    "issue`), and give --join FILE, which holds the address, instead of --connect"
                 )
     return None
 
 
 def _speaks_tls(link: socket.socket) -> bool:
-    """Whether the other side is a TLS server, whoever's."""
+    """Whether the other side is a TLS server, of any fleet."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:
@@ -50,15 +50,15 @@ def _diagnose_tls(link: socket.socket, host: str, credentials: Credentials) -> s
     try:
         with context.wrap_socket(link, server_hostname=host.strip("[]")):
             return (
-                "it is of this fleet, and refuses this join file; it may be of another authority, expired or revoked: "
-                "have another issued"
+                "it belongs to this fleet but refuses this join file, which may be of another authority, expired or "
+                "revoked: have another issued"
             )
     except ssl.SSLCertVerificationError as error:
         return (
-            f"its certificate is not good here ({error.verify_message.rstrip('.')}): it is another fleet's, has "
+            f"its certificate is not valid here ({error.verify_message.rstrip('.')}): it is another fleet's, has "
             "expired, or was issued without --host for this name; have the coordinator's join file issued again"
         )
-    except TimeoutError:  # an unsecured router waits for the rest of what it takes for a message
-        return "it answers nothing to TLS: its coordinator was started without --join, or it is too busy for now"
+    except TimeoutError:  # an unsecured router takes the handshake for an incomplete message
+        return "it does not answer TLS: its coordinator was started without --join, or it is too busy"
     except (OSError, ValueError):
-        return "it speaks no TLS: its coordinator was started without --join, or another program has the port"
+        return "it does not speak TLS: its coordinator was started without --join, or another program has the port"

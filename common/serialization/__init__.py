@@ -1,1 +1,1 @@
-"""Plain data to typed objects and back: validation, bounded values, fields that later versions added."""
+"""Conversion of plain data to typed objects and back: validation, bounds, optional fields."""

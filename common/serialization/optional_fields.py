@@ -1,4 +1,4 @@
-"""Fields that a later version added to a document: absent means the default, and a default is not written."""
+"""Optional fields, which later versions added: a missing one has its default, and a default is not written."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def optional_defaults(kind: Any) -> dict[str, Any]:
 
 
 def to_dict(document: Any) -> dict[str, Any]:
-    """A dataclass as a dictionary without optional fields at their default, also of dataclasses within."""
+    """A dataclass as nested dictionaries without optional fields at their default."""
     plain = asdict(document)
     _drop_defaults(document, plain)
     return plain
@@ -41,20 +41,20 @@ def _default(each: Field[Any]) -> Any:
     return each.default if each.default_factory is MISSING else each.default_factory()
 
 
-def known(hint: Any, plain: Any) -> Any:
-    """A plain document without the fields that the dataclasses of `hint` do not have, at any depth."""
+def drop_unknown_fields(hint: Any, plain: Any) -> Any:
+    """Remove the fields that the dataclasses of the type `hint` do not have, at any depth of a plain document."""
     origin = get_origin(hint)
     if origin is Annotated:
-        return known(get_args(hint)[0], plain)
+        return drop_unknown_fields(get_args(hint)[0], plain)
     if origin in (Union, UnionType):
         inner = [each for each in get_args(hint) if each is not NoneType]
-        return known(inner[0], plain) if plain is not None and len(inner) == 1 else plain
+        return drop_unknown_fields(inner[0], plain) if plain is not None and len(inner) == 1 else plain
     if origin is tuple and isinstance(plain, (list, tuple)):
-        return [known(get_args(hint)[0], each) for each in plain]
+        return [drop_unknown_fields(get_args(hint)[0], each) for each in plain]
     if is_dataclass(hint) and isinstance(plain, dict):
         kind: Any = hint  # mypy takes no class for hashable
         hints = _hints(kind)
-        return {name: known(hints[name], value) for name, value in plain.items() if name in hints}
+        return {name: drop_unknown_fields(hints[name], value) for name, value in plain.items() if name in hints}
     return plain
 
 

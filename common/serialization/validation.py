@@ -1,39 +1,63 @@
-"""Plain data (of JSON or msgpack) to frozen dataclasses and back, checked field by field against their type hints."""
+"""Conversion of plain data (JSON or msgpack) to frozen dataclasses and back, checked against their type hints."""
 
 from __future__ import annotations
 
 import math
 import types
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.serialization.constraints import Between, Length
-from dreamfleet.common.serialization.optional_fields import optional_defaults
+from dreamfleet.common.serialization.optional_fields import drop_unknown_fields, optional_defaults
 
 Check = Callable[[Any], Any]
-
-
 T = TypeVar("T")
+MAX_ITEMS = 4096  # of a list whose type has no bound
+MAX_TEXT = 2000  # characters: of an error, of why a worker is refused, of a fingerprint
 
 
-MAX_ITEMS = 4096  # of a list without a bound of its own
+@dataclass(frozen=True)
+class Between:
+    """Inclusive bounds of a number."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Length:
+    """Inclusive bounds of the length of text (characters), bytes, or a list."""
+
+    low: int
+    high: int
+
+
+Count = Annotated[int, Between(0, 2**63 - 1)]
+Seconds = Annotated[float, Between(0.0, 1e9)]
+Digest = Annotated[bytes, Length(32, 32)]
+Word = Annotated[str, Length(1, 128)]
+Text = Annotated[str, Length(0, MAX_TEXT)]
 
 
 class MalformedError(DreamfleetError, ValueError):
-    """A message that is not of the schema; `args[0]` is the reason to count it under, or for people to read."""
+    """Data does not fit its schema; `args[0]` is the reason, for counting or display."""
 
 
 def from_plain(kind: type[T], plain: Any) -> T:
-    """A dataclass from its plain form, checked; `MalformedError` if it does not fit."""
+    """Build a dataclass from its plain form; `MalformedError` if that does not fit."""
     checked: T = checker_of(kind)(plain)
     return checked
 
 
+def from_plain_lenient(kind: type[T], plain: Any) -> T:
+    """Like `from_plain`, but ignores unknown fields at any depth, for documents of later versions."""
+    return from_plain(kind, drop_unknown_fields(kind, plain))
+
+
 def to_plain(value: Any) -> Any:
-    """Nested dataclasses as dictionaries, without `dataclasses.asdict`'s deep copies of every vector."""
+    """Nested dataclasses as dictionaries; unlike `dataclasses.asdict`, without copying vectors."""
     if isinstance(value, tuple):
         return [to_plain(item) for item in value]
     kind: Any = type(value)
@@ -53,7 +77,7 @@ def _field_names(kind: Any) -> tuple[str, ...]:
 
 
 def checker_of(hint: Any) -> Check:
-    """A type annotation as a function that returns the checked value or raises."""
+    """Compile a type annotation to a function that returns the checked value or raises `MalformedError`."""
     return _compile(hint)
 
 
@@ -79,16 +103,16 @@ def _compile(hint: Any) -> Check:
 
 
 def _checker_for_items(hint: Any, bounds: list[Any]) -> Check:
-    """A tuple's checker; its length is bounded before any item is looked at."""
+    """A tuple's checker, which checks the length before the items."""
     if get_origin(hint) is not tuple:
         return checker_of(hint)
     check = checker_of(get_args(hint)[0])
-    most = min([bound.high for bound in bounds if isinstance(bound, Length)], default=MAX_ITEMS)
+    max_items = min([bound.high for bound in bounds if isinstance(bound, Length)], default=MAX_ITEMS)
 
     def items(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, (list, tuple)):
             raise MalformedError("wrong type")
-        if len(value) > most:
+        if len(value) > max_items:
             raise MalformedError("wrong length")
         return tuple([check(item) for item in value])
 
@@ -113,7 +137,7 @@ def _dataclass_checker(kind: type[Any]) -> Check:
 
 
 def _bounded_checker(check: Check, bounds: list[Any]) -> Check:
-    """A checker with the tightest of the bounds; no loop at run time, for every field of every message passes here."""
+    """A checker of the tightest bounds, computed once: every field of every message passes through it."""
     between = [bound for bound in bounds if isinstance(bound, Between)]
     lengths = [bound for bound in bounds if isinstance(bound, Length)]
 
@@ -179,7 +203,7 @@ def _mapping_checker(hint: Any) -> Check:
 
 
 def _check_text(value: Any) -> str:
-    """Text that can travel: JSON may hold half a surrogate pair, which neither UTF-8 nor a journal takes."""
+    """Check a text; JSON may contain half a surrogate pair, which neither UTF-8 nor a journal can store."""
     if type(value) is not str:
         raise MalformedError("wrong type")
     if not value.isascii():
@@ -195,7 +219,7 @@ def _type_checker(kind: type[Any]) -> Check:
         return _check_text
 
     def exactly(value: Any) -> Any:
-        if type(value) is not kind:  # a bool is no count
+        if type(value) is not kind:  # not isinstance: a bool is no count
             raise MalformedError("wrong type")
         return value
 

@@ -1,4 +1,4 @@
-"""Endpoints: where one side listens and the others connect. Knows no transport, so that every verb may read it."""
+"""Network endpoints. Imports no transport library, so that every verb can import it quickly."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from dreamfleet.common.security.credentials import Credentials
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LOOPBACK = "127.0.0.1"
-SECURED_PREFIX = "tls/"  # how endpoints of a fleet with join files begin
-SECURED_ENDPOINT = "tls/0.0.0.0:7447"  # where such a coordinator listens by default
+SECURED_PREFIX = "tls/"  # prefix of a secured fleet's endpoints
+SECURED_ENDPOINT = "tls/0.0.0.0:7447"  # default of a secured coordinator
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[0-9a-fA-F:]+\]|[^:/\s]+):(\d{1,5})")
 
 
 @dataclass(frozen=True)
 class Network:
-    """Where to listen and what to connect to, endpoints such as `tcp/HOST:7447`, and as whom.
+    """Endpoints such as `tcp/HOST:7447` to listen on and to connect to, with credentials in a secured fleet.
 
-    `revoked_seats` are the seats that a secured router lets do nothing.
+    A secured router denies everything to the seats in `revoked_seats`.
     """
 
     listen: tuple[str, ...] = ()
@@ -39,11 +39,11 @@ class Network:
             check_secured(endpoint)
 
     def check_open(self, *, insecure: bool) -> None:
-        """`UsageError` where others could reach a router that lets everybody do all, and nobody said `insecure`."""
+        """`UsageError` if other hosts can reach an unsecured router, unless `insecure` allows that."""
         for endpoint in self.listen:
             if self.credentials is None and not insecure and not is_loopback(endpoint):
                 raise UsageError(
-                    f"{endpoint} can be reached from other hosts, and whoever reaches it owns the run: give --join "
+                    f"{endpoint} can be reached from other hosts, and anyone who reaches it owns the run: give --join "
                     "FILE (`dreamfleet access`, docs/security.md), or --insecure inside a network that you trust"
                 )
 
@@ -53,12 +53,12 @@ def _to_secured(endpoint: str) -> str:
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether an endpoint is of this host alone."""
+    """Whether only this host can reach an endpoint."""
     return is_loopback_host(endpoint.partition("/")[2].rpartition(":")[0].strip("[]"))
 
 
 def is_loopback_host(host: str) -> bool:
-    """Whether a name or an address is of this host alone."""
+    """Whether a name or an address is this host's loopback."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
@@ -69,21 +69,21 @@ def check_endpoint(endpoint: str) -> str:
     """Return `endpoint` if it is well formed, else raise `UsageError`."""
     found = _ENDPOINT.fullmatch(endpoint)
     if not found or int(found[3]) > 65535:
-        run = "" if "/" in endpoint or ":" in endpoint else "; a run's name is none: --help says where it stands"
-        raise UsageError(f"{endpoint!r} is no endpoint: write it as tcp/HOST:PORT, such as {DEFAULT_ENDPOINT}{run}")
+        hint = "" if "/" in endpoint or ":" in endpoint else "; a run's name goes elsewhere: see --help"
+        raise UsageError(f"{endpoint!r} is no endpoint: write it as tcp/HOST:PORT, such as {DEFAULT_ENDPOINT}{hint}")
     return endpoint
 
 
 def check_secured(endpoint: str) -> str:
-    """Return `endpoint` if Zenoh can connect to it, else raise `UsageError`: it checks no certificate for IPv6."""
+    """Return `endpoint` unless it is a TLS endpoint with an IPv6 address, which Zenoh cannot verify (`UsageError`)."""
     if endpoint.startswith(f"{SECURED_PREFIX}["):
-        raise UsageError(f"{endpoint} cannot be reached: Zenoh speaks TLS to names and IPv4 alone; give a name")
+        raise UsageError(f"{endpoint} cannot be reached: Zenoh supports TLS only for names and IPv4; give a name")
     return endpoint
 
 
 def parse_metrics_address(text: str) -> tuple[str, int]:
-    """Host and port of `--metrics-port`: a port of this host alone, or HOST:PORT; `UsageError` if it is neither."""
+    """Host and port of `--metrics-port`: PORT for loopback only, or HOST:PORT; `UsageError` for anything else."""
     host, _, port = text.rpartition(":")
     if not (port.isdecimal() and 0 < int(port) <= 65535):
-        raise UsageError(f"--metrics-port {text!r}: give a port such as 9108, or HOST:PORT for more than this host")
+        raise UsageError(f"--metrics-port {text!r}: give a port such as 9108, or HOST:PORT to serve other hosts too")
     return host.strip("[]") or LOOPBACK, int(port)

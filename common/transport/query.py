@@ -1,7 +1,7 @@
-"""Asking over Zenoh: one query, or several at once, and every reply to them.
+"""Zenoh queries that collect the replies of all responders.
 
-Left to itself, Zenoh asks only one of those who answer for a key if that one says that it knows all, and of several
-answers to one key tells the last: so whoever reaches the port could answer in a coordinator's place.
+By default Zenoh sends a query to one responder if that claims to be complete, and keeps only the last of several
+replies for a key: so anyone who reaches the port could answer in a coordinator's place.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from typing import Any
 
 import zenoh
 
-GRACE = 2.0  # seconds after which no end of replies is waited for
-MAX_WAITING_REPLIES = 65_536  # that wait to be looked at: an answerer without end fills no memory
-STOP_CHECK_SECONDS = 0.2  # seconds between looks at whether to stop
+GRACE = 2.0  # seconds after the timeout to wait for Zenoh's end-of-replies signal
+MAX_WAITING_REPLIES = 65_536  # further ones are dropped, so that a flood of replies cannot fill the memory
+STOP_CHECK_SECONDS = 0.2
 
 
 def query_every_responder(
     session: zenoh.Session, selectors: Iterable[str], timeout: float, payload: bytes | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[tuple[str, bytes]]:  # fmt: skip
-    """Every good reply of everybody who answers, as it comes within `timeout` seconds: whose it is, and its payload.
+    """Yield every good reply that comes within `timeout` seconds: the responder's Zenoh ID and its payload.
 
-    Nobody's answer keeps another's away. Whose it is, is the answering session's own word. `payload` is JSON.
+    No reply replaces another one. The ID is as the responder claims. The query's `payload` is JSON.
     """
-    everybody = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
-    for reply in _replies(session, selectors, timeout, payload, stopped, **everybody):
+    all_replies = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
+    for reply in _replies(session, selectors, timeout, payload, stopped, **all_replies):
         yield str(reply.replier_id and reply.replier_id.zid), reply.ok.payload.to_bytes()
 
 
@@ -35,18 +35,18 @@ def query_all(
     session: zenoh.Session, selectors: Iterable[str], timeout: float, payload: bytes | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> list[bytes]:  # fmt: skip
-    """The payloads of all good replies that come within `timeout` seconds; those that have come so far if `stopped`.
+    """The payloads of all good replies within `timeout` seconds, or until `stopped`, unordered.
 
-    `payload` is JSON. All queries are in flight together, and no order of the replies is promised.
+    All queries run concurrently. Their `payload` is JSON.
     """
     return [reply.ok.payload.to_bytes() for reply in _replies(session, selectors, timeout, payload, stopped)]
 
 
 def _replies(
     session: zenoh.Session, selectors: Iterable[str], timeout: float, payload: bytes | None,
-    stopped: Callable[[], bool], **how: Any,
+    stopped: Callable[[], bool], **options: Any,
 ) -> Iterator[Any]:  # fmt: skip
-    """Good replies as they come."""
+    """Yield good replies as they arrive."""
     replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
     done = object()
 
@@ -58,9 +58,9 @@ def _replies(
     left = 0
     for selector in selectors:
         handler = zenoh.handlers.Callback(take, lambda: replies.put(done), indirect=False)
-        session.get(selector, handler, timeout=timeout, payload=payload, encoding=encoding, **how)
+        session.get(selector, handler, timeout=timeout, payload=payload, encoding=encoding, **options)
         left += 1
-    deadline = monotonic() + timeout + GRACE  # Ctrl-C in Zenoh's thread can take an end of replies with it
+    deadline = monotonic() + timeout + GRACE  # Ctrl-C in Zenoh's thread can lose the end signal
     while left and not stopped() and monotonic() < deadline:
         try:
             reply = replies.get(timeout=STOP_CHECK_SECONDS)

@@ -1,4 +1,4 @@
-"""A router of its own, for coordinators and workers that cannot reach each other. It decides and keeps nothing."""
+"""A stand-alone router, for coordinators and workers that cannot reach each other directly. It has no state."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from dreamfleet.common.transport.network import Network
 from dreamfleet.common.transport.session import open_session
 
 log = logging.getLogger("dreamfleet.router")
-SUMMARY_INTERVAL = 60.0  # seconds from one line about the sessions to the next
+SUMMARY_INTERVAL = 60.0  # seconds between two log lines about the sessions
 
 
 def run_router(network: Network, stopped: Event) -> None:
-    """Pass messages on between whoever connects, until `stopped`; `ConnectionFailedError` if it cannot listen.
+    """Route messages between all connected sessions until `stopped`; `ConnectionFailedError` if it cannot listen.
 
-    Other routers in `network.connect` may start later, end and come back.
+    Other routers in `network.connect` may start later, stop and return.
     """
     with closing(open_session(network, timeout=None)) as session:
-        others = f"; linked to {', '.join(network.connect)} whenever it is there" if network.connect else ""
+        others = f"; linked to {', '.join(network.connect)} while it is reachable" if network.connect else ""
         log.info("listening on %s%s", ", ".join(network.listen), others,
                  extra={"facts": {"event": "begin", "listen": network.listen, "connect": network.connect}})  # fmt: skip
         while not stopped.wait(SUMMARY_INTERVAL):

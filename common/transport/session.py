@@ -1,7 +1,7 @@
-"""Zenoh sessions as this system opens them: configuration from ours, and the traps of the defaults closed.
+"""Opening Zenoh sessions with a safe configuration.
 
-Defaults listen on all interfaces with multicast scouting and gossip on; shared memory makes small messages ten times
-slower; 1000 sessions are the most. None of that stands here.
+Zenoh's defaults listen on all interfaces with multicast scouting and gossip, use shared memory, which makes small
+messages ten times slower, and allow 1000 sessions. The configuration here changes all of these.
 """
 
 from __future__ import annotations
@@ -27,28 +27,26 @@ from dreamfleet.common.security.credentials import SEATS, Credentials, derive_pa
 from dreamfleet.common.security.handshake import diagnose_connection
 from dreamfleet.common.transport.network import SECURED_PREFIX, Network, check_endpoint
 
-CONNECT_TIMEOUT = 3.0  # seconds that a link may take to open: TLS takes four round trips and more
-LEASE_MS = 4000  # announced by each side: after so long without a sign the other side drops its token
+CONNECT_TIMEOUT = 3.0  # seconds to open a link; TLS takes four or more round trips
+LEASE_MS = 4000  # after so long without a message the other side drops a session's liveliness tokens
 MAX_SESSIONS = 10_000
-MAX_RECEIVED = (
-    128 * 1024
-)  # bytes of a message: above it Zenoh itself lets go; the largest of the protocol is MAX_MESSAGE
-# Bytes of a message that a router passes on; the room beside the protocol's own limit is for messages that show as
-# too large in a coordinator's status. Zenoh drops what is larger silently.
+MAX_RECEIVED = 128 * 1024  # bytes of a message; for a larger one Zenoh closes the link
+# Bytes of a message that a router forwards; Zenoh drops larger ones silently. More than the protocol's MAX_MESSAGE, so
+# that a slightly oversize message still reaches the coordinator and is counted there.
 MAX_FORWARDED = 64 * 1024
 _NO_ROOM = "no network session can be opened: {}; give this host more room (ulimit -n, ulimit -u)"
 __all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_session", "zenoh_config"]
 
 
 def open_session(network: Network, *, timeout: float | None = CONNECT_TIMEOUT) -> zenoh.Session:
-    """A router where `network.listen` is given, else a client; `ConnectionFailedError` after `timeout` seconds.
+    """Open a session: a router if `network.listen` is set, else a client.
 
-    It is a `HandshakeRejectedError` where somebody listens who does not let this side in, and can be seen to.
+    `ConnectionFailedError` after `timeout` seconds; `HandshakeRejectedError` if the other side rejects this one.
 
-    Once open, a client reconnects by itself for ever, at any of its addresses. Zenoh's own first attempt never leaves
-    the first one, and blocks in native code where no signal is heard: so whoever wants to wait calls again, and the one
-    of several that answers is found before. A router does not block: without a `timeout` it opens at once, and links to
-    others as they come.
+    An open client reconnects for ever, to any of its addresses. But Zenoh's first attempt tries only the first
+    address, and blocks in native code, where signals are not handled. So the reachable one of several addresses is
+    found first, and callers that want to wait longer call again. A router without `timeout` opens at once and links
+    to others as they become reachable.
     """
     with _password_file(network) as dictionary:
         if network.listen or len(network.connect) < 2:
@@ -63,13 +61,15 @@ def open_session(network: Network, *, timeout: float | None = CONNECT_TIMEOUT) -
 
 
 def _reachable_first(network: Network, timeout: float) -> Network:
-    """The same with an address in front that answers; each may take an attempt, for one may swallow what it is sent."""
+    """The network with a reachable address first. Each gets a full attempt, as an address may drop packets."""
     deadline, pause = monotonic() + timeout, 0.1
     while True:
         for each in network.connect:
             try:
                 settings = zenoh_config(replace(network, connect=(each,)), CONNECT_TIMEOUT)
-                settings["connect"]["retry"]["period_init_ms"] = 0  # once: of a session that stays it would never rest
+                settings["connect"]["retry"]["period_init_ms"] = (
+                    0  # a single attempt; a session that stays must not have this setting
+                )
                 _open_zenoh(settings).close()  # type: ignore[no-untyped-call]
             except zenoh.ZError:
                 if monotonic() >= deadline and each == network.connect[-1]:
@@ -92,18 +92,18 @@ def _open_or_explain(network: Network, begin: Callable[[], zenoh.Session]) -> ze
             raise DreamfleetError(_NO_ROOM.format(_first_line(error))) from error
         raise _connection_error(network, error) from error
     except BaseException as error:
-        if type(error).__name__ != "PanicException":  # Zenoh's own threads or descriptors, of which there are none left
+        if type(error).__name__ != "PanicException":  # raised if Zenoh runs out of threads or descriptors
             raise
         raise DreamfleetError(_NO_ROOM.format(_first_line(error))) from error
 
 
 def zenoh_config(network: Network, timeout: float | None, dictionary: str | None = None) -> dict[str, Any]:
-    """Zenoh's own configuration for `network`; a stand-alone `zenohd` reads a router's as well.
+    """Zenoh's configuration for `network`; `zenohd` can read a router's too.
 
-    With credentials it holds their secrets; `dictionary` is a file of the users' passwords.
+    With credentials it contains their secrets; `dictionary` is the path of the users' password file.
     """
     router, credentials = bool(network.listen), network.credentials
-    room = connection_budget()  # else strangers who connect could keep a coordinator from writing a file
+    room = connection_budget()  # else strangers' connections could use up the descriptors for files
     bounds = {"max_sessions": min(MAX_SESSIONS, room * 3 // 4), "accept_pending": min(MAX_SESSIONS, room // 4)}
     transport: dict[str, Any] = {
         "unicast": bounds if router else {},
@@ -144,13 +144,13 @@ def zenoh_config(network: Network, timeout: float | None, dictionary: str | None
 
 
 def _listen_endpoints(network: Network) -> list[str]:
-    """Where a router listens, and for how long a secured one holds a stranger who says nothing."""
+    """A router's endpoints; a secured one closes connections whose handshake takes too long."""
     patience = "" if network.credentials is None else f"#tls_handshake_timeout_ms={int(1000 * CONNECT_TIMEOUT)}"
     return [each + patience for each in network.listen]
 
 
 def _tls(credentials: Credentials) -> dict[str, Any]:
-    """Both ends of a link show their certificates; where passwords are in force, only who listens does."""
+    """TLS settings: both ends show certificates; with passwords only the listening end does."""
     settings = {"root_ca_certificate_base64": _base64(credentials.ca), "enable_mtls": not credentials.uses_passwords,
                 "verify_name_on_connect": True, "close_link_on_expiration": True}  # fmt: skip
     if credentials.certificate:
@@ -171,7 +171,7 @@ def _password_config(credentials: Credentials, dictionary: str | None) -> dict[s
 
 @contextmanager
 def _password_file(network: Network) -> Iterator[str | None]:
-    """The file that Zenoh reads the users' passwords from as it opens, and nobody else; it is gone afterwards."""
+    """Yield the path of a private temporary file of the users' passwords, which Zenoh reads as it opens, or `None`."""
     secret = network.credentials.secret if network.credentials and network.listen else ""
     if not secret:
         yield None
@@ -204,14 +204,14 @@ def _first_line(error: BaseException) -> str:
     return str(error).splitlines()[0][:200]
 
 
-def enqueue_into(inbox: queue.SimpleQueue[Any], kind: str, most: int | None = None) -> Callable[[Any], None]:
-    """A Zenoh callback that only enqueues `(kind, event)`: a slow callback looks like a frozen process.
+def enqueue_into(inbox: queue.SimpleQueue[Any], kind: str, max_waiting: int | None = None) -> Callable[[Any], None]:
+    """A Zenoh callback that only enqueues `(kind, event)`, as a slow callback blocks the session.
 
-    Where `most` events wait already it drops: for what is said again until it is heard.
+    Drops events while `max_waiting` are queued, for messages that are repeated anyway.
     """
 
     def enqueue(event: Any) -> None:
-        if most is None or inbox.qsize() < most:
+        if max_waiting is None or inbox.qsize() < max_waiting:
             inbox.put((kind, event))
 
     return zenoh.handlers.Callback(enqueue, indirect=False)

@@ -12,8 +12,8 @@ from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.messages import ControlReply, HelloReply, HelloRequest, Intervals
-from dreamfleet.common.serialization.constraints import MAX_TEXT
 from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import MAX_TEXT
 from dreamfleet.coordinator.run.run import Run
 
 LONGEST_VERB = 60  # characters of a verb that nobody knows

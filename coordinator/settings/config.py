@@ -31,7 +31,7 @@ from dreamfleet.common.runs.records import (
     StageSettings,
 )
 from dreamfleet.common.runs.stages import Stage, stages_of
-from dreamfleet.common.serialization.constraints import Between, Count
+from dreamfleet.common.serialization.validation import Between, Count
 from dreamfleet.common.transport.network import parse_metrics_address
 from dreamfleet.coordinator.settings.schedule import check_schedule, split_first_stage
 from dreamfleet.coordinator.settings.task_options import (

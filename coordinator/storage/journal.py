@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.files.atomic_write import atomic_write, fsync_path, reporting_unwritable_folder
-from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count
+from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS, LONGEST_EPISODE, max_steps, to_finite
 from dreamfleet.common.runs import schema
@@ -189,7 +189,7 @@ class Journal:
     def classes(self) -> HostClasses:
         """What all results are of: read once, then counted with each."""
         if self._counted is None:
-            self._counted = count(self._read(class_counts_query()))
+            self._counted = count_results(self._read(class_counts_query()))
         return HostClasses.of(self._counted)
 
     def end(self, why: str) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.cli.config import Table, given, load
+from dreamfleet.common.cli.config import Table, configured_values, load
 from dreamfleet.common.cli.global_config import load_credentials
 from dreamfleet.common.cli.output import print_answer
 from dreamfleet.common.errors import UsageError
@@ -126,7 +126,7 @@ def _warn_ignored_settings(args: argparse.Namespace, stored: RunFolder) -> None:
     """A file serves many runs: what it says of another one is no error, but is not silently passed over either."""
     from dreamfleet.coordinator.settings.config import config_values
 
-    said = given(RunConfig, "run", args.sources["file"], args.sources["environment"])
+    said = configured_values(RunConfig, "run", args.sources["file"], args.sources["environment"])
     said = {**(find_preset(said.pop("preset")) if "preset" in said else {}), **said}
     given_stages, own_stages = find_schedule(said.pop("schedule", None), args.sources["file"]), said.pop("stages", ())
     named, stages = split_first_stage(own_stages if given_stages is None else given_stages)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.artifacts.car_racing_variants import Variant
-from dreamfleet.common.cli.config import add_flags, given, load
+from dreamfleet.common.cli.config import add_flags, configured_values, load
 from dreamfleet.common.cli.global_config import add_global_flags, load_credentials
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
@@ -113,7 +113,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
 def _common_run_flags(args: argparse.Namespace) -> tuple[str, ...]:
     """What a round's coordinator is told before `--run-flags`: the file, and the preset where nobody names one."""
     sources = args.sources
-    named = "preset" in given(RunConfig, "run", sources["file"], sources["environment"])
+    named = "preset" in configured_values(RunConfig, "run", sources["file"], sources["environment"])
     file = ("--config", str(args.config)) if args.config else ()
     return (*file, *(() if named else ("--preset", "dream")))
 

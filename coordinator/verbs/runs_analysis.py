@@ -191,6 +191,7 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
+    from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING
     from dreamfleet.coordinator.analysis.learning import PAPER_SCORES, LearningCurve
     from dreamfleet.coordinator.analysis.plot import plot_learning
 

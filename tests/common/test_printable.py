@@ -13,14 +13,14 @@ from dreamfleet.common.printable import format_setting, plural, printable
         ("\u202eback", "\\u202eback"),
     ],
 )
-def test_what_a_terminal_would_obey_is_written_out(text, shown):
+def test_control_characters_are_escaped(text, shown):
     assert printable(text) == shown
 
 
-def test_of_one_there_is_one():
-    told = plural(1, "seed"), plural(1000, "seed"), plural(1.0, "minute"), plural(1.5, "minute")
-    assert (*told, plural(2, "batch", "batches")) == ("1 seed", "1,000 seeds", "1 minute", "1.5 minutes", "2 batches")
+def test_plurals():
+    texts = plural(1, "seed"), plural(1000, "seed"), plural(1.0, "minute"), plural(1.5, "minute")
+    assert (*texts, plural(2, "batch", "batches")) == ("1 seed", "1,000 seeds", "1 minute", "1.5 minutes", "2 batches")
 
 
-def test_settings_are_told_as_people_write_them():
+def test_settings_are_formatted():
     assert [format_setting(each) for each in (True, False, ("numpy", "cma"), 0.1)] == ["yes", "no", "numpy, cma", "0.1"]

@@ -68,7 +68,7 @@ def test_each_may_do_what_its_role_says_and_the_run_is_none_the_worse(processes,
                         for who in ("first", "viewer", "operator")}  # fmt: skip
             kept = []
             for who, session in sessions.items():
-                for kind in (keys.result, keys.beat, keys.upload):
+                for kind in (keys.result, keys.heartbeat, keys.upload):
                     session.put(kind("safe", foreign), garbage)
                 session.put(keys.job("safe", own), encode(MSGPACK["job"]))
                 session.put(keys.event_status("safe"), garbage)
@@ -297,6 +297,6 @@ def test_a_router_of_its_own_holds_everybody_to_the_same_rules(processes, access
             replies = session.get(keys.control("far", "resume"), timeout=DEADLINE if may else 2)
             assert any(reply.ok for reply in replies) == may
     code, _, err = processes.call("pause", "far", "--join", access.path("viewer"), "--connect", endpoint)
-    assert (code, "needs one whose role is operator" in err) == (1, True)
+    assert (code, "this needs operator" in err) == (1, True)
     work(processes, access, endpoint, "second", name="far").wait_for("joined")
     assert coordinator.finish()[0] == 0

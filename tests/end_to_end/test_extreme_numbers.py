@@ -15,7 +15,7 @@ def test_extreme_numbers_pause_the_run_with_their_reason_and_it_can_be_continued
     processes.worker("--task", task)
     said = coordinator.wait_for("paused: ")
     assert "failed on one worker" in said
-    assert "which must lie within" in said or "steps, and may have" in said
+    assert "which must lie within" in said or "steps, more than" in said
     assert processes.status()["state"] == "paused"
     assert processes.call("stop", "test", "--connect", processes.endpoint)[0] == 0
     assert coordinator.finish()[0] == 130

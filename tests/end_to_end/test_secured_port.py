@@ -120,7 +120,7 @@ def test_strangers_take_no_descriptor_for_good(processes, access, endpoint, rand
     coordinator = begin(processes, access, endpoint, random_bundle, "--generations", 1,
                         inside=("bash", "-c", 'ulimit -n 120; exec "$@"', "-"))  # fmt: skip
     before, held = open_files(coordinator), hold(address(endpoint), 400)
-    coordinator.wait_for("prove nothing")
+    coordinator.wait_for("are unauthenticated")
     for link in held:
         link.close()
     until(lambda: open_files(coordinator) <= before, "descriptors do not come back")

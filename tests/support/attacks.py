@@ -142,7 +142,7 @@ class Attacker:
             numbering=guest.numbering, seen=guest.seen, capacity=guest.capacity, slots=guest.capacity, queued=(),
             unacked=(), running=running,
         )  # fmt: skip
-        self.session.put(keys.beat(RUN, guest.identity), encode(beat))
+        self.session.put(keys.heartbeat(RUN, guest.identity), encode(beat))
 
     def report(self, worker, *results, fingerprint=None):
         if self.head is not None:

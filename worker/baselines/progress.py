@@ -9,9 +9,8 @@ from statistics import fmean
 from typing import Annotated, Any
 
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.common.serialization.constraints import Count, Length
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import Count, Length, MalformedError, from_plain
 
 
 @dataclass(frozen=True)

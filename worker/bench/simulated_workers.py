@@ -109,7 +109,7 @@ def _handle_and_send(
         if now >= worker.beat_at:
             worker.beat_at = now + run.intervals.beat
             active.add(identity)
-            session.put(keys.beat(run.run, identity), encode(worker.beat()), encoding=encoding(Heartbeat))
+            session.put(keys.heartbeat(run.run, identity), encode(worker.beat()), encoding=encoding(Heartbeat))
         if identity not in active:
             continue
         for results in worker.outbox.due(now):

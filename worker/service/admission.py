@@ -17,8 +17,7 @@ from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder, encode_json
 from dreamfleet.common.protocol.messages import HelloReply, HelloRequest, Intervals, TaskSpec
-from dreamfleet.common.serialization.constraints import MAX_TEXT
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import MAX_TEXT, MalformedError, from_plain
 from dreamfleet.common.transport.query import query_all, query_every_responder
 from dreamfleet.worker.tasks.registry import check_task_allowed
 

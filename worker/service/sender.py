@@ -102,7 +102,7 @@ class CoordinatorSender:
             drawn_by=slots.drawn_by,
             host_class=self._host_class(slots),
         )
-        self._publish(keys.beat(self._admission.run, self._identity), beat)
+        self._publish(keys.heartbeat(self._admission.run, self._identity), beat)
 
     def _host_class(self, slots: SlotPool) -> str | None:
         """The host class, if it is known and the coordinator supports host classes."""

@@ -22,15 +22,15 @@ def test_a_shifted_pedal_gives_gas_where_its_output_is_zero():
         np.testing.assert_allclose(shifted.to_action(logits(0.0, pedal)), [0, gas, brake], atol=1e-6)
 
 
-def test_a_brake_that_shares_its_output_feels_every_step_of_it():
-    """The plain brake is flat wherever its own output is below zero: no small step finds it."""
+def test_a_brake_with_a_shared_output_responds_to_every_change():
+    """By default the brake is constant while its output is below zero, so small changes have no effect there."""
     near = [np.array([0, pedal], np.float32) for pedal in (0.3, 0.31, -0.3, -0.31)]
     assert len({ONE_PEDAL.to_action(each).tobytes() for each in near}) == 4
     flat = [np.array([0, 0, brake], np.float32) for brake in (-0.3, -0.31)]
     assert np.array_equal(*(STEERING_GAS_BRAKE.to_action(each) for each in flat))
 
 
-def test_the_largest_output_of_choices_is_done_and_of_equals_the_first():
+def test_the_choice_of_the_largest_output_wins_and_the_first_of_equal_ones():
     five = Variant(actions="discrete").controls
     assert (five.outputs, five.actions) == (5, 3)
     assert five.to_action(np.array([9, -1, 0, 9, 3], np.float32)).tolist() == [0, 0, 0]
@@ -42,7 +42,7 @@ def test_the_largest_output_of_choices_is_done_and_of_equals_the_first():
     assert not five.to_outputs(np.array([[0.5, 0, 0]], np.float32)).any(), "what is no choice was none"
 
 
-def test_many_actions_are_each_the_one_alone():
+def test_a_batch_of_actions_equals_single_actions():
     many = np.random.default_rng(0).normal(size=(256, 2)).astype(np.float32)
     together = ONE_PEDAL.to_action(many)
     assert together.shape == (256, 3)
@@ -50,7 +50,7 @@ def test_many_actions_are_each_the_one_alone():
     assert all(np.array_equal(ONE_PEDAL.to_action(row), action) for row, action in zip(many, together, strict=True))
 
 
-def test_actions_go_back_to_what_a_controller_gives():
+def test_actions_convert_back_to_outputs():
     given = np.array([[0.25, -0.5], [-1.0, 0.75], [0.0, 0.0]], np.float32)
     np.testing.assert_allclose(
         ONE_PEDAL.to_outputs(ONE_PEDAL.to_action(np.arctanh(given * 0.9))), given * 0.9, atol=1e-6
@@ -59,7 +59,7 @@ def test_actions_go_back_to_what_a_controller_gives():
     assert STEERING_GAS_BRAKE.to_outputs(action) is action
 
 
-def test_an_action_has_an_output_of_its_own_unless_it_says_otherwise():
+def test_each_action_has_its_own_output_by_default():
     assert (STEERING_GAS_BRAKE.outputs, STEERING_GAS_BRAKE.actions) == (3, 3)
     assert Continuous.between([-1, -2], [1, 2]).output_indices == ()
     logits = np.random.default_rng(0).normal(size=3).astype(np.float32)

@@ -33,7 +33,7 @@ def test_equal_parts_give_equal_files(random_bundle, tmp_path):
     assert again.sha256 == random_bundle.sha256 == hash_file(random_bundle.path)
 
 
-def test_what_ships_is_whole_and_small():
+def test_shipped_bundles_are_valid_and_small():
     assert "tiny" in shipped_bundles()
     for name, path in shipped_bundles().items():
         bundle = find_bundle(name)
@@ -103,7 +103,7 @@ def rewrite(path, change):
         (of_tomorrow, "bundle format 2; this version reads 1"),
     ],
 )
-def test_damage_is_one_clear_line(random_bundle, tmp_path, damage, said):
+def test_damage_is_a_one_line_error(random_bundle, tmp_path, damage, said):
     path = tmp_path / "copy.zip"
     shutil.copyfile(random_bundle.path, path)
     damage(path)
@@ -122,13 +122,13 @@ def without_nodes(part):
 @pytest.mark.parametrize(
     "change", [lambda part: b"", without_nodes, lambda part: onnx.ModelProto().SerializeToString()]
 )
-def test_an_empty_graph_is_refused_by_its_name(random_bundle, tmp_path, name, change):
+def test_an_empty_graph_is_refused_with_its_name(random_bundle, tmp_path, name, change):
     parts = parts_of(random_bundle)
     with pytest.raises(BundleError, match=rf"b\.zip: {name} is an empty graph; .*build it again"):
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, name: change(parts[name])})
 
 
-def test_a_bundle_says_how_many_recorded_states_it_has(random_bundle, tmp_path):
+def test_recorded_states_are_counted(random_bundle, tmp_path):
     assert random_bundle.recorded_count == 0
     with pytest.raises(BundleError, match="holds no recorded states"):
         random_bundle.read_recorded()
@@ -138,14 +138,14 @@ def test_a_bundle_says_how_many_recorded_states_it_has(random_bundle, tmp_path):
     assert np.array_equal(some.read_recorded(), kept)
 
 
-def test_a_missing_bundle_names_those_that_ship(tmp_path):
+def test_the_error_for_a_missing_bundle_lists_the_shipped_ones(tmp_path):
     with pytest.raises(BundleError, match=r"no bundle 'huge'.*tiny"):
         find_bundle("huge")
     with pytest.raises(BundleError, match="no bundle at"):
         Bundle.open(tmp_path / "absent.zip")
 
 
-def test_the_store_finds_what_ships_and_what_was_downloaded(random_bundle, tmp_path):
+def test_the_store_finds_shipped_and_downloaded_bundles(random_bundle, tmp_path):
     store = BundleStore(tmp_path)
     shipped = find_bundle("tiny")
     assert store.find(shipped.sha256).path == shipped.path
@@ -173,12 +173,12 @@ def test_a_damaged_cached_copy_is_fetched_again(random_bundle, tmp_path):
     assert store.find(random_bundle.sha256) is None
 
 
-def test_other_weights_are_another_bundle(random_bundle, tmp_path):
+def test_other_weights_give_another_hash(random_bundle, tmp_path):
     assert write_random_bundle(tmp_path / "other.zip", seed=1).sha256 != random_bundle.sha256
 
 
 @pytest.mark.parametrize("name", ["", "abc", "../" * 20 + "etc0", "AB" * 32, "ab" * 31 + "/x"])
-def test_what_is_no_hash_is_never_part_of_a_path(tmp_path, name):
+def test_an_invalid_hash_never_becomes_a_path(tmp_path, name):
     store = BundleStore(tmp_path)
     with pytest.raises(BundleError, match="no hash of a bundle"):
         store.find(name)

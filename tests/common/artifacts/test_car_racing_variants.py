@@ -23,14 +23,14 @@ from dreamfleet.common.errors import UsageError
         '{"decide_every": 2, "feedback": "last", "pedals": "one", "time_cost": 1.0}',
     ],
 )
-def test_a_variant_is_its_options_and_back(options):
+def test_options_round_trip(options):
     variant = Variant.from_json(options)
     assert variant.options == options
     assert Variant.from_json(variant.options) == variant
     assert (variant.is_default, variant.version) == (False, 3 if variant.without_costs.is_default else 2)
 
 
-def test_the_plain_way_is_named_by_nothing():
+def test_the_default_variant_has_empty_options():
     assert (
         Variant.from_json("")
         == Variant.from_values({"pedals": "two", "decide_every": 1, "time_cost": 0})
@@ -45,7 +45,7 @@ def test_the_plain_way_is_named_by_nothing():
     assert DEFAULT_VARIANT.controls == STEERING_GAS_BRAKE
 
 
-def test_with_half_pedals_gas_and_brake_are_half_down_at_nothing():
+def test_half_pedals_press_gas_and_brake_halfway_at_zero():
     assert Variant(pedals="half").controls == STEERING_AND_HALVES
     outputs = np.array([[0, 0, 0], [9, 9, 9], [-9, -9, -9]], np.float32)
     assert Variant(pedals="half").controls.to_action(outputs).round(4).tolist() == [
@@ -56,7 +56,7 @@ def test_with_half_pedals_gas_and_brake_are_half_down_at_nothing():
     assert Variant(pedals="half", feedback="last").extra_features == 6
 
 
-def test_a_whole_number_is_written_as_the_number_that_it_means():
+def test_equal_numbers_give_equal_options():
     assert (
         Variant.from_values({"time_cost": 2}).options
         == '{"time_cost": 2.0}'
@@ -64,31 +64,31 @@ def test_a_whole_number_is_written_as_the_number_that_it_means():
     )
 
 
-def test_a_variant_can_be_said_as_a_run_is_told_it():
+def test_option_texts_are_name_value_pairs():
     assert Variant(pedals="one", decide_every=4, time_cost=0.25).option_texts == (
         "pedals=one", "decide_every=4", "time_cost=0.25",
     )  # fmt: skip
     assert DEFAULT_VARIANT.option_texts == ()
 
 
-def test_what_candidates_pay_is_no_part_of_how_they_drive():
+def test_penalties_do_not_change_the_controls():
     assert Variant(time_cost=0.5, offroad_cost=2.0).without_costs == DEFAULT_VARIANT
     assert Variant(pedals="one", time_cost=0.5).without_costs == Variant(pedals="one")
 
 
-def test_each_output_of_a_controller_is_seen_twice():
+def test_feedback_adds_two_features_an_output():
     assert Variant(feedback="last").extra_features == 6
     assert Variant(feedback="last", pedals="one").extra_features == 4
     assert Variant(feedback="last", actions="discrete").extra_features == 10
 
 
-def test_an_unknown_option_names_those_that_there_are():
+def test_the_error_for_an_unknown_option_lists_the_known_ones():
     with pytest.raises(
         UsageError, match="car-racing knows no option gears, pedal: known are actions, pedals, pedal_shift, "
-    ) as told:
+    ) as raised:
         Variant.from_json('{"pedal": "one", "gears": 5}')
-    assert all(name in str(told.value) for name in OPTION_HELP)
-    assert "\n" not in str(told.value)
+    assert all(name in str(raised.value) for name in OPTION_HELP)
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -103,20 +103,20 @@ def test_an_unknown_option_names_those_that_there_are():
         ("offroad_cost", [-0.1, 101, float("inf"), "1", False]),
     ],
 )
-def test_a_value_out_of_its_range_is_refused_with_what_it_must_be(name, values):
+def test_the_error_for_a_value_out_of_range_describes_the_range(name, values):
     for value in values:
-        with pytest.raises(UsageError) as told:
+        with pytest.raises(UsageError) as raised:
             Variant.from_json(json.dumps({name: value}))
-        assert f"car-racing's {name} must be {OPTION_HELP[name]}, not {value!r}" == str(told.value)
+        assert f"car-racing's {name} must be {OPTION_HELP[name]}, not {value!r}" == str(raised.value)
 
 
 @pytest.mark.parametrize("options", ["{", "[1]", "7", '"one"'])
-def test_options_that_are_no_object_are_refused(options):
+def test_options_must_be_a_json_object(options):
     with pytest.raises(UsageError, match="must be a JSON object"):
         Variant.from_json(options)
 
 
-def test_a_shift_that_leaves_no_pedal_is_refused():
+def test_a_pedal_shift_is_bounded():
     assert Variant(pedals="one", pedal_shift=-1).controls.shift == (0, -1, 1)
     for pedals in ("one", "half"):
         with pytest.raises(UsageError, match="discrete with pedals=two"):

@@ -16,7 +16,7 @@ def test_the_papers_controller_has_867_parameters():
     assert ControllerShape(features=32 + 256).size == 867
 
 
-def test_a_file_brings_everything_back(tmp_path):
+def test_a_file_round_trips(tmp_path):
     path = tmp_path / "c.npz"
     one = controller(np.arange(15) / 7)
     one.save(path)
@@ -31,19 +31,19 @@ def test_a_file_brings_everything_back(tmp_path):
     assert one.sha256 == other.sha256
 
 
-def test_zero_parameters_drive_straight_on_at_half_gas():
+def test_zero_parameters_drive_straight_at_half_gas():
     assert np.array_equal(
         act(SHAPE, np.zeros(15, np.float32), np.ones(4, np.float32), STEERING_GAS_BRAKE), [0.0, 0.5, 0.0]
     )
 
 
-def test_weights_come_row_by_row_then_biases():
+def test_weights_are_row_by_row_then_biases():
     ((weights, biases),) = SHAPE.unpack(np.arange(15, dtype=np.float32))
     assert np.array_equal(weights[1], [4, 5, 6, 7])
     assert np.array_equal(biases, [12, 13, 14])
 
 
-def test_a_hidden_layer_lies_between():
+def test_a_hidden_layer():
     shape = ControllerShape(features=2, hidden=4)
     assert shape.size == 4 * 3 + 3 * 5
     parameters = np.random.default_rng(0).normal(size=27).astype(np.float32)
@@ -55,13 +55,13 @@ def test_a_hidden_layer_lies_between():
 
 
 @pytest.mark.parametrize("parameters", [np.zeros(14), np.full(15, np.nan), np.full(15, np.inf)])
-def test_what_does_not_fit_is_refused(parameters):
+def test_parameters_that_do_not_fit_are_refused(parameters):
     with pytest.raises(ControllerError):
         controller(parameters)
 
 
 @pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 and then nothing"])
-def test_a_damaged_file_is_one_clear_line(tmp_path, content):
+def test_a_damaged_file_is_a_one_line_error(tmp_path, content):
     path = tmp_path / "c.npz"
     path.write_bytes(content)
     with pytest.raises(ControllerError, match="is not a controller file") as error:

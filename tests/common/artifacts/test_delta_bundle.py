@@ -1,4 +1,4 @@
-"""A bundle that ships without the parts that another one has, and is put together where it is wanted."""
+"""Delta bundles: shipped without the parts of their base, and rebuilt."""
 
 import pytest
 
@@ -11,7 +11,7 @@ from tests.support.bundles import states, write_random_bundle
 
 @pytest.fixture
 def shelf(tmp_path, monkeypatch):
-    """A folder of what ships: `base` whole, and `able` without what is equal there."""
+    """A folder of shipped bundles: `base` whole, and `able` as a delta to it."""
     folder = tmp_path / "ships"
     folder.mkdir()
     monkeypatch.setattr(bundle_store, "pretrained_folder", lambda: folder)
@@ -25,7 +25,7 @@ def shelf(tmp_path, monkeypatch):
     return folder, whole
 
 
-def test_it_is_the_bundle_that_was_frozen_to_the_byte(shelf):
+def test_rebuilding_gives_the_original_bundle_to_the_byte(shelf):
     folder, whole = shelf
     assert (folder / "able.lean").stat().st_size < whole.path.stat().st_size / 3
     found = find_bundle("able")
@@ -36,12 +36,12 @@ def test_it_is_the_bundle_that_was_frozen_to_the_byte(shelf):
     assert BundleStore(bundle_store.default_cache()).find(whole.sha256).path == found.path
 
 
-def test_a_controller_finds_its_world_model_by_the_hash(shelf):
+def test_a_controller_finds_its_world_model_by_hash(shelf):
     _, whole = shelf
     assert BundleStore(bundle_store.default_cache()).find(whole.sha256).sha256 == whole.sha256
 
 
-def test_a_damaged_copy_in_the_cache_is_put_together_again(shelf):
+def test_a_damaged_cached_copy_is_rebuilt(shelf):
     _, whole = shelf
     path = find_bundle("able").path
     path.write_bytes(b"damaged")
@@ -58,7 +58,7 @@ def test_a_damaged_copy_in_the_cache_is_put_together_again(shelf):
         lambda folder: write_random_bundle(folder / "base.zip", seed=9),
     ],
 )
-def test_what_is_damaged_or_lacks_the_other_one_is_said(shelf, harm):
+def test_a_damaged_delta_or_missing_base_is_an_error(shelf, harm):
     folder, _ = shelf
     harm(folder)
     with pytest.raises(BundleError) as raised:
@@ -66,18 +66,18 @@ def test_what_is_damaged_or_lacks_the_other_one_is_said(shelf, harm):
     assert "\n" not in str(raised.value)
 
 
-def test_names_of_all_that_ship_are_told(shelf):
+def test_shipped_names_include_deltas(shelf):
     with pytest.raises(BundleError, match="one that ships: base, able"):
         find_bundle("nobody")
 
 
-def test_a_cache_that_takes_nothing_is_said(shelf, tmp_path, monkeypatch):
+def test_an_unwritable_cache_is_an_error(shelf, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "file"))
     with pytest.raises(BundleError, match="cannot write in"):
         find_bundle("able")
 
 
-def test_what_ships_lean_is_whole():
+def test_shipped_deltas_can_be_rebuilt():
     for name in bundle_store.shipped_names():
         assert isinstance(find_bundle(name), Bundle)

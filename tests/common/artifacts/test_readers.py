@@ -1,4 +1,4 @@
-"""Files that people pass around, damaged in thousands of ways: each is read, or is one line."""
+"""Files from untrusted sources, damaged in thousands of ways: each is read, or is a one-line error."""
 
 import hashlib
 import io
@@ -48,7 +48,7 @@ def bundle(tmp_path):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", [(), (0,), (5,), (2, 3), (4, 1, 2)])
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_an_array_comes_back_as_numpy_reads_it(kind, shape, order):
+def test_arrays_parse_as_in_numpy(kind, shape, order):
     array = np.asarray(np.arange(np.prod(shape, dtype=int)).reshape(shape).astype(kind), order=order)
     ours, theirs = parse_array(npy(array)), np.load(io.BytesIO(npy(array)))
     assert (ours.dtype, ours.shape, ours.flags.f_contiguous) == (theirs.dtype, theirs.shape, theirs.flags.f_contiguous)
@@ -78,7 +78,7 @@ def header(text):
         b"\x93NUMPY",
     ],
 )
-def test_an_array_of_anything_else_is_refused(data):
+def test_other_arrays_are_refused(data):
     with pytest.raises(DamagedArchiveError, match=r"^it "):
         parse_array(data)
 
@@ -88,7 +88,7 @@ def bomb(size):
 
 
 def declaring(size):
-    """A member that says it is longer than it is."""
+    """A member that is shorter than declared."""
     data = bytearray(packed({"a.npy": npy(np.zeros(4))}, zipfile.ZIP_DEFLATED))
     data[data.index(b"PK\1\2") + 24 :][:4] = struct.pack("<I", size)
     place = data.index(b"PK\1\2") + 24
@@ -122,12 +122,12 @@ def commented():
 @pytest.mark.parametrize(
     ("data", "says"),
     [
-        (bomb(50 << 20), "unpacks to 50 MiB, 1 at most"),
+        (bomb(50 << 20), "unpacks to 50 MiB, and at most 1"),
         (declaring(2**31), "unpacks to 2048 MiB"),
-        (declaring(1000), "not as long as it says|bad zip|CRC"),
+        (declaring(1000), "declared length|bad zip|CRC"),
         (encrypted(), "is encrypted"),
         (packed({"a.npy": npy(np.zeros(4))}, zipfile.ZIP_BZIP2), "unknown compression method"),
-        (packed({f"{number}.npy": b"" for number in range(65)}), "65 members, 64 at most"),
+        (packed({f"{number}.npy": b"" for number in range(65)}), "65 members, and at most 64"),
         (packed({f"{number}.npy": b"" for number in range(5000)}), "directory is too long"),
         (packed({"b.npy": npy(np.zeros(4))}), "holds no a"),
         (commented(), "does not end as an archive"),
@@ -139,24 +139,24 @@ def test_an_archive_is_bounded_before_it_is_read(data, says, watched):
         read_arrays(data, LIMITS, ["a"])
 
 
-def test_two_members_of_one_name_are_refused():
+def test_two_members_of_the_same_name_are_refused():
     with pytest.raises(DamagedArchiveError, match="two of its members have the same name"):
         read_arrays(twice(), LIMITS)
 
 
-def test_a_part_that_unpacks_to_much_more_is_refused(bundle, watched):
+def test_a_zip_bomb_is_refused(bundle, watched):
     with (
         zipfile.ZipFile(bundle, "a", zipfile.ZIP_DEFLATED) as archive,
         archive.open("weights.safetensors", "w") as part,
     ):
         for _ in range(300):
             part.write(bytes(1 << 20))
-    with pytest.raises(BundleError, match="it unpacks to 300 MiB, 256 at most"):
+    with pytest.raises(BundleError, match="it unpacks to 300 MiB, and at most 256"):
         Bundle.open(bundle)
 
 
 def damage(whole, path, watched, error, load, seed):
-    """Some of so many damaged files are read all the same, and the others are one line each."""
+    """Damage a file many times: each version is read, or is a one-line error."""
     read = 0
     for data in archives(whole.read_bytes(), COUNT, seed=seed):
         path.write_bytes(data)
@@ -211,7 +211,7 @@ def test_damaged_task_options(watched):
 
 @pytest.fixture
 def strange(tmp_path):
-    """Names under which there is no regular file that can be read."""
+    """Paths that are not readable regular files."""
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     (tmp_path / "empty").touch()
@@ -221,7 +221,7 @@ def strange(tmp_path):
     return [*names, tmp_path / ("x" * 5000), tmp_path / "a\0b", tmp_path / "half\ud800", tmp_path / "empty" / "below"]
 
 
-def test_what_is_no_regular_file_is_one_line(strange, watched, tmp_path):
+def test_anything_but_a_regular_file_is_a_one_line_error(strange, watched, tmp_path):
     from dreamfleet.common.runs.lookup import find_controller
 
     for path in strange:
@@ -233,7 +233,7 @@ def test_what_is_no_regular_file_is_one_line(strange, watched, tmp_path):
             assert not watched.read(UsageError, read_toml, path, [])
 
 
-def test_a_cache_entry_that_is_anything_else_is_none(tmp_path, bundle, watched):
+def test_a_cache_entry_that_is_not_a_regular_file_is_ignored(tmp_path, bundle, watched):
     sha256 = hashlib.sha256(bundle.read_bytes()).hexdigest()
     store, entry = BundleStore(tmp_path / "cache"), tmp_path / "cache" / "bundles" / f"{sha256}.zip"
     entry.parent.mkdir(parents=True)
@@ -252,7 +252,7 @@ def test_a_cache_entry_that_is_anything_else_is_none(tmp_path, bundle, watched):
 
 
 @pytest.mark.parametrize("ending", ["part", "lock"])
-def test_no_link_in_a_cache_leads_to_another_file(tmp_path, ending):
+def test_links_in_a_cache_are_not_followed(tmp_path, ending):
     (tmp_path / "cache" / "bundles").mkdir(parents=True)
     own = tmp_path / "own"
     own.write_text("mine")
@@ -264,7 +264,7 @@ def test_no_link_in_a_cache_leads_to_another_file(tmp_path, ending):
     assert own.read_text() == "mine"
 
 
-def test_a_cache_that_is_a_file_is_one_line(tmp_path):
+def test_a_cache_that_is_a_file_is_a_one_line_error(tmp_path):
     (tmp_path / "cache").touch()
     store = BundleStore(tmp_path / "cache")
     assert store.find("ab" * 32) is None
@@ -273,7 +273,7 @@ def test_a_cache_that_is_a_file_is_one_line(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a user without an entry")
-def test_a_user_without_a_home_is_told_what_to_set(monkeypatch):
+def test_the_error_without_a_home_folder_names_the_variable(monkeypatch):
     for name in ("HOME", "DREAMFLEET_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(os, "getuid", lambda: 2**31 - 7)

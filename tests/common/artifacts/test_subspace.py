@@ -1,4 +1,4 @@
-"""A subspace: what it holds, how it is kept, and what its coordinates stand for."""
+"""Subspaces: contents, storage, and coordinates."""
 
 import json
 
@@ -39,7 +39,7 @@ def test_coordinates_are_weights_of_the_features(subspace, shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_it_begins_where_the_search_does_and_a_row_does_not_depend_on_others(subspace, shape):
+def test_zero_coordinates_are_the_origin_and_rows_are_independent(subspace, shape):
     space, random = SearchSpace(subspace, shape), np.random.default_rng(3)
     origin, coordinates = random.normal(size=shape.size), random.normal(size=(9, space.dimension))
     assert (space.lift(origin, np.zeros(space.dimension)) == origin).all()
@@ -47,7 +47,7 @@ def test_it_begins_where_the_search_does_and_a_row_does_not_depend_on_others(sub
     assert all((space.lift(origin, each) == row).all() for each, row in zip(coordinates, together, strict=True))
 
 
-def test_it_is_kept_whole_as_text_and_as_a_file(subspace, tmp_path):
+def test_text_and_file_round_trip(subspace, tmp_path):
     path = tmp_path / "few.npz"
     subspace.save(path, {"drives": 3})
     for again in (Subspace.from_text(subspace.text), Subspace.load(path)):
@@ -55,7 +55,7 @@ def test_it_is_kept_whole_as_text_and_as_a_file(subspace, tmp_path):
         assert (again.names, again.bundle, again.sha256) == (subspace.names, subspace.bundle, subspace.sha256)
 
 
-def test_another_number_is_another_subspace(subspace):
+def test_other_numbers_give_another_hash(subspace):
     moved = subspace.weights.copy()
     moved[0, 0] = np.nextafter(moved[0, 0], 9, dtype=np.float32)
     assert Subspace(moved, subspace.offsets, subspace.names, subspace.bundle).sha256 != subspace.sha256
@@ -82,7 +82,7 @@ def test_another_number_is_another_subspace(subspace):
         ({"about": {"format": "x" * 5000}}, "another format"),
     ],
 )
-def test_what_is_no_subspace_is_one_line(subspace, tmp_path, changes, why):
+def test_an_invalid_subspace_is_a_one_line_error(subspace, tmp_path, changes, why):
     about = {"format": 1, "names": ["a", "b", "c"], "bundle": "ab"} | changes.pop("about", {})
     arrays = {"weights": subspace.weights, "offsets": subspace.offsets, **changes}
     path = tmp_path / "bad.npz"
@@ -93,7 +93,7 @@ def test_what_is_no_subspace_is_one_line(subspace, tmp_path, changes, why):
 
 
 @pytest.mark.parametrize("content", [None, b"", b"rubbish", b"PK\x03\x04"])
-def test_what_is_no_archive_is_one_line(tmp_path, content):
+def test_an_invalid_archive_is_a_one_line_error(tmp_path, content):
     path = tmp_path / "bad.npz"
     if content is not None:
         path.write_bytes(content)
@@ -102,6 +102,6 @@ def test_what_is_no_archive_is_one_line(tmp_path, content):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", "nothing", '{"weights": "é"}', "[" * 100_000])
-def test_a_damaged_fact_is_told_as_such(text):
+def test_damaged_text_is_an_error(text):
     with pytest.raises(ValueError):  # noqa: PT011 - who keeps it says which file it is
         Subspace.from_text(text)

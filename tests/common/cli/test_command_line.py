@@ -1,4 +1,4 @@
-"""The command line itself: verbs found, loaded alone, and slips of the hand answered."""
+"""The command line: finding and loading verbs, help, and errors for typing mistakes."""
 
 import re
 import subprocess
@@ -28,7 +28,7 @@ def points(*more):
         (("status", "--xyzzy"), "unrecognized arguments: --xyzzy\n"),
     ],
 )
-def test_an_unknown_flag_names_the_near_one(words, said, capsys):
+def test_the_error_for_an_unknown_flag_suggests_the_nearest(words, said, capsys):
     with pytest.raises(SystemExit) as left:
         command_line.main(words)
     assert left.value.code == 2
@@ -43,13 +43,13 @@ def test_an_unknown_flag_names_the_near_one(words, said, capsys):
         (("xyzzy",), "unknown verb 'xyzzy'; `dreamfleet --help` lists them"),
     ],
 )
-def test_an_unknown_verb_names_the_near_one(words, said, capsys):
+def test_the_error_for_an_unknown_verb_suggests_the_nearest(words, said, capsys):
     assert command_line.main(words) == UsageError.exit_code
     assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [(), ("runs",)])
-def test_no_verb_is_an_error_that_says_so(words, capsys):
+def test_a_missing_verb_is_an_error(words, capsys):
     with pytest.raises(SystemExit) as left:
         command_line.main(words)
     assert left.value.code == 2
@@ -57,14 +57,14 @@ def test_no_verb_is_an_error_that_says_so(words, capsys):
 
 
 @pytest.mark.parametrize("words", [("--help",), ("runs", "--help"), ("worker", "--help"), ("train", "vae", "--help")])
-def test_help_tells_the_exit_codes(words, capsys):
+def test_help_lists_the_exit_codes(words, capsys):
     with pytest.raises(SystemExit) as left:
         command_line.main(words)
     assert left.value.code == 0
     assert "130 it was interrupted" in " ".join(capsys.readouterr().out.split())
 
 
-def test_every_verb_offers_the_file_and_what_is_logged():
+def test_every_verb_has_the_flags_for_config_and_logs():
     for name, point in points().items():
         text = command_line.build_parser(name, point.load()).format_help()
         assert "--config" in text, name
@@ -74,18 +74,18 @@ def test_every_verb_offers_the_file_and_what_is_logged():
 SILENT = {"dashboard", "demo", "router", "worker"}  # these work for a person who watches, or for nobody
 
 
-def test_every_verb_that_answers_can_do_so_in_json():
+def test_every_verb_with_output_has_json():
     verbs = {name: command_line.build_parser(name, point.load()).format_help() for name, point in points().items()}
     assert {name for name, text in verbs.items() if "--json" not in text} <= SILENT
 
 
-def test_a_verb_that_cannot_be_loaded_breaks_no_other(capsys, tmp_path):
+def test_a_broken_verb_does_not_affect_others(capsys, tmp_path):
     assert command_line.run_verb(points(BROKEN), ["runs", "list", "--runs-dir", str(tmp_path)]) == 0
     with pytest.raises(SystemExit):
         command_line.run_verb(points(BROKEN), ["--help"])
-    told = " ".join(capsys.readouterr().out.split())
-    assert re.search(r"broken BROKEN: the verb 'broken' cannot be loaded from tests\.no_such_module", told)
-    assert "score candidates for a run" in told
+    output = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"broken BROKEN: the verb 'broken' cannot be loaded from tests\.no_such_module", output)
+    assert "score candidates for a run" in output
     with pytest.raises(DreamfleetError, match=r"'broken' cannot be loaded .*ModuleNotFoundError"):
         command_line.run_verb(points(BROKEN), ["broken"])
 
@@ -96,15 +96,15 @@ def test_the_module_and_the_version():
     assert re.fullmatch(r"dreamfleet \d+\.\d+\.\d+\S*\n", done.stdout)
 
 
-def test_the_help_of_a_fork_names_no_default_that_it_does_not_have(capsys):
+def test_the_help_of_fork_shows_its_own_defaults(capsys):
     with pytest.raises(SystemExit):
         command_line.main(["fork", "--help"])
-    told = " ".join(capsys.readouterr().out.split())
-    assert "candidates a generation (default RUN's own)" in told
-    assert "(default 32)" not in told
+    output = " ".join(capsys.readouterr().out.split())
+    assert "candidates a generation (default RUN's own)" in output
+    assert "(default 32)" not in output
 
 
-def test_closed_streams_end_no_verb_and_give_no_file_their_numbers(tmp_path):
+def test_closed_streams_are_replaced(tmp_path):
     program = (
         "import os, sys; from dreamfleet.common.cli.command_line import main; assert sys.stdout is None; "
         "main(['runs', 'list']); raise SystemExit(os.open('journal', os.O_CREAT | os.O_WRONLY))"

@@ -25,11 +25,11 @@ def flags(*arguments):
     return parser.parse_args(arguments)
 
 
-def test_defaults_stand_alone():
+def test_defaults():
     assert load(ThingConfig, "thing") == ThingConfig()
 
 
-def test_the_nearer_source_wins():
+def test_precedence_of_sources():
     sources = {
         "base": {"count": 4, "rate": 4.0, "colour": "blue", "names": ("p",)},
         "file": {"thing": {"count": 5, "rate": 5, "names": ["f"]}},
@@ -57,12 +57,12 @@ def test_flags_of_every_type():
         ({"environment": {"DREAMFLEET_THING_LOUD": "yes"}}, "must be true or false"),
     ],
 )
-def test_what_nobody_knows_is_refused(source, said):
+def test_unknown_keys_are_refused(source, said):
     with pytest.raises(UsageError, match=said):
         load(ThingConfig, "thing", **source)
 
 
-def test_a_flag_that_was_not_given_leaves_no_trace():
+def test_a_flag_that_is_not_given_sets_nothing():
     assert vars(flags()) == {}
     assert load(ThingConfig, "thing", flags=Namespace(other=1)) == ThingConfig()
 
@@ -71,7 +71,7 @@ def test_a_flag_that_was_not_given_leaves_no_trace():
     ("text", "said"),
     [("[thign]\n", "unknown table"), ("thing = 3\n", "must be a table"), ("[thing\n", "cannot be read as TOML")],
 )
-def test_a_wrong_file_is_refused(tmp_path, text, said):
+def test_an_invalid_file_is_refused(tmp_path, text, said):
     path = tmp_path / "run.toml"
     path.write_text(text)
     with pytest.raises(UsageError, match=said):
@@ -83,7 +83,7 @@ def test_a_missing_file_is_refused(tmp_path):
         read_toml(tmp_path / "absent.toml", ["thing"])
 
 
-def test_a_preset_can_be_named_in_the_file_and_is_weaker_than_everything_but_its_base(tmp_path):
+def test_a_preset_in_the_file_overrides_only_its_base(tmp_path):
     sizes = {"large": {"count": 90, "rate": 9.0}}
     sources = {"file": {"thing": {"preset": "large", "rate": 5}}, "base": {"count": 2, "colour": "blue"}}
     loaded = load(ThingConfig, "thing", preset=sizes.__getitem__, **sources)
@@ -92,7 +92,7 @@ def test_a_preset_can_be_named_in_the_file_and_is_weaker_than_everything_but_its
         load(ThingConfig, "thing", preset=sizes.__getitem__, environment={"DREAMFLEET_THING_PRESET": "tiny"})
 
 
-def test_the_section_without_a_name_is_the_top_of_the_file(tmp_path):
+def test_the_unnamed_section_is_the_top_of_the_file(tmp_path):
     path = tmp_path / "fleet.toml"
     path.write_text("count = 5\n[other]\nkey = 1\n")
     file = read_toml(path, ["other"], top=["count"])
@@ -100,7 +100,7 @@ def test_the_section_without_a_name_is_the_top_of_the_file(tmp_path):
     assert load(ThingConfig, "", file=file, environment=environment) == ThingConfig(5, 2.0)
 
 
-def test_flags_can_be_some_of_a_section():
+def test_flags_for_some_fields_of_a_section():
     parser = ArgumentParser()
     add_flags(parser, ThingConfig, only=["count"], texts={"count": "so many"})
     assert "so many" in parser.format_help()

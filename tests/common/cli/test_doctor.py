@@ -1,4 +1,4 @@
-"""`doctor` in an installation that has no more than a coordinator needs, put together from links."""
+"""`doctor` in an installation with only a coordinator's packages, built from links."""
 
 import json
 import os
@@ -24,7 +24,7 @@ def top_of(name):
 
 @pytest.fixture
 def bare(tmp_path):
-    """A folder of links to the coordinator's packages alone."""
+    """A folder of links to only the coordinator's packages."""
     site = tmp_path / "site"
     site.mkdir()
     for name in COORDINATOR:
@@ -45,7 +45,7 @@ def doctor(bare, tmp_path, *words):
     return done.returncode, done.stdout
 
 
-def test_it_says_of_each_role_whether_it_can_be_played_and_the_whole_remedy(bare, tmp_path):
+def test_each_role_is_listed_with_its_remedy(bare, tmp_path):
     code, out = doctor(bare, tmp_path)
     assert code == 0
     assert "coordinator\tcan be played" in out
@@ -57,7 +57,7 @@ def test_it_says_of_each_role_whether_it_can_be_played_and_the_whole_remedy(bare
     ("role", "code"),
     [("coordinator", 0), ("worker", 1), ("views", 1), ("train", 1), ("dashboard", 1), ("export", 1)],
 )
-def test_its_exit_code_is_of_the_role_that_is_asked_about(bare, tmp_path, role, code):
+def test_the_exit_code_is_the_chosen_roles(bare, tmp_path, role, code):
     left, out = doctor(bare, tmp_path, "--role", role, "--json")
     report = json.loads(out)
     assert left == code
@@ -66,19 +66,19 @@ def test_its_exit_code_is_of_the_role_that_is_asked_about(bare, tmp_path, role, 
     assert not report["roles"]["worker"]
 
 
-def test_a_run_that_needs_a_workers_packages_to_begin_says_which_extra_has_them(bare, tmp_path):
+def test_a_run_that_needs_a_workers_packages_names_the_extra(bare, tmp_path):
     done = call(bare, tmp_path, "coordinator", "--task", "gym:LunarLander-v3", "--runs-dir", str(tmp_path / "runs"))
     assert done.returncode == 2
     assert "no module 'gymnasium' here; pip install 'dreamfleet[worker]'" in done.stderr
 
 
-def test_the_search_says_nothing_of_pictures_that_nobody_asked_for(bare, tmp_path):
+def test_a_search_does_not_mention_unrequested_pictures(bare, tmp_path):
     done = call(bare, tmp_path, module=("-c", "import dreamfleet.coordinator.optimisers.pycma"))
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_worker_needs_no_folder_for_runs():
-    """Its root may be read-only but for the cache."""
+    """Its root may be read-only except for the cache."""
     findings = run_checks(Path("/dev/null/runs"))
     assert missing_for_role("worker", findings) == []
     assert [each.name for each in missing_for_role("coordinator", findings)] == ["runs folder"]

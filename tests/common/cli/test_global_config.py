@@ -1,4 +1,4 @@
-"""What every verb knows of its surroundings: from the top of a file, the environment and flags, in this order."""
+"""Settings of all verbs: from the top of a file, the environment and flags."""
 
 from argparse import ArgumentParser
 from pathlib import Path
@@ -31,13 +31,13 @@ def settled(*words, environment=None):
     return args
 
 
-def test_defaults_stand_alone():
+def test_defaults():
     args = settled()
     assert (resolve_network(args).connect, args.listen, str(args.runs_dir)) == (("tcp/127.0.0.1:7447",), (), "runs")
     assert args.given == {"config"}
 
 
-def test_file_environment_and_flags_in_this_order(tmp_path):
+def test_precedence_of_file_environment_and_flags(tmp_path):
     path = tmp_path / "fleet.toml"
     path.write_text(FILE)
     environment = {"DREAMFLEET_CONNECT": "tcp/environment:1,tcp/other:2", "DREAMFLEET_RUNS_DIR": "/from/environment"}
@@ -51,20 +51,20 @@ def test_file_environment_and_flags_in_this_order(tmp_path):
     assert args.sources["file"]["worker"] == {"slots": 3}
 
 
-def test_an_empty_variable_takes_back_the_join_file_that_the_file_names(tmp_path):
+def test_an_empty_variable_unsets_the_files_join_file(tmp_path):
     path = tmp_path / "fleet.toml"
     path.write_text('join = "lab.join"\n')
     assert settled("--config", str(path)).global_config.join == Path("lab.join")
     assert settled("--config", str(path), environment={"DREAMFLEET_JOIN": ""}).global_config.join is None
 
 
-def test_the_file_can_be_named_in_the_environment(tmp_path):
+def test_the_environment_can_name_the_file(tmp_path):
     path = tmp_path / "fleet.toml"
     path.write_text(FILE)
     assert settled(environment={"DREAMFLEET_CONFIG": str(path)}).global_config.connect == ("tcp/file:1",)
 
 
-def test_quiet_logs_warnings_alone():
+def test_quiet_logs_only_warnings():
     assert settled("-q").log_level == "warning"
     assert settled("--log-level", "debug").log_level == "debug"
 
@@ -79,12 +79,12 @@ def test_quiet_logs_warnings_alone():
         ({"DREAMFLEET_CONFIG": "absent.toml"}, "no configuration file at absent.toml"),
     ],
 )
-def test_a_wrong_environment_is_refused(environment, said):
+def test_an_invalid_environment_is_refused(environment, said):
     with pytest.raises(UsageError, match=said):
         settled(environment=environment)
 
 
-def test_variables_of_others_are_none_of_our_business():
+def test_other_programs_variables_are_ignored():
     settled(environment={"DREAMFLEET_CACHE": "x", "DREAMFLEET_TEST_STEPS": "y", "DREAMFLEET_WORKER_SLOTS": "1"})
 
 
@@ -97,7 +97,7 @@ def test_variables_of_others_are_none_of_our_business():
         ("[connect]\n", "connect must be a list of texts"),
     ],
 )
-def test_a_wrong_file_is_refused(tmp_path, text, said):
+def test_an_invalid_file_is_refused(tmp_path, text, said):
     path = tmp_path / "fleet.toml"
     path.write_text(text)
     with pytest.raises(UsageError, match=said):

@@ -1,4 +1,4 @@
-"""Answers: whole tables in a terminal, tab-separated lines in a pipe, JSON where it is asked for."""
+"""Output of verbs: tables in a terminal, tab-separated lines in a pipe, JSON with `--json`."""
 
 import fcntl
 import json
@@ -25,22 +25,22 @@ def in_terminal(code, columns):
     seen.pop("COLUMNS", None)
     with subprocess.Popen([sys.executable, "-c", code], stdout=theirs, stdin=theirs, env=seen) as child:
         os.close(theirs)
-        told = b""
+        output = b""
         try:
             while part := os.read(ours, 4096):
-                told += part
+                output += part
         except OSError:  # the other end is closed
             pass
         assert child.wait(DEADLINE) == 0
     os.close(ours)
-    return told.decode()
+    return output.decode()
 
 
-def test_a_narrow_terminal_cuts_nothing_and_brackets_stay():
-    told = in_terminal(SHOW, 40)
-    assert LONG in told
-    assert "said [bold]so[/] and [worker]" in told
-    assert "…" not in told
+def test_a_narrow_terminal_truncates_nothing_and_keeps_brackets():
+    output = in_terminal(SHOW, 40)
+    assert LONG in output
+    assert "said [bold]so[/] and [worker]" in output
+    assert "…" not in output
 
 
 def test_a_pipe_gets_tab_separated_lines(capsys):
@@ -48,7 +48,7 @@ def test_a_pipe_gets_tab_separated_lines(capsys):
     assert capsys.readouterr().out == "a\tb\nx y\t1\nline break tab\t-\n"
 
 
-def test_an_answer_is_a_sentence_or_json(capsys, tmp_path):
+def test_output_is_text_or_json(capsys, tmp_path):
     print_answer(Namespace(json=False), "archived", archived=tmp_path)
     print_answer(Namespace(json=True), "archived", archived=tmp_path)
     first, second = capsys.readouterr().out.splitlines()
@@ -56,11 +56,11 @@ def test_an_answer_is_a_sentence_or_json(capsys, tmp_path):
     assert json.loads(second) == {"archived": str(tmp_path)}
 
 
-def test_no_word_of_others_is_an_order_to_a_terminal():
+def test_untrusted_text_cannot_control_the_terminal():
     rows = [{"run": "night\x1b[2J", "state": "ended: \x1b]0;owned\x07\u202e"}]
     show = f"from dreamfleet.common.cli.output import print_rows; print_rows({rows!r})"
-    told = in_terminal(show, 80)
+    output = in_terminal(show, 80)
     piped = subprocess.run([sys.executable, "-c", show], check=True, capture_output=True, text=True).stdout
-    for text in (told, piped):
+    for text in (output, piped):
         assert "night\\x1b[2J" in text
         assert "owned\\x07\\u202e" in text

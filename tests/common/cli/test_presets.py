@@ -1,4 +1,4 @@
-"""Kinds of presets share some names: every message says which kind it speaks of. Help and docs tell their values."""
+"""Presets: errors name the kind of a preset, as kinds share names; help and docs list the values."""
 
 import argparse
 import re
@@ -18,13 +18,13 @@ from dreamfleet.worker.verbs import baseline
 from tests.support.processes import ROOT
 
 
-def test_the_names_are_those_that_each_side_has_settings_for():
+def test_the_names_match_the_presets_of_each_side():
     assert set(NAMES["run"]) == set(runs.PRESETS)
     assert set(NAMES["training"]) == set(presets.PRESETS)
     assert set(NAMES["baseline"]) == set(baselines.PRESETS)
 
 
-def test_a_name_of_the_other_kind_is_told_apart():
+def test_the_error_names_the_other_kind_of_a_preset():
     with pytest.raises(UsageError, match=r"unknown run preset 'attentive'.*'attentive' is a preset of training"):
         check_preset("run", "attentive")
     with pytest.raises(UsageError, match=r"unknown training preset 'dream'.*'dream' is a preset of run"):
@@ -33,23 +33,23 @@ def test_a_name_of_the_other_kind_is_told_apart():
         baselines.find_preset("tiny")
 
 
-def test_help_tells_each_presets_values():
+def test_help_lists_each_presets_values():
     training, learning = argparse.ArgumentParser(), argparse.ArgumentParser()
     add_training_flags(training, "vae")
     baseline.configure_train(learning)
-    told = " ".join(training.format_help().split())
-    assert "(default 1500; notebook 30000; article 60000; attentive 19200; paper 1000000)" in told
-    assert "0: never (default 0; attentive, paper 10)" in told
-    assert "else such that the picture's size results (notebook 5 5 6 6)" in told
-    assert "else the encoder's in reverse --" in told
+    help_text = " ".join(training.format_help().split())
+    assert "(default 1500; notebook 30000; article 60000; attentive 19200; paper 1000000)" in help_text
+    assert "0: never (default 0; attentive, paper 10)" in help_text
+    assert "else such that the picture's size results (notebook 5 5 6 6)" in help_text
+    assert "else the encoder's in reverse --" in help_text
     assert "(default 2000; notebook 500)" in " ".join(learning.format_help().split())
 
 
-def test_docs_tell_what_each_preset_of_a_run_is():
+def test_docs_list_each_run_presets_values():
     page = (ROOT / "docs" / "operations.md").read_text()
-    told = dict(re.findall(r"^\| `(\w+)` \| `(--[^`]+)`", page, re.MULTILINE))
-    assert told.keys() == runs.PRESETS.keys()
-    for name, flags in told.items():
+    described = dict(re.findall(r"^\| `(\w+)` \| `(--[^`]+)`", page, re.MULTILINE))
+    assert described.keys() == runs.PRESETS.keys()
+    for name, flags in described.items():
         said = vars(build_parser("coordinator", coordinator).parse_all(shlex.split(flags)))
         settings = {key: value for key, value in runs.PRESETS[name].items() if key not in ("stages", "preset_variant")}
         if variant := runs.PRESETS[name].get("preset_variant"):

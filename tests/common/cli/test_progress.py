@@ -1,4 +1,4 @@
-"""A bar's line in a terminal of any width."""
+"""Progress bars in terminals of any width."""
 
 import io
 import logging
@@ -15,7 +15,7 @@ NOTE = "likelihood -12.345  reward 0.0123"
     ("width", "kept", "left_out"),
     [(160, ("━━━━━━━━", "updates", "left"), ()), (80, ("━━━", "left"), ("updates",)), (66, (), ("━", "left"))],
 )
-def test_what_matters_least_is_left_out_and_nothing_is_cut(width, kept, left_out):
+def test_the_least_important_columns_are_left_out_and_nothing_is_truncated(width, kept, left_out):
     console = Console(file=io.StringIO(), width=width)
     with make_progress("updates", console) as progress:
         Bar(progress, "train mdnrnn", 4000).update(1200, NOTE)
@@ -26,7 +26,7 @@ def test_what_matters_least_is_left_out_and_nothing_is_cut(width, kept, left_out
     assert not any(part in line for part in left_out)
 
 
-def test_where_no_bar_moves_a_line_is_said_now_and_then(monkeypatch):
+def test_without_a_terminal_a_line_is_logged_periodically(monkeypatch):
     console = Console(file=io.StringIO(), width=120)
     with make_progress("updates", console) as progress:
         bar = Bar(progress, "VAE", 1800)
@@ -38,7 +38,7 @@ def test_where_no_bar_moves_a_line_is_said_now_and_then(monkeypatch):
 
 
 @pytest.mark.parametrize(("level", "drawn"), [("INFO", True), ("WARNING", False)])
-def test_a_verb_that_is_to_be_quiet_draws_none(capsys, monkeypatch, level, drawn):
+def test_a_quiet_verb_draws_no_bar(capsys, monkeypatch, level, drawn):
     log = logging.getLogger("dreamfleet")
     monkeypatch.setattr(log, "level", log.level)  # and so it is put back
     log.setLevel(level)

@@ -1,4 +1,4 @@
-"""What `--out` names is looked at before the work, and is whole or not there."""
+"""`--out` is checked before the work, and written atomically."""
 
 import os
 import tempfile
@@ -13,7 +13,7 @@ from dreamfleet.common.files.atomic_write import check_output_path, open_output
 NOBODY = 65534
 
 
-def test_a_folder_is_made_and_a_file_is_whole(tmp_path):
+def test_the_folder_is_created_and_the_file_is_complete(tmp_path):
     path = tmp_path / "results" / "tiny.json"
     check_output_path(path)
     with open_output(path) as file:
@@ -21,7 +21,7 @@ def test_a_folder_is_made_and_a_file_is_whole(tmp_path):
     assert path.read_bytes() == b"all of it"
 
 
-def test_where_no_file_can_be_is_said_before_the_work(tmp_path):
+def test_an_impossible_path_is_an_error_before_the_work(tmp_path):
     with pytest.raises(UsageError, match="is a folder"):
         check_output_path(tmp_path)
     (tmp_path / "file").touch()
@@ -29,7 +29,7 @@ def test_where_no_file_can_be_is_said_before_the_work(tmp_path):
         check_output_path(tmp_path / "file" / "tiny.json")
 
 
-def test_a_device_or_pipe_stays_what_it_is(tmp_path):
+def test_devices_and_pipes_are_not_replaced(tmp_path):
     pipe, link = tmp_path / "pipe", tmp_path / "link"
     os.mkfifo(pipe)
     link.symlink_to(pipe)
@@ -64,7 +64,7 @@ def test_a_read_only_folder_is_reported_before_the_work():
             check_output_path(folder / "tiny.json")
 
 
-def test_what_fails_half_way_leaves_what_was_there(tmp_path):
+def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "tiny.json"
     path.write_text("before")
     with suppress(RuntimeError), open_output(path) as file:

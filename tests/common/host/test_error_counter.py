@@ -1,6 +1,6 @@
 import logging
 
-from dreamfleet.common.host.error_counter import LONGEST, ErrorCounter
+from dreamfleet.common.host.error_counter import MAX_LOGGED_CHARS, ErrorCounter
 
 log = logging.getLogger("dreamfleet.test")
 
@@ -12,7 +12,7 @@ def raised(error):
         return caught
 
 
-def test_each_reason_is_counted_and_told_ever_more_rarely(caplog):
+def test_each_reason_is_counted_and_logged_ever_more_rarely(caplog):
     error_counter = ErrorCounter(log)
     for _ in range(9):
         error_counter.record("beat", raised(KeyError("x")), "an event")
@@ -21,9 +21,9 @@ def test_each_reason_is_counted_and_told_ever_more_rarely(caplog):
     assert len(caplog.records) == 4 + 1
 
 
-def test_what_is_told_of_an_event_is_short_and_printable(caplog):
+def test_logged_events_are_short_and_printable(caplog):
     ErrorCounter(log).record("hello", raised(ValueError("\x1b[2J" * 500)), "\x1b]0;title\x07" * 500)
     (line,) = (record.getMessage() for record in caplog.records)
     assert line.isprintable()
-    assert len(line) < 3 * LONGEST
+    assert len(line) < 3 * MAX_LOGGED_CHARS
     assert "test_error_counter.py" in line

@@ -1,4 +1,4 @@
-"""Logs as lines for people and as JSON for programs."""
+"""Logs as text and as JSON."""
 
 import json
 import subprocess
@@ -23,7 +23,7 @@ def said(wanted):
     return done.stderr.splitlines()
 
 
-def test_text_is_what_people_read():
+def test_text_is_the_default_format():
     first, *_, last = said("text")
     assert first.endswith("WARNING dreamfleet.x: said by a\\x1b[2J")
     assert last == "dreamfleet: why"

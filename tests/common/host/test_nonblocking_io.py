@@ -1,4 +1,4 @@
-"""Streams whose reader sleeps, over real pipes."""
+"""Streams with a slow reader, over real pipes."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ from tests.support.processes import DEADLINE, environment
 
 @pytest.fixture
 def pipe():
-    """What reads, and a stream that writes."""
+    """The reading end of a pipe, and a stream that writes to it."""
     read, write = os.pipe()
     with os.fdopen(write, "w") as stream, os.fdopen(read, "rb") as reader:
         yield reader, stream
@@ -31,7 +31,7 @@ def read_in_background(reader, until):
     return got, thread
 
 
-def test_what_is_written_arrives_in_order(pipe):
+def test_output_arrives_in_order(pipe):
     reader, stream = pipe
     unblocked = NonblockingStream(stream)
     for number in range(100):
@@ -42,7 +42,7 @@ def test_what_is_written_arrives_in_order(pipe):
     assert got.decode() == "".join(f"line {number}\n" for number in range(100)) + "and a half"
 
 
-def test_nothing_waits_for_a_reader_that_sleeps_and_what_was_dropped_is_said(pipe):
+def test_a_slow_reader_blocks_nothing_and_drops_are_reported(pipe):
     reader, stream = pipe
     unblocked = NonblockingStream(stream)
     line = "x" * 999 + "\n"
@@ -58,7 +58,7 @@ def test_nothing_waits_for_a_reader_that_sleeps_and_what_was_dropped_is_said(pip
     assert dropped > count // 3
 
 
-def test_a_reader_that_is_gone_ends_nothing(pipe):
+def test_a_closed_reader_is_no_error(pipe):
     reader, stream = pipe
     unblocked = NonblockingStream(stream)
     reader.close()
@@ -66,7 +66,7 @@ def test_a_reader_that_is_gone_ends_nothing(pipe):
     unblocked.finish(10)
 
 
-def test_a_process_ends_although_nobody_reads_its_last_words():
+def test_a_process_exits_although_nobody_reads_its_output():
     program = (
         "import os, sys, logging\n"
         "from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking\n"

@@ -1,4 +1,4 @@
-"""Our own verbs as processes."""
+"""Verbs as child processes."""
 
 import os
 import select
@@ -15,7 +15,7 @@ from tests.support.processes import DEADLINE
 CHATTER = ("sh", "-c", 'yes out | head -c 300000; yes err | head -c 300000 >&2; exec "$@"', "sh")
 
 
-def test_a_child_that_says_much_waits_for_no_reader():
+def test_a_child_with_much_output_does_not_block():
     with VerbProcess("--version", inside=CHATTER) as child:
         code, out = child.finish(DEADLINE)
     assert code == 0
@@ -23,7 +23,7 @@ def test_a_child_that_says_much_waits_for_no_reader():
     assert "err\n" in child.lines
 
 
-def test_a_module_in_the_current_folder_is_never_taken_for_ours(tmp_path, monkeypatch):
+def test_modules_in_the_current_folder_are_not_imported(tmp_path, monkeypatch):
     for name in ("dreamfleet.py", "argparse.py", "zenoh.py"):
         (tmp_path / name).write_text("raise SystemExit('hostile')\n")
     monkeypatch.chdir(tmp_path)
@@ -31,7 +31,7 @@ def test_a_module_in_the_current_folder_is_never_taken_for_ours(tmp_path, monkey
         assert child.finish(DEADLINE)[0] == 0, child.lines
 
 
-def test_a_child_is_asked_to_leave_before_it_is_ended(processes, random_bundle):
+def test_a_child_gets_sigterm_before_sigkill(processes, random_bundle):
     words = ("coordinator", "--run", "asked", "--runs-dir", processes.runs, "--listen", processes.endpoint)
     with VerbProcess(*words, "--bundle", random_bundle.path, "--task", tasks.TOY) as child:
         child.wait_for("incarnation")
@@ -39,14 +39,14 @@ def test_a_child_is_asked_to_leave_before_it_is_ended(processes, random_bundle):
     assert "left run asked open" in child.lines[-1]
 
 
-def test_words_go_to_a_log_where_one_is_named(tmp_path):
+def test_output_goes_to_the_log_file(tmp_path):
     log = tmp_path / "new" / "child.log"
     with VerbProcess("runs", "show", "absent", "--runs-dir", tmp_path, log=log) as child:
         assert child.finish(DEADLINE) == (1, "")
     assert child.last_line().startswith("no run 'absent'")
 
 
-def test_what_is_not_said_is_an_error_and_no_endless_wait(tmp_path):
+def test_waiting_for_missing_output_times_out(tmp_path):
     with (
         VerbProcess("runs", "list", "--runs-dir", tmp_path) as child,
         pytest.raises(DreamfleetError, match="ended before"),
@@ -56,7 +56,7 @@ def test_what_is_not_said_is_an_error_and_no_endless_wait(tmp_path):
         run_verb_to_end("runs", "show", "absent", "--runs-dir", tmp_path)
 
 
-def test_a_leashed_child_dies_with_a_parent_that_is_killed(tmp_path):
+def test_a_child_dies_with_a_killed_parent(tmp_path):
     program = (
         "import sys; from dreamfleet.common.host.processes import VerbProcess, parent_death_command\n"
         "child = VerbProcess('worker', '--connect', 'tcp/127.0.0.1:1', inside=parent_death_command())\n"

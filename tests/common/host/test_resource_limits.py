@@ -1,4 +1,4 @@
-"""Cores that a process may use, as a host, a container and a batch system tell them."""
+"""Usable cores by affinity masks and cgroup quotas."""
 
 import os
 
@@ -17,7 +17,7 @@ def many(monkeypatch):
 
 @pytest.fixture
 def host(tmp_path):
-    """Control groups, and which are ours; a function that writes a file of them."""
+    """A cgroup file system and the list of this process's cgroups, with a function that writes a file in them."""
     own = tmp_path / "own"
     own.write_text("0::/\n")
 
@@ -29,24 +29,24 @@ def host(tmp_path):
     return tmp_path / "groups", own, write
 
 
-def test_without_control_groups_the_scheduler_says_it(many, tmp_path):
+def test_without_cgroups_the_affinity_counts(many, tmp_path):
     assert usable_cores(tmp_path / "none", tmp_path / "nothing") == 64
 
 
 @pytest.mark.parametrize(
-    ("told", "found"),
+    ("quota", "found"),
     [
         ("max 100000", 64), ("200000 100000", 2), ("150000 100000", 2), ("10000 100000", 1),
         ("9900000 100000", 64), ("rubbish", 64), ("5 0", 64),
     ],
 )  # fmt: skip
-def test_a_container_has_the_time_that_its_group_is_given(many, host, told, found):
+def test_a_containers_quota_is_rounded_up(many, host, quota, found):
     groups, own, write = host
-    write("cpu.max", told)
+    write("cpu.max", quota)
     assert usable_cores(groups, own) == found
 
 
-def test_the_smallest_quota_on_the_way_up_holds(many, host):
+def test_the_smallest_quota_of_all_parents_counts(many, host):
     groups, own, write = host
     own.write_text("0::/user.slice/job-7/step\n")
     write("user.slice/job-7/step/cpu.max", "max 100000")
@@ -55,7 +55,7 @@ def test_the_smallest_quota_on_the_way_up_holds(many, host):
     assert usable_cores(groups, own) == 3
 
 
-def test_groups_of_version_1(many, host):
+def test_cgroups_version_1(many, host):
     groups, own, write = host
     own.write_text("7:memory:/docker/1\n4:cpu,cpuacct:/docker/1\n1:name=systemd:/x\n")
     write("cpu/docker/1/cpu.cfs_quota_us", "400000")
@@ -65,11 +65,11 @@ def test_groups_of_version_1(many, host):
     assert usable_cores(groups, own) == 4
 
 
-def test_a_system_that_knows_no_affinity(monkeypatch, tmp_path):
+def test_a_system_without_affinity(monkeypatch, tmp_path):
     monkeypatch.delattr(os, "sched_getaffinity")
     monkeypatch.setattr(os, "cpu_count", lambda: 10)
     assert usable_cores(tmp_path, tmp_path / "nothing") == 10
 
 
-def test_here_it_is_as_many_as_the_scheduler_lets_us_have_or_fewer():
+def test_this_host_has_at_most_as_many_cores_as_the_affinity_mask():
     assert 1 <= usable_cores() <= len(os.sched_getaffinity(0))

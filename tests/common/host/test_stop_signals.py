@@ -8,7 +8,7 @@ from dreamfleet.common.host.stop_signals import never_stop, signals_deferred, st
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_is_told_and_the_second_interrupts(number):
+def test_the_first_signal_stops_and_the_second_interrupts(number):
     with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:  # noqa: PT012
         assert not stop()
         os.kill(os.getpid(), number)
@@ -16,7 +16,7 @@ def test_the_first_signal_is_told_and_the_second_interrupts(number):
         os.kill(os.getpid(), number)
 
 
-def test_afterwards_signals_do_what_they_did_before():
+def test_the_signal_handlers_are_restored():
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     with stop_on_signals():
         assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] != before
@@ -25,7 +25,7 @@ def test_afterwards_signals_do_what_they_did_before():
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_what_is_undisturbed_is_finished_before_a_signal_counts(number):
+def test_deferred_signals_arrive_after_the_operation(number):
     finished = []
     with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:  # noqa: PT012
         with signals_deferred():
@@ -38,6 +38,6 @@ def test_what_is_undisturbed_is_finished_before_a_signal_counts(number):
     assert finished == [False, True]
 
 
-def test_a_thread_that_hears_no_signals_needs_no_peace():
+def test_other_threads_defer_no_signals():
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(lambda: [signals_deferred().__enter__()]).result() == [None]

@@ -1,4 +1,4 @@
-"""What a run's status tells of its end, and its state as a sentence."""
+"""Estimates of a run's end, and descriptions of its state."""
 
 import dataclasses
 
@@ -18,39 +18,39 @@ def status(limits=(), seconds=None, gone=0.0, **changes):
     )  # fmt: skip
 
 
-def test_minutes_are_told_with_the_pace_and_what_is_left():
+def test_a_limit_of_minutes():
     eta = estimate_eta(status({"minutes": 30.0}, seconds=18 * 60))
     assert eta.description == "18 of 30 minutes, 4.6 s a generation, about 12 min to go"
     assert eta.bounds[0].share == pytest.approx(0.6)
     assert eta.seconds == pytest.approx(12 * 60)
 
 
-def test_one_generation_that_was_paused_for_long_does_not_set_the_pace():
+def test_a_paused_generation_does_not_change_the_pace():
     assert estimate_eta(status()).pace == 4.6
 
 
-def test_the_open_generation_counts_for_what_it_has_taken():
+def test_the_open_generations_elapsed_time_counts():
     assert estimate_eta(status({"generations": 9}, gone=1.6)).seconds == pytest.approx(3.0 + 4.6)
     assert estimate_eta(status({"generations": 8}, gone=99.0)).seconds == 0
 
 
-def test_steps_are_foretold_by_the_rate_of_closed_generations():
+def test_steps_are_estimated_from_the_rate_of_closed_generations():
     eta = estimate_eta(status({"steps": 576_000}, paces=(10.0, 10.0)))  # each of 64,000 steps
     assert eta.description.startswith("448k of 576k steps")
     assert eta.seconds == pytest.approx(20.0)
 
 
-def test_of_several_limits_the_nearest_stands_first_and_counts():
+def test_the_nearest_of_several_limits_is_first_and_counts():
     eta = estimate_eta(status({"generations": 1000, "minutes": 30.0}, seconds=18 * 60))
     assert [each.name for each in eta.bounds] == ["minutes", "generations"]
     assert eta.seconds == eta.bounds[0].seconds
 
 
-def with_speed(told, candidates=None, evaluations=None):
+def with_speed(status, candidates=None, evaluations=None):
     throughput = dataclasses.replace(
-        told.throughput, episodes_per_second=candidates, evaluation_episodes_per_second=evaluations
+        status.throughput, episodes_per_second=candidates, evaluation_episodes_per_second=evaluations
     )
-    return dataclasses.replace(told, throughput=throughput)
+    return dataclasses.replace(status, throughput=throughput)
 
 
 @pytest.mark.parametrize(("rate", "then"), [(None, "then 90 episodes of evaluation"), (0.5, "about 3 min to go")])
@@ -71,13 +71,13 @@ def test_a_limit_that_an_evaluation_reached_is_over_too():
     assert eta.seconds == 10.0
 
 
-def test_a_coordinator_from_before_says_what_is_in_progress():
+def test_an_older_coordinators_evaluations_in_progress_count():
     eta = estimate_eta(status({"minutes": 1.0}, seconds=66.0, state="evaluating", confirming=EpisodeProgress(3, 16)))
     assert eta.description.endswith("then 13 episodes of evaluation")
     assert estimate_eta(status({"minutes": 1.0}, seconds=66.0)).description.endswith("about to end")
 
 
-def test_where_workers_were_lost_generations_are_foretold_by_the_speed_of_those_that_are_left():
+def test_after_losing_workers_the_remaining_speed_counts():
     slowed = with_speed(status({"generations": 10}, gone=99.0), candidates=0.5)  # 5 of 8 episodes are left
     assert estimate_eta(slowed).seconds == 10 + 16 + 16
     steps = with_speed(status({"steps": 576_000}, paces=(8.0, 8.0)), candidates=0.5)
@@ -86,7 +86,7 @@ def test_where_workers_were_lost_generations_are_foretold_by_the_speed_of_those_
     assert estimate_eta(first).seconds == 10.0
 
 
-def test_a_target_is_told_and_not_foretold():
+def test_a_target_score_has_no_estimate():
     eta = estimate_eta(status({"target": 900.0, "parted": 3}, best=BEST))
     assert eta.description == (
         "until an evaluation reaches 900 (best 120), until 3 evaluations in a row fall behind, 4.6 s a generation"
@@ -94,19 +94,19 @@ def test_a_target_is_told_and_not_foretold():
     assert eta.seconds is None
 
 
-def test_without_limits_or_generations_nothing_is_made_up():
+def test_without_limits_or_generations_there_is_no_estimate():
     assert estimate_eta(status(paces=())).description == "no limit: it runs until it is stopped"
     assert estimate_eta(status({"generations": 9}, paces=())).seconds is None
     assert estimate_eta(status({"minutes": 30.0})).bounds == ()  # an earlier coordinator does not say how long
 
 
 @pytest.mark.parametrize("state", ["paused", "waiting for workers", "ended", "left"])
-def test_while_nobody_works_there_is_no_time_to_go(state):
+def test_inactive_states_have_no_estimate(state):
     assert estimate_eta(status({"minutes": 30.0}, seconds=60.0, state=state)).seconds is None
 
 
 @pytest.mark.parametrize("strange", ["many", None, [1], float("nan"), -3])
-def test_limits_of_another_version_are_passed_over(strange):
+def test_unknown_limits_are_ignored(strange):
     eta = estimate_eta(
         status(dict.fromkeys(("generations", "steps", "minutes", "target", "parted"), strange), seconds=1.0)
     )
@@ -135,7 +135,7 @@ def test_limits_of_another_version_are_passed_over(strange):
         ),
         (
             {"state": "left"},
-            "its coordinator left; `dreamfleet coordinator --resume night` continues it (its log has the whole command)",
+            "its coordinator left; `dreamfleet coordinator --resume night` continues (its log has the full command)",
         ),
         (
             {"state": "ended", "why": "30 minutes", "best": None},
@@ -144,7 +144,7 @@ def test_limits_of_another_version_are_passed_over(strange):
         ({"state": "of a later version"}, "of a later version"),
     ],
 )
-def test_a_state_is_a_sentence(changes, said):
+def test_states_are_described(changes, said):
     assert describe_state(status(**changes)) == said
 
 
@@ -155,5 +155,5 @@ def test_a_state_is_a_sentence(changes, said):
         (3599, "1 h"), (12_000, "3 h 20 min"), (439_200, "5 d 2 h"), (86_400 * 3, "3 d"), (float("inf"), "very long"),
     ],
 )  # fmt: skip
-def test_durations_are_said_as_people_say_them(seconds, said):
+def test_durations_are_formatted(seconds, said):
     assert format_duration(seconds) == said

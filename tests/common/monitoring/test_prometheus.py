@@ -1,4 +1,4 @@
-"""What Prometheus reads of a status, by Prometheus' own parser."""
+"""Prometheus's own parser on the exposition of a status."""
 
 import dataclasses
 import json
@@ -33,7 +33,7 @@ def read(status):
     return found
 
 
-def test_figures_are_those_of_the_status():
+def test_values_are_the_statuss():
     found = read(WHOLE)
     assert found["dreamfleet_generation"] == [({"run": "night"}, 7.0)]
     assert found["dreamfleet_environment_steps_total"][0][1] == 448000
@@ -44,17 +44,17 @@ def test_figures_are_those_of_the_status():
     assert found["dreamfleet_confirmed_score"][0][1] == 118.5
 
 
-def test_what_is_not_known_has_no_sample():
+def test_unknown_values_have_no_sample():
     found = read(dataclasses.replace(STATUS, last=None, recent=(), evaluation=None, best=None))
     for name in ("fitness", "evaluated_score", "confirmed_score", "temperature", "eta_seconds", "worker_job_seconds"):
         assert f"dreamfleet_{name}" not in found
 
 
-def test_results_by_class_of_host_add_up_to_all_of_them():
+def test_results_by_host_class_sum_to_the_total():
     found = read(dataclasses.replace(STATUS, classes=HostClasses.of({(f"{n:016x}", "x"): 10 - n for n in range(9)})))
     assert found["dreamfleet_host_classes"][0][1] == 9
-    told = {labels["class"]: value for labels, value in found["dreamfleet_class_results"]}
-    assert told == {**{f"{n:016x}": 10 - n for n in range(MAX_LISTED)}, "other": 6 + 5 + 4 + 3 + 2}
+    results = {labels["class"]: value for labels, value in found["dreamfleet_class_results"]}
+    assert results == {**{f"{n:016x}": 10 - n for n in range(MAX_LISTED)}, "other": 6 + 5 + 4 + 3 + 2}
 
 
 def test_label_sets_are_bounded():
@@ -65,7 +65,7 @@ def test_label_sets_are_bounded():
     assert len(found["dreamfleet_dropped_messages_total"]) == MAX_REASONS
 
 
-def test_no_text_of_others_makes_a_line_of_its_own():
+def test_untrusted_text_cannot_start_a_line():
     worker = dataclasses.replace(WORKER, worker=HOSTILE)
     hostile = dataclasses.replace(WHOLE, run=HOSTILE, worker_list=(worker,), dropped={HOSTILE: 1})
     found, plain = read(hostile), read(WHOLE)
@@ -75,12 +75,12 @@ def test_no_text_of_others_makes_a_line_of_its_own():
 
 
 @pytest.mark.parametrize("value", [float("inf"), float("nan"), 1.7e308])
-def test_any_number_can_be_told(value):
+def test_any_number_can_be_written(value):
     last = dataclasses.replace(STATUS.last, mean=value)
     assert len(read(dataclasses.replace(WHOLE, last=last))["dreamfleet_fitness"]) == 3
 
 
-def test_every_metric_that_the_grafana_dashboard_asks_for_is_there():
+def test_every_metric_of_the_grafana_dashboard_exists():
     dashboard = json.loads(GRAFANA.read_text())
     asked = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
     asked += [each["query"] for each in dashboard["templating"]["list"]]

@@ -1,4 +1,4 @@
-"""The status document: golden, forgiving towards later versions, clear about what it cannot read."""
+"""The status document: golden file, later versions, and errors."""
 
 import dataclasses
 import json
@@ -16,11 +16,11 @@ from tests.support.samples import STATUS
 GOLDEN = Path(__file__).parents[1] / "golden" / "status.v2.json"
 
 
-def test_the_golden_status_is_read_for_ever():
+def test_the_golden_status_can_be_read():
     assert read_status(read_document(GOLDEN.read_bytes())) == STATUS
 
 
-def test_what_is_written_today_reads_as_what_was_written():
+def test_statuses_round_trip():
     assert read_status(read_document(encode_json(STATUS))) == STATUS
     assert json.loads(encode_json(STATUS)) == json.loads(GOLDEN.read_bytes())
 
@@ -36,7 +36,7 @@ def test_fields_of_later_versions_are_ignored_at_any_depth():
 
 
 @pytest.mark.parametrize("missing", ["waste", "population", "worker_list", "recent"])
-def test_a_missing_field_is_an_error_that_names_what_to_install(missing):
+def test_the_error_for_a_missing_field_names_the_version_to_install(missing):
     document = json.loads(GOLDEN.read_bytes())
     del document[missing]
     with pytest.raises(MalformedError, match=r"run night .* install the coordinator's dreamfleet \(0\.1\.0\) here"):
@@ -49,12 +49,12 @@ def test_the_first_schema_is_refused_with_its_number():
 
 
 @pytest.mark.parametrize("payload", [b"", b"[]", b"\xff", b"{" * 20000, b"1"])
-def test_what_is_no_document_is_an_error_for_people(payload):
+def test_an_invalid_document_is_a_readable_error(payload):
     with pytest.raises(MalformedError, match="install the same dreamfleet"):
         read_document(payload)
 
 
-def test_a_population_is_columns_on_the_wire_and_rows_to_a_reader():
+def test_a_population_has_columns_and_rows():
     population = dataclasses.replace(STATUS.population, offset=4)
     assert population.candidates[1] == Candidate(7, 5, 1, 2, -3.25)
     assert population.candidates[2].fitness is None
@@ -68,20 +68,20 @@ def test_a_population_is_columns_on_the_wire_and_rows_to_a_reader():
         (("population", "done"), [1]),
     ],
 )
-def test_what_nothing_can_be_computed_of_is_malformed(path, value):
+def test_values_out_of_range_are_malformed(path, value):
     document = json.loads(GOLDEN.read_bytes())
     document[path[0]][path[1]] = value
     with pytest.raises(MalformedError):
         read_status(document)
 
 
-def test_a_number_of_more_digits_than_a_message_can_hold_is_malformed():
+def test_a_number_with_too_many_digits_is_malformed():
     with pytest.raises(MalformedError):
         read_document(b'{"limits": {"generations": 1%s}}' % (b"0" * 400))
     assert read_document(b'{"limits": {"generations": 18446744073709551615}}')
 
 
-def test_classes_without_names_or_results_are_told():
+def test_host_classes_without_names_or_results_are_described():
     assert HostClasses(total=1).description == "no result yet"
     assert HostClasses(2, (HostClassShare("a" * 16, 0, ()),), 0).description.startswith("mixed: 2 classes")
 
@@ -90,10 +90,10 @@ if __name__ == "__main__" and not GOLDEN.exists():
     GOLDEN.write_bytes(encode_json(STATUS))
 
 
-def test_of_several_runs_one_that_answers_with_nonsense_is_a_note_and_the_others_are_told(capsys):
+def test_one_invalid_reply_among_several_runs_is_only_noted(capsys):
     first, other, liar = (json.loads(encode_json(dataclasses.replace(STATUS, run=run))) for run in ("b", "a", "liar"))
     print_runs([first, liar | {"evaluations": -1}, other])
-    told = capsys.readouterr()
-    assert [line.split()[0] for line in told.out.splitlines() if line.split()[0] in {"a", "b", "liar"}] == ["a", "b"]
-    assert "liar" in told.err
-    assert "2 live runs" in told.err
+    output = capsys.readouterr()
+    assert [line.split()[0] for line in output.out.splitlines() if line.split()[0] in {"a", "b", "liar"}] == ["a", "b"]
+    assert "liar" in output.err
+    assert "2 live runs" in output.err

@@ -28,13 +28,13 @@ def drawn(status, width, *flags):
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])
-def test_a_workers_name_is_whole_in_a_terminal_of_any_width(width):
+def test_a_workers_name_is_never_truncated(width):
     text = drawn(dataclasses.replace(STATUS, worker_list=(WORKER,)), width)
     assert LONG in text
     assert "…" not in text
 
 
-def test_what_matters_least_is_left_out_first():
+def test_the_least_important_lines_are_left_out_first():
     status = dataclasses.replace(STATUS, worker_list=(WORKER,))
     narrow, wide = drawn(status, 80), drawn(status, 160)
     assert all(column in wide for column in ("slots", "leases", "finished", "load", "picture", "round trip", "resent"))
@@ -57,7 +57,7 @@ LARGE = dataclasses.replace(
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (60, 10), (200, 60), (20, 5)])
-def test_a_picture_that_is_drawn_again_and_again_fits_the_terminal(width, height):
+def test_a_fitted_panel_fits_the_terminal(width, height):
     console = Console(file=io.StringIO(), width=width, height=height)
     console.print(RunPanel(LARGE, fitted=True))
     lines = console.file.getvalue().splitlines()
@@ -65,7 +65,7 @@ def test_a_picture_that_is_drawn_again_and_again_fits_the_terminal(width, height
     assert max(map(cell_len, lines)) <= width
 
 
-def test_at_80_columns_and_24_lines_every_part_is_there_and_names_are_whole():
+def test_80_columns_and_24_lines_show_every_part():
     lines = [line.plain for line in panel_lines(LARGE, 76, 21)]
     text = "\n".join(lines)
     assert len(lines) == 21
@@ -77,7 +77,7 @@ def test_at_80_columns_and_24_lines_every_part_is_there_and_names_are_whole():
     assert f"and {40 - len(rows)} more" in lines[-1]
 
 
-def test_whoever_is_lost_or_slow_is_among_the_few_that_have_room():
+def test_lost_and_slow_workers_are_shown_first():
     odd = {17: {"state": "silent"}, 31: {"job_seconds": 4.6}}
     fleet = [dataclasses.replace(each, **odd.get(number, {})) for number, each in enumerate(FLEET)]
     lines = [line.plain for line in WorkerTable(fleet, 41).lines(76, 5)]
@@ -88,13 +88,13 @@ def test_whoever_is_lost_or_slow_is_among_the_few_that_have_room():
     assert find_slowest(FLEET) is None
 
 
-def test_a_name_longer_than_the_terminal_goes_on_in_the_next_line():
+def test_a_name_longer_than_the_terminal_wraps():
     lines = [line.plain for line in WorkerTable([WORKER], 1).lines(30, 10)]
     assert "".join(lines[1:]) == LONG
     assert WorkerTable([WORKER], 1).height(30) == len(lines)
 
 
-def test_lines_go_to_the_blocks_that_are_needed_first():
+def test_lines_go_to_the_blocks_of_the_highest_priority():
     blocks = [Block(1, 2, 4, 9, list), Block(0, 1, 1, 1, list), Block(2, 3, 5, 5, list)]
     assert allocate_lines(blocks, None) == [9, 1, 5]
     assert allocate_lines(blocks, 0) == [0, 0, 0]
@@ -108,7 +108,7 @@ SIZES = st.tuples(st.integers(0, 9), st.integers(1, 5), st.integers(0, 5), st.in
 
 
 @given(st.lists(SIZES), st.integers(0, 40))
-def test_no_more_lines_are_allotted_than_there_are(parts, lines):
+def test_no_more_lines_are_given_than_available(parts, lines):
     blocks = [Block(priority, least, least + more, least + more + most, list) for priority, least, more, most in parts]
     given_lines = allocate_lines(blocks, lines)
     assert sum(given_lines) <= lines
@@ -117,7 +117,7 @@ def test_no_more_lines_are_allotted_than_there_are(parts, lines):
     )
 
 
-def test_candidates_are_cells_that_fill_in_and_the_best_is_marked():
+def test_candidates_are_cells_and_the_best_is_highlighted():
     population = Population(7, 0, 5, (4, 2, 1, 0, 4), (4, 4, 4, 4, 4), (1.0, 2.0, 3.0, None, 4.0))
     (line,) = candidate_grid(population, 80, 1)
     assert line.plain == "█▄▂·█"
@@ -126,7 +126,7 @@ def test_candidates_are_cells_that_fill_in_and_the_best_is_marked():
     assert [len(each) for each in candidate_grid(many, 76, 2)] == [76, 74]
 
 
-def test_a_curve_is_as_high_as_it_may_be():
+def test_a_curve_has_the_given_height():
     assert bar_chart([0.0, 7.0], 1) == ["▁█"]
     assert bar_chart([0.0, 15.0], 2) == [" █", "▁█"]
     assert bar_chart([3.0, 3.0], 2) == ["  ", "▁▁"]
@@ -138,16 +138,16 @@ def test_an_ended_run_shows_its_last_generations_candidates():
     assert "generation 6     8/8 episodes, so far -12 to 140" in text
 
 
-def test_workers_beyond_the_head_are_counted():
+def test_workers_beyond_the_first_are_counted():
     known = dataclasses.replace(STATUS.workers, known=31)
     assert "and 30 more" in drawn(dataclasses.replace(STATUS, workers=known), 80)
 
 
-def test_a_run_without_workers_says_how_to_start_one():
+def test_a_run_without_workers_shows_how_to_start_one():
     gone = dataclasses.replace(STATUS, worker_list=())
-    told = drawn(gone, 80, "--connect tcp/lab:7448")
-    assert "no worker is present; start one with" in told
-    assert "dreamfleet worker --run night --connect tcp/lab:7448" in told
+    panel = drawn(gone, 80, "--connect tcp/lab:7448")
+    assert "no worker is present; start one with" in panel
+    assert "dreamfleet worker --run night --connect tcp/lab:7448" in panel
     new = dataclasses.replace(gone, throughput=dataclasses.replace(gone.throughput, environment_steps=0))
     assert "no workers yet; start one with" in drawn(new, 80)
 
@@ -156,7 +156,7 @@ HOSTILE = "[/bold][red]\x1b[2J\x1b]0;owned\x07\u202e\ud800[link=x]\n2026"
 
 
 def hostile(value):
-    """The same document with every text replaced by one that a terminal or a table would obey."""
+    """The document with every text replaced by one with markup and control characters."""
     if isinstance(value, str):
         return HOSTILE
     if isinstance(value, dict):
@@ -164,8 +164,8 @@ def hostile(value):
     if isinstance(value, (tuple, list)):
         return tuple(map(hostile, value))
     if dataclasses.is_dataclass(value):
-        told = {each.name: hostile(getattr(value, each.name)) for each in dataclasses.fields(value)}
-        return dataclasses.replace(value, **told)
+        values = {each.name: hostile(getattr(value, each.name)) for each in dataclasses.fields(value)}
+        return dataclasses.replace(value, **values)
     return value
 
 
@@ -175,7 +175,7 @@ def obeyed(text):
 
 @pytest.mark.parametrize("workers", [STATUS.worker_list, ()])
 @pytest.mark.parametrize("why", ["", HOSTILE])
-def test_no_text_of_others_is_markup_or_an_order_to_a_terminal(workers, why):
+def test_untrusted_text_is_no_markup_and_cannot_control_the_terminal(workers, why):
     status = dataclasses.replace(hostile(dataclasses.replace(STATUS, worker_list=workers)), why=why)
     text = drawn(status, 100)
     assert not obeyed(text)
@@ -188,13 +188,13 @@ def test_a_sparkline_of_any_numbers(means):
     assert "mean fitness by generation" in drawn(dataclasses.replace(STATUS, recent=recent), 100)
 
 
-def test_a_failure_that_names_no_worker_is_shown():
+def test_a_failure_without_worker_is_shown():
     failure = dataclasses.replace(STATUS.failures[0], errors={})
     assert "no reason was given" in drawn(dataclasses.replace(STATUS, why="", failures=(failure,)), 100)
 
 
 @pytest.mark.parametrize("columns", [60, 80])
-def test_the_whole_run_is_in_the_curve_however_long_it_is(columns):
+def test_the_curve_covers_the_whole_run(columns):
     history = [dataclasses.replace(STATUS.recent[0], number=number, mean=float(number)) for number in range(4000)]
     rows = drawn(dataclasses.replace(STATUS, recent=tuple(history)), columns).splitlines()
     (caption,) = (row for row, text in enumerate(rows) if "mean fitness by generation, 0 to 3999" in text)
@@ -204,7 +204,7 @@ def test_the_whole_run_is_in_the_curve_however_long_it_is(columns):
     assert columns - 15 < len(lowest) < columns
 
 
-def test_a_driven_stage_of_a_dream_is_told_so_and_what_was_before_it_is_no_part_of_its_curve():
+def test_a_driven_stage_is_described_and_its_curve_dims_earlier_ones():
     task = dataclasses.replace(STATUS.settings.task, task="dream")
     history = tuple(dataclasses.replace(STATUS.recent[0], number=number) for number in range(7))
     generation = dataclasses.replace(

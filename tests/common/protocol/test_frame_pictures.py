@@ -20,12 +20,12 @@ def random(*shape):
 
 
 @pytest.mark.parametrize("side", [64, 96])
-def test_what_a_model_sees_arrives_as_it_is_whatever_it_shows(side):
+def test_a_small_picture_round_trips(side):
     picture = random(side, side)
     assert (unpack_picture(frame(*pack_picture(picture))) == picture).all()
 
 
-def test_a_large_picture_is_the_mean_of_its_pixels():
+def test_a_large_picture_is_averaged():
     picture = np.zeros((400, 600, 3), np.uint8)
     picture[:, ::3] = 90
     height, width, data = pack_picture(picture)
@@ -34,7 +34,7 @@ def test_a_large_picture_is_the_mean_of_its_pixels():
 
 
 @pytest.mark.parametrize("shape", [(2000, 3000), (1, 5000), (5000, 1), (257, 257)])
-def test_every_picture_becomes_small_enough(shape):
+def test_every_picture_fits(shape):
     height, width, data = pack_picture(random(*shape))
     assert max(height, width) <= MAX_PICTURE_SIDE
     assert len(data) <= MAX_PART
@@ -50,12 +50,12 @@ def test_every_picture_becomes_small_enough(shape):
         (frame(2, 2, zlib.compress(bytes(11))), "wrong length"),
     ],
 )
-def test_bytes_that_are_no_such_picture_are_malformed(sent, reason):
+def test_invalid_picture_bytes_are_malformed(sent, reason):
     with pytest.raises(MalformedError, match=reason):
         unpack_picture(sent)
 
 
-def test_a_bomb_takes_no_more_memory_than_the_picture_that_it_says_to_be():
+def test_a_zip_bomb_takes_no_more_memory_than_its_declared_picture():
     bomb = zlib.compress(bytes(30 << 20), 9)
     tracemalloc.start()
     with pytest.raises(MalformedError, match="wrong length"):
@@ -64,5 +64,5 @@ def test_a_bomb_takes_no_more_memory_than_the_picture_that_it_says_to_be():
     tracemalloc.stop()
 
 
-def test_no_picture_is_none():
+def test_a_frame_without_picture_gives_none():
     assert unpack_picture(frame(1, 1, b"", packed=False)) is None

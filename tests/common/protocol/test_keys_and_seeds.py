@@ -21,7 +21,7 @@ def test_bad_run_names_are_refused(name):
 
 
 @pytest.mark.parametrize("name", ["ok", "hostB", "Rack_3.slot-1", "0", "x" * 63])
-def test_a_worker_keeps_the_name_that_it_was_given(name):
+def test_a_worker_keeps_its_given_name(name):
     identity = keys.new_worker_identity(name)
     assert keys.is_worker_identity(identity)
     assert identity.split("/")[0] == name
@@ -29,34 +29,34 @@ def test_a_worker_keeps_the_name_that_it_was_given(name):
 
 
 @pytest.mark.parametrize("name", ["", "Big Host!", "***", "-a", ".a", "a/b", "@a", "x" * 64, "häuschen", "a\n"])
-def test_a_worker_name_that_cannot_be_kept_is_refused(name):
+def test_an_invalid_worker_name_is_refused(name):
     assert not keys.is_worker_identity(f"{name}/0a0b0c0d")
     with pytest.raises(UsageError, match="cannot name a worker"):
         keys.new_worker_identity(name)
 
 
 @pytest.mark.parametrize("host", ["Big Host!", "***", "", "ok", "x" * 200, "häuschen"])
-def test_any_host_gives_its_worker_a_name(monkeypatch, host):
+def test_every_host_name_gives_a_valid_worker_name(monkeypatch, host):
     monkeypatch.setattr(socket, "gethostname", lambda: host)
     assert re.fullmatch(r"[a-z0-9][a-z0-9.-]{0,62}/[0-9a-f]{8}", keys.new_worker_identity())
     assert keys.is_worker_identity(keys.new_worker_identity())
 
 
-def test_two_lives_differ():
+def test_two_identities_differ():
     assert keys.new_worker_identity("a") != keys.new_worker_identity("a")
 
 
-def test_keys_of_workers_give_the_worker_back():
+def test_a_workers_key_contains_its_identity():
     assert keys.worker_from_key(keys.result("run", "host/0a0b0c0d")) == "host/0a0b0c0d"
 
 
-def test_training_seeds_belong_to_training_and_to_one_episode():
+def test_training_seeds_are_unique_and_in_the_training_range():
     made = [seeds.training_seed(run, g, e) for run in range(4) for g in range(10) for e in range(10)]
     assert len(set(made)) == len(made)
     assert all(seeds.TRAINING_FIRST <= seed <= seeds.TRAINING_LAST for seed in made)
     assert made[0] == seeds.training_seed(0, 0, 0)
 
 
-def test_validation_and_test_tracks_never_meet():
+def test_validation_and_test_seeds_are_disjoint():
     assert not set(seeds.validation_seeds(100)) & set(seeds.TEST)
     assert seeds.validation_seeds(3) == (20000, 20001, 20002)

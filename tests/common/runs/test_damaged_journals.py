@@ -1,4 +1,4 @@
-"""Journals that people pass around, damaged: what can be read is told, what cannot is one line."""
+"""Damaged journals: each value is read, or is a one-line error."""
 
 import os
 import random
@@ -23,7 +23,7 @@ def folder(tmp_path):
 
 
 def look(folder):
-    """Everything that a journal tells."""
+    """Read everything in a journal."""
     with RunFolder(folder) as run:
         assert run.settings.population > 1
         run.history(), run.evaluations(), run.rollouts(), run.strategy_state(), run.result_count()
@@ -32,8 +32,8 @@ def look(folder):
         run.candidate(0, 0), run.fitness(0, 0), run.results(0, 0), run.classes.description
 
 
-def test_what_a_killed_coordinator_had_begun_to_write_is_undone(folder, tmp_path):
-    """Before a journal turns to its log it has a rollback journal, which a reader must not roll back."""
+def test_a_killed_coordinators_open_transaction_is_rolled_back(folder, tmp_path):
+    """Until it switches to its write-ahead log, a journal has a rollback journal, which a reader cannot roll back."""
     path = folder / "journal.sqlite"
     with sqlite3.connect(path, isolation_level=None) as writer:
         writer.execute("PRAGMA journal_mode = DELETE")
@@ -64,7 +64,7 @@ def test_damaged_pages(folder, watched):
 
 
 def loose(path):
-    """The same rows in tables that take anything, as another program might have written them."""
+    """The same rows in tables without type checks, as another program might have written them."""
     with sqlite3.connect(path) as old:
         migrate(old, check_schema(old, path))
         names = [name for (name,) in old.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
@@ -119,7 +119,7 @@ def test_a_query_that_never_ends_is_not_run(folder):
         look(folder)
 
 
-def test_a_journal_that_is_no_file_is_one_line(tmp_path, watched):
+def test_a_journal_that_is_no_file_is_a_one_line_error(tmp_path, watched):
     folder = tmp_path / "night"
     folder.mkdir()
     journal = folder / "journal.sqlite"
@@ -134,21 +134,21 @@ def test_a_journal_that_is_no_file_is_one_line(tmp_path, watched):
     assert not watched.read(JournalError, open_run, tmp_path / ("x" * 5000), "night")
 
 
-def test_a_folder_whose_name_is_part_of_an_address_is_read(folder):
+def test_a_folder_name_with_uri_characters_is_read(folder):
     strange = folder.rename(folder.with_name("50%20 #1 ?mode=rwc"))
     look(strange)
 
 
-def test_a_confirmed_score_of_no_drives_is_damaged(folder):
+def test_a_confirmed_score_of_no_episodes_is_damaged(folder):
     with sqlite3.connect(folder / "journal.sqlite") as journal:
-        told = '{"generation": 1, "episodes": 0, "mean": 1.0, "std": 1.0, "closed": 9}'
-        journal.execute("INSERT OR REPLACE INTO run VALUES ('confirmed', ?)", (told,))
+        text = '{"generation": 1, "episodes": 0, "mean": 1.0, "std": 1.0, "closed": 9}'
+        journal.execute("INSERT OR REPLACE INTO run VALUES ('confirmed', ?)", (text,))
     journal.close()
     with RunFolder(folder) as run, pytest.raises(JournalError, match="confirmed score is damaged"):
         run.confirmation()
 
 
-def test_a_journal_that_another_program_keeps_locked_is_not_called_damaged(folder, monkeypatch):
+def test_a_locked_journal_is_not_called_damaged(folder, monkeypatch):
     other = sqlite3.connect(folder / "journal.sqlite", isolation_level=None)
     other.execute("PRAGMA journal_mode = delete")
     other.execute("BEGIN EXCLUSIVE")

@@ -1,4 +1,4 @@
-"""Drives of a controller: their figures, the document they are told in, and whether another's are better."""
+"""Evaluation results: statistics, reports, comparison and reproduction."""
 
 import json
 from dataclasses import replace
@@ -22,33 +22,33 @@ JUDGEMENT = EvaluationReport("tiny", "cd" * 32, "dream", "car-racing", "ab" * 32
 
 
 def scored(*scores, first=10_000, **others):
-    """A report of a world that tells nothing but scores."""
+    """A report of an environment that reports only scores."""
     drives = tuple(EpisodeResult(seed, float(score), 10) for seed, score in enumerate(scores, first))
     return replace(JUDGEMENT, drives=drives, **others)
 
 
-def test_figures_are_of_all_drives_and_a_long_one_counts_for_more():
+def test_statistics_weight_episodes_by_their_steps():
     found = EpisodeResults.of(reversed(DRIVES))
     assert found.seeds == (10_000, 10_001, 10_002)
-    assert (found.mean, found.median, found.least, found.most) == (670.0, 850.0, 250.0, 910.0)
+    assert (found.mean, found.median, found.worst, found.best) == (670.0, 850.0, 250.0, 910.0)
     assert found.std == pytest.approx(np.std(found.scores))
     assert found.error == pytest.approx(np.std(found.scores, ddof=1) / np.sqrt(3))
     assert (found.above(800), found.above(910), found.steps, found.finished) == (2 / 3, 0.0, 2000, 1)
     assert (found.speed, found.braking) == (pytest.approx(60.0), pytest.approx(0.1))
 
 
-def test_one_drive_has_no_spread():
+def test_one_episode_has_no_standard_error():
     assert scored(839.0).description.startswith("839.0 on one seed; judged by")
 
 
-def test_a_world_that_tells_nothing_leaves_its_figures_out():
+def test_figures_that_an_environment_does_not_report_are_left_out():
     found = scored(1.0).results
     assert (found.finished, found.speed, found.braking, found.error) == (None, None, None, None)
     assert "laps" not in scored(1.0).description
     assert "standard error" not in scored(1.0).description
 
 
-def test_people_are_told_how_it_drove_and_what_with():
+def test_the_description_covers_driving_and_origin():
     score, manner, origin = JUDGEMENT.description.splitlines()
     assert score.startswith("670.0 ± 210.7 (standard error) on 3 seeds, 250 to 910, median 850")
     assert manner == (
@@ -66,12 +66,12 @@ def test_people_are_told_how_it_drove_and_what_with():
         (800, 2, "100.0 below gymnasium's threshold of 900, on fewer than 100 seeds"),
     ],
 )
-def test_people_are_told_whether_the_world_is_solved(mean, count, says):
+def test_the_description_says_whether_the_environment_is_solved(mean, count, says):
     assert scored(*[mean] * count, threshold=900.0).description.splitlines()[1] == says
     assert "threshold" not in scored(*[mean] * count).description, "where gymnasium names none"
 
 
-def test_a_report_is_read_as_it_was_written_and_tells_its_figures(tmp_path):
+def test_a_report_round_trips_with_its_statistics(tmp_path):
     path = tmp_path / "report.json"
     path.write_text(JUDGEMENT.to_json())
     plain = json.loads(path.read_text())
@@ -81,7 +81,7 @@ def test_a_report_is_read_as_it_was_written_and_tells_its_figures(tmp_path):
     assert plain["drives"][1]["steps"] == 500
 
 
-def test_a_report_that_was_written_before_a_field_existed_is_read(tmp_path):
+def test_a_report_without_newer_fields_is_read(tmp_path):
     plain = json.loads(JUDGEMENT.to_json())
     del plain["threshold"]
     path = tmp_path / "older.json"
@@ -90,7 +90,7 @@ def test_a_report_that_was_written_before_a_field_existed_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"drives": []}', JUDGEMENT.to_json().replace("910.0", '"910"')])
-def test_what_is_no_report_is_refused_in_one_line(tmp_path, text):
+def test_an_invalid_report_is_a_one_line_error(tmp_path, text):
     path = tmp_path / "report.json"
     path.write_text(text)
     with pytest.raises(UsageError, match="write it again"):
@@ -99,7 +99,7 @@ def test_what_is_no_report_is_refused_in_one_line(tmp_path, text):
         read_evaluation_report(tmp_path / "nowhere.json")
 
 
-def test_a_difference_is_of_equal_seeds_and_what_tracks_have_in_common_falls_out():
+def test_a_difference_is_paired_by_seed():
     found = PairedDifference.between(scored(100, 500, 900).results, scored(110, 512, 908, 0).results)
     assert (found.seeds, found.mean) == (3, 10.0)
     assert found.error == pytest.approx(np.std([10, 12, 8], ddof=1) / np.sqrt(3))
@@ -107,13 +107,11 @@ def test_a_difference_is_of_equal_seeds_and_what_tracks_have_in_common_falls_out
     assert found.description.endswith("on 3 equal seeds: better")
 
 
-def test_a_difference_under_two_standard_errors_is_none():
+def test_a_difference_under_two_standard_errors_is_not_significant():
     found = PairedDifference.between(scored(100, 500, 900).results, scored(200, 400, 930).results)
     assert not found.is_significant
-    assert found.description.endswith("none, for a difference under 4.4 standard errors of so few seeds is none")
-    assert PairedDifference(30, 1.0, 0.6).description.endswith(
-        "none, for a difference under two standard errors is none"
-    )
+    assert found.description.endswith("not significant, as it is under 4.4 standard errors of so few seeds")
+    assert PairedDifference(30, 1.0, 0.6).description.endswith("not significant, as it is under two standard errors")
     bounds = [round(PairedDifference(seeds, 0, 1).critical_value, 2) for seeds in (4, 8, 16)]
     assert bounds == [3.28, 2.43, 2.18]  # t itself: 3.31, 2.43, 2.18
     assert (
@@ -140,23 +138,23 @@ def test_the_verb_compares_each_report_with_the_first(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("scores", [(1e308, 2, 3), (float("nan"), 2, 3)])
-def test_scores_that_nothing_can_be_computed_from_are_no_report(tmp_path, scores):
+def test_scores_out_of_range_are_no_report(tmp_path, scores):
     path = tmp_path / "a.json"
     path.write_text(json.dumps({**json.loads(scored(1, 2, 3).to_json()), "drives": [
         {"seed": seed, "score": score, "steps": 9} for seed, score in enumerate(scores)
     ]}))  # fmt: skip
-    with pytest.raises(UsageError, match="no report"):
+    with pytest.raises(UsageError, match="not a report"):
         read_evaluation_report(path)
 
 
-def test_a_seed_that_stands_twice_is_no_report(tmp_path):
+def test_a_duplicate_seed_is_no_report(tmp_path):
     path = tmp_path / "a.json"
     path.write_text(scored(1, 2).to_json().replace("10001", "10000"))
-    with pytest.raises(UsageError, match="a seed stands there twice"):
+    with pytest.raises(UsageError, match="a seed occurs twice"):
         read_evaluation_report(path)
 
 
-def test_what_else_differs_than_the_controllers_is_noted(tmp_path, capsys):
+def test_other_differences_than_the_controllers_are_noted(tmp_path, capsys):
     for name, changes in {"a": {}, "b": {"task": "car-racing"}, "c": {"fingerprint": "arm"}}.items():
         (tmp_path / f"{name}.json").write_text(scored(1, 2, **changes).to_json())
     assert command_line.main(["compare", *(str(tmp_path / f"{name}.json") for name in "abc")]) == 0
@@ -168,7 +166,7 @@ def test_what_else_differs_than_the_controllers_is_noted(tmp_path, capsys):
 ELSEWHERE = {"fingerprint": "aarch64"}
 
 
-def test_one_seed_of_other_bits_is_not_reproduced_and_no_difference_is_asked_of_it():
+def test_a_single_differing_seed_is_not_reproduced():
     found = Reproduction(scored(100, 500), scored(110, **ELSEWHERE))
     assert not found.is_reproduced
     assert "NOT reproduced: 110.0 instead of 100.0 on one seed" in found.description
@@ -176,7 +174,7 @@ def test_one_seed_of_other_bits_is_not_reproduced_and_no_difference_is_asked_of_
 
 @pytest.mark.parametrize("words", [("--episodes", "99999999999"), ("--first-seed", "9223372036854775807")])
 @pytest.mark.parametrize("verb", [("evaluate", "--controller", "tiny"), ("baseline", "evaluate", "random")])
-def test_seeds_that_no_report_could_tell_of_are_refused_before_anybody_drives(verb, words, capsys):
+def test_seeds_out_of_range_are_refused_before_the_episodes(verb, words, capsys):
     assert command_line.main([*verb, *words]) == 2
     assert "--episodes must be at most 100000, and seeds below" in capsys.readouterr().err
 
@@ -192,7 +190,7 @@ def test_seeds_that_no_report_could_tell_of_are_refused_before_anybody_drives(ve
         ((100, 500), {}, True, "the same 2 scores"),
     ],
 )
-def test_a_record_holds_to_the_bit_on_an_equal_host_and_within_two_standard_errors_elsewhere(
+def test_reproduction_is_to_the_bit_on_equal_hosts_and_within_two_standard_errors_elsewhere(
     scores, changes, holds, says
 ):
     found = Reproduction(scored(100, 500, 900), scored(*scores, **changes))

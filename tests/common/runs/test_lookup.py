@@ -1,4 +1,4 @@
-"""What is named on the command line: what ships before files."""
+"""Lookup by name: shipped artifacts before files."""
 
 import numpy as np
 import pytest
@@ -18,11 +18,11 @@ def subspace():
 @pytest.mark.parametrize(
     "path", sorted((pretrained_folder() / lookup.SUBSPACES).glob("*.npz")), ids=lambda path: path.stem
 )
-def test_what_ships_is_of_the_world_model_of_its_name(path):
+def test_a_shipped_subspace_fits_the_world_model_of_its_name(path):
     assert find_subspace(path.stem).bundle == find_bundle(path.stem).sha256
 
 
-def test_a_subspace_is_one_that_ships_or_a_file(subspace, tmp_path, monkeypatch):
+def test_a_subspace_is_a_shipped_one_or_a_file(subspace, tmp_path, monkeypatch):
     monkeypatch.setattr(lookup, "pretrained_folder", lambda: tmp_path / "ships")
     (tmp_path / "ships" / lookup.SUBSPACES).mkdir(parents=True)
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""What a controller tells of the run that it came from."""
+"""The run provenance in a controller."""
 
 import base64
 from dataclasses import replace
@@ -36,7 +36,7 @@ def controller(**provenance):
 
 
 @pytest.mark.parametrize("receipt", [RECEIPTS, RunProvenance(0, Effort())])
-def test_a_receipt_comes_back_from_a_controllers_file(tmp_path, receipt):
+def test_a_receipt_round_trips_in_a_controller_file(tmp_path, receipt):
     controller(**{RECEIPT: to_dict(receipt)}).save(tmp_path / "a.npz")
     found = read_run_provenance(Controller.load(tmp_path / "a.npz"))
     assert found == receipt
@@ -45,30 +45,32 @@ def test_a_receipt_comes_back_from_a_controllers_file(tmp_path, receipt):
         assert found.total == Effort(15, 2, 0, 3_600_000)
 
 
-def test_what_an_earlier_version_wrote_is_repeated_from_what_it_tells(tmp_path):
+def test_an_older_controllers_provenance_is_derived(tmp_path):
     tiny, _ = find_controller("tiny", tmp_path)
     found = read_run_provenance(tiny)
     assert (found.generations, found.effort, found.start) == (25, Effort(dreamt=10_240_000), None)
     assert read_run_settings(tiny).task.temperature == 1.5
 
 
-@pytest.mark.parametrize("told", [{}, {RECEIPT: 1}, {RECEIPT: {"generations": -1}}, {"settings": {}, "generation": 1}])
-def test_a_controller_without_a_receipt_says_so(told):
+@pytest.mark.parametrize(
+    "provenance", [{}, {RECEIPT: 1}, {RECEIPT: {"generations": -1}}, {"settings": {}, "generation": 1}]
+)
+def test_a_controller_without_receipt_is_an_error(provenance):
     with pytest.raises(ControllerError, match="run"):
-        read_run_provenance(controller(**told))
+        read_run_provenance(controller(**provenance))
 
 
-def test_a_start_that_is_not_the_one_that_was_hashed_is_refused():
+def test_a_start_with_a_wrong_hash_is_refused():
     with pytest.raises(ControllerError, match="damaged"):
         _ = replace(START, mean=START.mean[:-4]).vector
 
 
-def test_it_names_the_seeds_that_judged():
+def test_validation_seed_ranges():
     assert validation_seed_ranges(SETTINGS) == {"evaluation": (20_000, 3), "confirmation": (40_000, 8)}
     assert validation_seed_ranges(replace(SETTINGS, evaluate_every=0, confirm_episodes=0)) == {}
 
 
-def test_effort_counts_reality_apart_from_the_dream():
+def test_effort_counts_reality_and_dream_separately():
     kinds = [("car-racing", "score"), ("car-racing", "evaluate"), ("dream", "score"), ("dream", "evaluate")]
     found = sum((Effort.of(task, kind, 10.0, 1e6) for task, kind in kinds), Effort.of("dream", "collect", 5, 0))
     assert (found.driven, found.judged, found.dreamt, found.steps) == (15, 20, 10, 35)
@@ -80,5 +82,5 @@ def test_effort_counts_reality_apart_from_the_dream():
 @pytest.mark.parametrize(
     ("steps", "said"), [(930, "930"), (12_345, "12.3k"), (28 * 10**5, "2.8M"), (17 * 10**8, "1.7G")]
 )
-def test_steps_are_said_shortly(steps, said):
+def test_steps_are_formatted(steps, said):
     assert format_steps(steps) == said

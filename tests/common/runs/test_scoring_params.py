@@ -28,7 +28,7 @@ def temperature(generation, evaluations, settings=SETTINGS):
 
 
 def raised(means, settings=SETTINGS):
-    """Of the first generation that all of the checks decide upon."""
+    """The temperature of the first generation that depends on all evaluations."""
     found = temperature(EVERY * (len(means) + 1), checks(*means), settings)
     return None if found == settings.task.temperature else found
 
@@ -48,11 +48,11 @@ def raised(means, settings=SETTINGS):
         ((500.0, 400.0, 300.0, 200.0, 300.0, 200.0), 3.375),
     ],
 )
-def test_a_check_that_falls_clearly_raises_the_temperature_and_begins_the_comparison_anew(means, expected):
+def test_a_clear_fall_raises_the_temperature_and_restarts_the_comparison(means, expected):
     assert raised(means) == expected
 
 
-def test_a_generation_is_decided_by_checks_that_are_a_whole_block_old():
+def test_the_temperature_depends_on_evaluations_at_least_one_interval_old():
     found = [temperature(generation, checks(500.0, 400.0, 390.0)) for generation in range(20)]
     found = [None if each == SETTINGS.task.temperature else each for each in found]
     assert found == [None] * 15 + [1.5] * 5
@@ -60,26 +60,26 @@ def test_a_generation_is_decided_by_checks_that_are_a_whole_block_old():
     assert [state.required_evaluation(generation) for generation in (0, 9, 10, 14, 15)] == [-1, -1, 4, 4, 9]
 
 
-def test_later_checks_and_those_off_the_schedule_and_the_order_of_arrival_change_nothing():
+def test_later_and_unscheduled_evaluations_and_their_order_do_not_matter():
     known = checks(500.0, 450.0, 500.0)
     stray = [StoredEvaluation(7, 16, 900.0, 40.0), *checks(0.0, 0.0, 0.0, 0.0, 0.0)[3:]]
     for order in itertools.permutations([*known, *stray]):
         assert temperature(20, order) == temperature(20, known) == 1.5
 
 
-def test_the_temperature_stays_within_what_a_message_may_carry():
+def test_the_temperature_is_bounded():
     hottest = dataclasses.replace(SETTINGS, heat=1e300)
     assert raised((500.0, 400.0, 300.0, 200.0), hottest) == MAX_TEMPERATURE
 
 
-def test_without_heat_nothing_is_raised_or_waited_for():
+def test_without_heat_nothing_is_raised_or_required():
     cold = dataclasses.replace(SETTINGS, heat=1.0)
     assert raised((500.0, 400.0, 300.0, 200.0), cold) is None
     never = dataclasses.replace(cold, evaluate_every=0)
     assert [ScheduleState(each).required_evaluation(50) for each in (cold, never)] == [-1, -1]
 
 
-def test_settings_and_digests_without_heat_are_what_they_were():
+def test_settings_and_digests_without_heat_are_unchanged():
     cold = dataclasses.replace(SETTINGS, heat=1.0)
     assert '"heat"' not in cold.to_json()
     assert RunSettings.from_json(cold.to_json()) == cold

@@ -30,7 +30,7 @@ def numbers(settings, closed, evaluations=()):
     return [scoring_params_at(number, settings, closed, evaluations).stage.number for number in range(len(closed) + 1)]
 
 
-def test_what_a_stage_does_not_name_is_as_in_the_one_before():
+def test_unchanged_settings_are_those_of_the_stage_before():
     stages = stages_of(scheduled(
         StageSettings(3), StageSettings(2, horizon=400, racing=True), StageSettings(population=9, patience=0),
     ))  # fmt: skip
@@ -39,7 +39,7 @@ def test_what_a_stage_does_not_name_is_as_in_the_one_before():
     ]  # fmt: skip
 
 
-def test_the_search_begins_anew_with_another_population_or_a_step_size_alone():
+def test_another_population_or_step_size_starts_a_new_search():
     later = [StageSettings(population=9), StageSettings(sigma0=0.1), StageSettings(population=6),
              StageSettings(horizon=5, patience=3, episodes=4, racing=True)]  # fmt: skip
     assert [stages_of(scheduled(StageSettings(1), each))[1].starts_new_search for each in later] == [
@@ -50,34 +50,34 @@ def test_the_search_begins_anew_with_another_population_or_a_step_size_alone():
     ]
 
 
-def test_a_search_that_goes_on_is_that_of_the_stage_that_began_it():
+def test_a_continued_search_belongs_to_the_stage_that_started_it():
     stages = stages_of(scheduled(StageSettings(1), StageSettings(1, sigma0=0.2), StageSettings(horizon=5)))
     assert [each.search for each in stages] == [1, 2, 2]
 
 
-def test_a_stage_ends_by_its_own_generations_whatever_the_run_has_behind_it():
+def test_a_stage_ends_after_its_own_generations():
     settings = scheduled(StageSettings(3), StageSettings(1), StageSettings(2), StageSettings())
     assert numbers(settings, history(*[10] * 8)) == [1, 1, 1, 2, 3, 3, 4, 4, 4]
 
 
-def test_a_stage_ends_by_its_own_steps():
+def test_a_stage_ends_after_its_own_steps():
     settings = scheduled(StageSettings(steps=25), StageSettings(steps=1, horizon=50), StageSettings())
     assert numbers(settings, history(10, 10, 10, 10, 10)) == [1, 1, 1, 2, 3, 3]
 
 
-def test_a_score_ends_a_stage_when_its_evaluation_is_a_whole_interval_old():
+def test_a_score_ends_a_stage_once_its_evaluation_is_one_interval_old():
     settings = scheduled(StageSettings(score=50.0), StageSettings(horizon=50))
     assert numbers(settings, history(*[10] * 8), evaluated({1: 10.0, 3: 50.0, 5: 0.0})) == [1] * 6 + [2] * 3
 
 
-def test_a_score_of_an_earlier_stage_or_off_the_schedule_ends_nothing():
+def test_scores_of_earlier_stages_or_unscheduled_evaluations_end_no_stage():
     settings = scheduled(StageSettings(4), StageSettings(score=50.0), StageSettings(horizon=50))
     stray = evaluated({1: 90.0, 3: 90.0, 4: 90.0, 5: 10.0, 6: 90.0})
     assert numbers(settings, history(*[10] * 9), stray) == [1] * 4 + [2] * 6
     assert numbers(settings, history(*[10] * 9), [*stray[:3], *evaluated({5: 50.0})]) == [1] * 4 + [2] * 4 + [3] * 2
 
 
-def test_later_evaluations_and_the_order_of_arrival_change_nothing():
+def test_later_evaluations_and_their_order_do_not_matter():
     settings = scheduled(StageSettings(score=50.0), StageSettings(horizon=50))
     for order in itertools.permutations(evaluated({1: 10.0, 3: 50.0, 5: 90.0, 7: 0.0})):
         assert scoring_params_at(5, settings, history(*[10] * 9), order).stage.number == 1
@@ -89,7 +89,7 @@ def test_later_evaluations_and_the_order_of_arrival_change_nothing():
     [(StageSettings(9), [-1] * 8), (StageSettings(score=1.0), [-1, -1, -1, 1, 1, 3, 3, 5])],
     ids=["generations", "score"],
 )
-def test_a_generation_waits_for_an_evaluation_only_where_a_score_may_end_its_stage(end, required_evaluation):
+def test_a_generation_requires_an_evaluation_only_if_a_score_may_end_its_stage(end, required_evaluation):
     agenda, found = ScheduleState(scheduled(end, StageSettings())), []
     for number in range(8):
         agenda.scoring_params(number, history(*[10] * number), {})
@@ -97,7 +97,7 @@ def test_a_generation_waits_for_an_evaluation_only_where_a_score_may_end_its_sta
     assert found == required_evaluation
 
 
-def test_a_stage_and_its_reason_are_told():
+def test_stages_and_their_reasons_are_described():
     settings = scheduled(StageSettings(2), StageSettings(steps=15), StageSettings(score=50.0), StageSettings())
     begun = begun_stages(settings, history(*[10] * 9), evaluated({5: 51.25}))
     assert [(each.since, each.why) for each in begun] == [
@@ -107,7 +107,7 @@ def test_a_stage_and_its_reason_are_told():
     assert begun[3].stage.end_condition == "to the end"
 
 
-def test_a_candidate_is_scored_under_its_stage_and_as_warm_as_its_generation():
+def test_candidates_are_scored_with_their_stage_and_temperature():
     warm = replace(PLAIN, task=replace(SPEC, temperature=1.0), heat=1.5)
     settings = replace(warm, stages=(StageSettings(4), StageSettings(horizon=50, patience=0)))
     cooled = evaluated({1: 100.0, 3: 10.0})
@@ -116,14 +116,14 @@ def test_a_candidate_is_scored_under_its_stage_and_as_warm_as_its_generation():
     assert longest_horizon(settings) == 1000
 
 
-def test_settings_and_digests_without_a_schedule_are_what_they_were():
+def test_settings_and_digests_without_a_schedule_are_unchanged():
     assert '"stages"' not in PLAIN.to_json()
     assert scoring_params_at(5, PLAIN, history(*[10] * 5), ()).spec == SPEC
     written = "32b5b1f8a6bee0b22ed62a5034cdf1657709a3c7b15707ad38a792110c7c9de4"  # by the version before heat
     assert SPEC.with_overrides(horizon=SPEC.horizon).digest("score", b"x" * 32, (1,)).hex() == written
 
 
-def test_a_schedule_is_journalled_without_what_no_stage_names():
+def test_a_schedule_is_stored_without_unchanged_settings():
     settings = scheduled(StageSettings(3, score=5.0), StageSettings(horizon=400, racing=False))
     assert RunSettings.from_json(settings.to_json()) == settings
     assert '"stages": [{"generations": 3, "score": 5.0}, {"horizon": 400, "racing": false}]' in settings.to_json()

@@ -1,4 +1,4 @@
-"""Join files: made by an authority, read strictly, and of use to nobody but their owner."""
+"""Join files: issued by an authority, validated strictly, and private."""
 
 import errno
 import os
@@ -41,13 +41,13 @@ def join(access, tmp_path):
     return path
 
 
-def test_what_an_authority_writes_is_its_owners_alone(access):
+def test_an_authoritys_files_are_private(access):
     assert stat.S_IMODE(access._folder.stat().st_mode) == 0o700
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in access._folder.iterdir() if path.name != "lock"}
     assert modes == dict.fromkeys(("ca.pem", "ca.key", "issued.json", "box.join"), 0o600)
 
 
-def test_a_join_file_says_who_its_holder_is_and_shows_no_secret(join):
+def test_a_join_file_identifies_its_holder_and_repr_hides_secrets(join):
     found = read_join_file(join)
     assert (found.role, found.name, found.connect, found.identity) == ("worker", "box", tuple(HERE), "worker.1")
     assert "PRIVATE KEY" in found.key
@@ -58,27 +58,27 @@ def test_a_join_file_says_who_its_holder_is_and_shows_no_secret(join):
     ("damage", "says"),
     [
         (lambda text: "", "no join file of this version"),
-        (lambda text: "not = [toml", "no TOML"),
+        (lambda text: "not = [toml", "not TOML"),
         (lambda text: text + "#" * MAX_BYTES, "larger than"),
         (lambda text: text.replace("version = 1", "version = 2"), "of this version"),
-        (lambda text: text.replace('role = "worker"', 'role = "king"'), "means nothing here"),
-        (lambda text: text.replace("seat = 1", "seat = 0"), "means nothing here"),
-        (lambda text: text.replace("seat = 1", 'seat = "1"'), "'seat' is not of its kind"),
-        (lambda text: text.replace("Z\nconnect", "\nconnect"), "means nothing here"),
+        (lambda text: text.replace('role = "worker"', 'role = "king"'), "is invalid"),
+        (lambda text: text.replace("seat = 1", "seat = 0"), "is invalid"),
+        (lambda text: text.replace("seat = 1", 'seat = "1"'), "'seat' has the wrong type"),
+        (lambda text: text.replace("Z\nconnect", "\nconnect"), "is invalid"),
         (lambda text: text.replace("name =", "nom ="), "'name' is missing"),
         (lambda text: text + 'more = "x"\n', "'more' is unknown"),
-        (lambda text: text.replace('["tls/127.0.0.1:7447"]', "[1]"), "'connect' is not of its kind"),
-        (lambda text: text.partition("certificate =")[0], "what proves its role is missing"),
+        (lambda text: text.replace('["tls/127.0.0.1:7447"]', "[1]"), "'connect' has the wrong type"),
+        (lambda text: text.partition("certificate =")[0], "its certificate, key or password is missing"),
     ],
 )  # fmt: skip
-def test_what_is_no_join_file_is_refused_in_a_line(join, damage, says):
+def test_an_invalid_join_file_is_a_one_line_error(join, damage, says):
     join.write_text(damage(join.read_text()))
     with pytest.raises(AccessError, match=says) as refused:
         read_join_file(join)
     assert "BEGIN" not in str(refused.value)
 
 
-def test_a_join_file_that_others_may_read_has_expired_or_is_none_is_refused(join, tmp_path):
+def test_a_readable_expired_or_invalid_join_file_is_refused(join, tmp_path):
     with pytest.raises(AccessError, match="expired on"):
         read_join_file(join, datetime.now(UTC) + timedelta(days=31))
     with pytest.raises(AccessError, match="no join file at"):
@@ -97,7 +97,7 @@ def test_a_workers_name_ends_in_its_seat(join):
     assert worker_seat_identity("gpu.1/0badc0de") == "worker.1"
 
 
-def test_a_seat_is_its_names_until_it_is_revoked_and_then_nobodys(access, tmp_path):
+def test_a_name_keeps_its_seat_until_revoked_and_seats_are_not_reused(access, tmp_path):
     seats = [access.issue("viewer", "anna", tmp_path / f"{number}", connect=HERE).seat for number in range(2)]
     access.revoke("anna")
     seats.append(access.issue("viewer", "anna", tmp_path / "2", connect=HERE).seat)
@@ -109,7 +109,7 @@ def test_a_seat_is_its_names_until_it_is_revoked_and_then_nobodys(access, tmp_pa
         access.revoke("carl")
 
 
-def test_what_is_revoked_is_seen_while_it_is_watched_and_what_is_damaged_takes_nothing_back(access, join, tmp_path):
+def test_the_watcher_sees_revocations_and_keeps_them_if_the_ledger_is_damaged(access, join, tmp_path):
     folder = tmp_path / "carried"
     folder.mkdir()
     watched = RevocationWatcher(folder, read_join_file(join))
@@ -128,7 +128,7 @@ def test_what_is_revoked_is_seen_while_it_is_watched_and_what_is_damaged_takes_n
         RevocationWatcher(folder, read_join_file(join))
 
 
-def test_the_verbs_make_list_and_take_back(tmp_path, capsys):
+def test_the_verbs_create_list_and_revoke(tmp_path, capsys):
     folder = ("--access-dir", str(tmp_path / "access"))
     out = tmp_path / "w.join"
     assert main(["access", "init", *folder]) == 0
@@ -144,10 +144,10 @@ def test_the_verbs_make_list_and_take_back(tmp_path, capsys):
     assert main(["access", "issue", "worker", "w2", *folder, "--connect", "tcp/h:1", "--out", f"{out}2"]) == 2
     assert main(["access", "issue", "coordinator", "c", *folder, "--out", f"{out}2"]) == 2
     assert main(["pause", "--join", str(out)]) == 1
-    assert "this needs one whose role is operator or coordinator" in capsys.readouterr().err
+    assert "this needs operator or coordinator" in capsys.readouterr().err
 
 
-def test_who_listens_is_issued_a_file_by_its_names_alone(tmp_path, capsys):
+def test_a_listener_is_issued_a_file_for_its_host_names(tmp_path, capsys):
     """The first of the five commands in docs/security.md."""
     folder, out = ("--access-dir", str(tmp_path / "access")), tmp_path / "home.join"
     assert main(["access", "init", *folder]) == 0
@@ -155,12 +155,12 @@ def test_who_listens_is_issued_a_file_by_its_names_alone(tmp_path, capsys):
     assert (read_join_file(out).role, read_join_file(out).connect) == ("coordinator", ())
     for wrong in ("h.example:7447", "tls/h.example", "", "a b", "a..b"):
         assert main(["access", "issue", "coordinator", "c", *folder, "--host", wrong, "--out", f"{out}2"]) == 2
-        assert "is no host" in capsys.readouterr().err
+        assert "is not a host" in capsys.readouterr().err
     assert main(["access", "issue", "worker", "w", *folder, "--connect", "tls/[::1]:1", "--out", f"{out}2"]) == 2
     assert "give a name" in capsys.readouterr().err
 
 
-def test_a_disk_without_room_says_that_nothing_is_taken_back(access, monkeypatch):
+def test_the_error_on_a_full_disk_says_that_nothing_changed(access, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -171,14 +171,14 @@ def test_a_disk_without_room_says_that_nothing_is_taken_back(access, monkeypatch
     assert (access._folder / LEDGER_FILE).read_bytes() == before
 
 
-def test_an_authority_whose_parts_are_not_its_own_issues_nothing(tmp_path):
+def test_an_authority_with_foreign_parts_issues_nothing(tmp_path):
     def made(name):
         return Authority.create(tmp_path / name, passwords=True)._folder
 
     whole, other = made("whole"), made("other")
     for part, text, why in (
         ("ca.key", (other / "ca.key").read_text(), "key of another certificate"),
-        (LEDGER_FILE, (other / LEDGER_FILE).read_text(), "of another authority"),
+        (LEDGER_FILE, (other / LEDGER_FILE).read_text(), "another authority"),
         ("secret", "no hex", "damaged"),
         ("secret", None, "secret is missing"),
     ):
@@ -197,7 +197,7 @@ def test_an_authority_whose_parts_are_not_its_own_issues_nothing(tmp_path):
     assert read_join_file(tmp_path / "home").secret == (whole / "secret").read_text().strip()
 
 
-def test_a_folder_that_may_not_be_looked_into_is_told(access, join, tmp_path, monkeypatch):
+def test_an_unreadable_folder_is_an_error(access, join, tmp_path, monkeypatch):
     credentials = read_join_file(join)
 
     def refused(self, **_):
@@ -213,7 +213,7 @@ def test_a_folder_that_may_not_be_looked_into_is_told(access, join, tmp_path, mo
             looked()
 
 
-def test_an_authority_that_is_made_already_is_left_alone_also_by_who_began_before(tmp_path, monkeypatch):
+def test_an_existing_authority_is_not_overwritten_even_in_a_race(tmp_path, monkeypatch):
     folder = tmp_path / "access"
     begun = authority._certificate_builder
 
@@ -229,7 +229,7 @@ def test_an_authority_that_is_made_already_is_left_alone_also_by_who_began_befor
 
 
 @pytest.mark.parametrize(("ca", "host"), [("garbage", "127.0.0.1"), ("gärbage", "127.0.0.1"), ("", "a" * 70)])
-def test_what_is_damaged_is_told_and_no_traceback(join, ca, host):
+def test_damage_is_an_error_without_traceback(join, ca, host):
     with socket.create_server(("127.0.0.1", 0)) as server:
         endpoint = f"tls/{host}:{server.getsockname()[1]}"
         said = diagnose_connection([endpoint], replace(read_join_file(join), ca=ca))

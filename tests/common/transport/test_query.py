@@ -1,4 +1,4 @@
-"""Questions over a real router, and what comes back."""
+"""Queries over a real router."""
 
 import pytest
 import zenoh
@@ -12,7 +12,7 @@ HELD = []
 
 @pytest.fixture(scope="module")
 def session():
-    """A client, beside a router that answers `a/*` with the question's own key and payload, and never answers `b`."""
+    """A client of a router that replies to `a/*` with the query's key and payload, and never to `b`."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
 
     def answer(query):
@@ -34,20 +34,20 @@ def session():
         del declared
 
 
-def test_every_reply_to_every_question_comes_back(session):
+def test_every_reply_to_every_query_is_returned(session):
     assert sorted(query_all(session, ["a/1", "a/2"], 10.0, b"{}")) == [b"a/1 {}", b"a/2 {}"]
     assert query_all(session, ["a/3"], 10.0) == [b"a/3 "]
 
 
-def test_an_error_and_a_key_that_nobody_serves_are_no_replies(session):
+def test_errors_and_unserved_keys_are_no_replies(session):
     assert query_all(session, ["a/wrong", "nobody"], 10.0) == []
     assert query_all(session, [], 10.0) == []
 
 
-def test_silence_ends_with_the_timeout_and_what_came_is_kept(session):
+def test_the_timeout_ends_a_query_and_keeps_earlier_replies(session):
     assert query_all(session, ["a/1", "b"], 0.3) == [b"a/1 "]
 
 
-def test_told_to_stop_it_does_not_wait_for_the_timeout(session):
+def test_stopping_does_not_wait_for_the_timeout(session):
     looks = iter([False, False, True])
     assert query_all(session, ["b"], 3600.0, stopped=lambda: next(looks)) == []

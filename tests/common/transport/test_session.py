@@ -19,33 +19,33 @@ def test_bad_endpoints_are_refused(endpoint):
         Network(listen=(endpoint,))
 
 
-def test_a_port_in_use_says_so():
+def test_a_port_in_use_is_an_error():
     network = Network(listen=(f"tcp/127.0.0.1:{free_port()}",))
     with open_session(network), pytest.raises(ConnectionFailedError, match=r"is in use: .*--listen"):
         open_session(network)
 
 
-def test_nobody_there_says_so():
+def test_no_listener_is_an_error():
     with pytest.raises(ConnectionFailedError, match="nobody answers at"):
         open_session(Network(connect=(f"tcp/127.0.0.1:{free_port()}",)), timeout=0.2)
 
 
 def served(endpoint):
-    """A router that answers there, by its own address."""
+    """A router at this endpoint, which replies with its address."""
     session = open_session(Network(listen=(endpoint,)))
     session.declare_queryable("who", lambda query: query.reply("who", endpoint))
     return session
 
 
 def await_answer(session, endpoint):
-    """Until the router of this address is the one that is asked."""
+    """Wait until the router of this endpoint replies."""
     deadline = time.monotonic() + DEADLINE
     while [reply.ok.payload.to_string() for reply in session.get("who", timeout=1) if reply.ok] != [endpoint]:
         assert time.monotonic() < deadline, "nobody answers there"
         time.sleep(0.1)
 
 
-def test_whichever_of_its_addresses_answers_is_found_first_and_again():
+def test_the_reachable_address_is_used_first_and_again():
     first, second = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
     router = served(second)
     with open_session(Network(connect=(first, second))) as session:
@@ -57,7 +57,7 @@ def test_whichever_of_its_addresses_answers_is_found_first_and_again():
     router.close()
 
 
-def test_an_address_that_swallows_everything_keeps_nobody_from_the_others():
+def test_an_address_that_drops_packets_does_not_block_the_others():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with (
         socket.create_server(("127.0.0.1", 0)) as mute,

@@ -2,7 +2,7 @@
 
 from dreamfleet.common.protocol.codec import encode
 from dreamfleet.common.protocol.messages import Result, ResultBatch
-from dreamfleet.common.serialization.constraints import MAX_TEXT
+from dreamfleet.common.serialization.validation import MAX_TEXT
 from dreamfleet.worker.service.outbox import Outbox
 from dreamfleet.worker.service.run_session import RunSession
 from tests.support.samples import HEAD

@@ -233,6 +233,6 @@ def test_evaluations_ignore_a_stages_horizon_and_patience(random_bundle):
 
 
 @pytest.mark.parametrize("name", ["os:abort", "sys:exit", "tests.support.tasks:steps_made"])
-def test_an_attribute_that_is_no_class_is_never_called(name):
-    with pytest.raises(UsageError, match="is no task: it is no class"):
+def test_what_is_no_class_is_never_called_as_a_task(name):
+    with pytest.raises(UsageError, match="is not a task: it is not a class"):
         find_task(name)
