@@ -60,9 +60,9 @@ def test_a_step_with_a_world_model_shows_picture_latent_and_state(random_bundle,
         _, seen = watched_and_not(scorer, [(kind, vector, 2**20)])
     assert [step.step for _, step in seen] == list(range(2, HORIZON, 3))
     assert {step.picture.shape for _, step in seen} == {(64, 64, 3)}
-    step = DreamStep(random_bundle)
+    dream = DreamStep(random_bundle)
     for _, step in seen:  # latent and state are those from before the action
-        acted = step.step(
+        acted = dream.step(
             step.latent[None], vector[None], step.state[None], np.zeros((1, 32), np.float32),
             np.zeros((1, 32), np.float32), 1.0,
         )  # fmt: skip
