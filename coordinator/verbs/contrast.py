@@ -48,8 +48,7 @@ def run(args: argparse.Namespace) -> int:
     """Do all trials that are left, and compare."""
     from dreamfleet.common.files.folder_lock import folder_lock
     from dreamfleet.coordinator.experiments.contrast.trials import LOCK, Trials
-    from dreamfleet.coordinator.experiments.local_run import LocalFleet
-    from dreamfleet.coordinator.experiments.run_flags import parse_run_flags
+    from dreamfleet.coordinator.experiments.local_run import LocalFleet, parse_run_flags
 
     contrast = Contrast(parse_kinds(args.kind), tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
     parse_run_flags(contrast.common_run_flags, args.sources, "contrast")  # what is wrong with them is said now

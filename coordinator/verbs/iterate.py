@@ -73,7 +73,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
     from dreamfleet.coordinator.experiments.iteration.phases import find_init
     from dreamfleet.coordinator.experiments.iteration.plan import INIT, Phase
     from dreamfleet.coordinator.experiments.iteration.runner import Iteration
-    from dreamfleet.coordinator.experiments.run_flags import parse_run_flags
+    from dreamfleet.coordinator.experiments.local_run import parse_run_flags
 
     begun = IterationLedger.load(layout.ledger)
     config = load(IterateConfig, "iterate", base=begun.settings if begun else None, **args.sources)

@@ -17,6 +17,7 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.subspace import Subspace
+from dreamfleet.common.cli.verb_runner import ProcessRunner
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.experiments.iteration.commands import Commands
@@ -25,7 +26,6 @@ from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
 from dreamfleet.coordinator.experiments.iteration.phases import PhaseRunner
 from dreamfleet.coordinator.experiments.iteration.plan import Phase
-from dreamfleet.coordinator.experiments.verb_process import run_for_json
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
@@ -174,9 +174,8 @@ def gate(layout, new, drives=write_drives, **changes):
         .add(FinishedPhase(1, "bundle", 0, 0.0, ""))
         .add(FinishedPhase(2, "bundle", 0, 0.0, ""))
     )
-    phases = PhaseRunner(
-        Commands(config, layout, ledger), None, lambda words, log: run_for_json(words, log, never_stop), never_stop
-    )
+    runner = ProcessRunner(never_stop)
+    phases = PhaseRunner(Commands(config, layout, ledger), None, runner.run_for_json, never_stop)
     return phases.do(Phase(2, "gate")).figures
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.cli.model_commands import Model, Words
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import path_exists
@@ -22,9 +23,9 @@ from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
 from dreamfleet.common.runs.run_folder import BUNDLE as RUN_BUNDLE
-from dreamfleet.common.runs.run_folder import JOURNAL, RunFolder, open_run
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.coordinator.experiments.iteration import artefacts, gate
-from dreamfleet.coordinator.experiments.iteration.commands import Commands, Words
+from dreamfleet.coordinator.experiments.iteration.commands import Commands
 from dreamfleet.coordinator.experiments.iteration.layout import ENCODED, EPISODES
 from dreamfleet.coordinator.experiments.iteration.plan import (
     BUNDLE,
@@ -39,7 +40,7 @@ from dreamfleet.coordinator.experiments.iteration.plan import (
     VAE,
     Phase,
 )
-from dreamfleet.coordinator.experiments.local_run import LocalFleet, evolve
+from dreamfleet.coordinator.experiments.local_run import LocalFleet, evolve, has_begun, has_ended
 
 log = logging.getLogger("dreamfleet.coordinator.iterate")
 
@@ -127,7 +128,7 @@ class PhaseRunner:
         self._encode(number)  # latents that went, were damaged or are of a later round's encoder; mostly none
         return self._train(number, MDNRNN)
 
-    def _train(self, number: int, model: str) -> PhaseResult:
+    def _train(self, number: int, model: Model) -> PhaseResult:
         words = self._commands.train(number, model)
         return PhaseResult((words,), self._call(number, model, words), (self._layout.checkpoint(number, model),))
 
@@ -181,25 +182,19 @@ class PhaseRunner:
     def _evolve(self, number: int) -> PhaseResult:
         layout, name = self._layout, self._layout.run_name(number)
         words: tuple[Words, ...] = ()
-        if not self._ended(number):
+        if not has_ended(layout.runs, name):
             local_fleet = self._local_fleet()
             log.info("run %s is reached at %s", name, ", ".join(local_fleet.listen))
             words = (self._run_command(number, local_fleet),)
-            evolve(words[0], name, local_fleet, layout.round(number) / "logs", self._stop)
+            evolve(name, words[0], local_fleet, layout.round(number) / "logs", self._stop)
         with open_run(layout.runs, name) as run:
             pilots, means = self._pilots(run, layout.means(number))
             told = _describe_run(run)
         made = (layout.run(number) / RUN_BUNDLE, layout.optimum(number), *pilots)
         return PhaseResult(words, {**told, "means": means}, made)
 
-    def _ended(self, number: int) -> bool:
-        if not path_exists(self._layout.run(number) / JOURNAL):
-            return False
-        with open_run(self._layout.runs, self._layout.run_name(number)) as run:
-            return run.ended is not None
-
     def _run_command(self, number: int, local_fleet: LocalFleet) -> Words:
-        if path_exists(self._layout.run(number) / JOURNAL):
+        if has_begun(self._layout.runs, self._layout.run_name(number)):
             return self._commands.resume_run(number, local_fleet.listen, local_fleet.security)
         start, subspace = None, None
         if self._config.go_on and not self._config.is_from_scratch(number):

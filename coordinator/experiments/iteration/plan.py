@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 
 INIT = "init"  # of round 0: what an iteration goes on from
 COLLECT, TAKE, DRIVE = "collect", "take", "drive"  # random drives, the last run's kept ones, its means' own
-VAE, ENCODE, MDNRNN, BUNDLE, GATE, EVOLVE = "vae", "encode", "mdnrnn", "bundle", "gate", "evolve"
+VAE: Final = "vae"
+MDNRNN: Final = "mdnrnn"
+ENCODE, BUNDLE, GATE, EVOLVE = "encode", "bundle", "gate", "evolve"
 DATA = (COLLECT, TAKE, DRIVE)
 ALL = (*DATA, VAE, ENCODE, MDNRNN, BUNDLE, GATE, EVOLVE)
 

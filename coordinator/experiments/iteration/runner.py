@@ -11,18 +11,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.cli.model_commands import MODELS, Model, Words
+from dreamfleet.common.cli.verb_runner import ProcessRunner
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.coordinator.experiments.iteration import artefacts
-from dreamfleet.coordinator.experiments.iteration.commands import Commands, Words
+from dreamfleet.coordinator.experiments.iteration.commands import Commands
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
 from dreamfleet.coordinator.experiments.iteration.phases import PhaseRunner
 from dreamfleet.coordinator.experiments.iteration.plan import Phase, PhasePlan
 from dreamfleet.coordinator.experiments.local_run import LocalFleet
-from dreamfleet.coordinator.experiments.verb_process import run_for_json, run_verb
 
 log = logging.getLogger("dreamfleet.coordinator.iterate")
 
@@ -43,6 +44,7 @@ class Iteration:
         self.ledger = ledger
         self._resume_command = shell_command("iterate", "--data", layout.root, *network_flags)
         self._layout, self._config, self._local_fleet, self._stop = layout, config, local_fleet, stop
+        self._runner = ProcessRunner(stop)
         self._plan = PhasePlan(config, bool(ledger.run.get("collect_every")))
 
     def redo(self, phase: Phase) -> None:
@@ -60,7 +62,7 @@ class Iteration:
         if self.ledger.entries or self._config.init:
             return
         commands = Commands(self._config, self._layout, self.ledger)
-        for model in ("vae", "mdnrnn"):
+        for model in MODELS:
             if getattr(self._config, f"{model}_flags"):
                 self._check_flags(commands.check_training(model), model)
 
@@ -104,10 +106,10 @@ class Iteration:
 
     def _ask(self, on_line: Callable[[str], None], words: Words, path: Path) -> Any:
         log.debug("dreamfleet %s", " ".join(words))
-        return run_for_json(words, path, self._stop, on_line)
+        return self._runner.run_for_json(words, path, on_line)
 
-    def _check_flags(self, words: Words, model: str) -> None:
+    def _check_flags(self, words: Words, model: Model) -> None:
         try:
-            run_verb(words, self._layout.root / "logs" / f"{model}.log", self._stop)
+            self._runner.run(words, self._layout.root / "logs" / f"{model}.log")
         except UsageError as error:
             raise UsageError(f"--{model}-flags: {error}") from error

@@ -133,6 +133,6 @@ def test_later_rounds_may_evolve_otherwise_than_the_first():
 
 @pytest.mark.parametrize("flags", ["--data elsewhere", "--updates 3 --seed=9", "--continue other.safetensors", "--new"])
 def test_what_a_training_is_told_by_the_iteration_is_no_flag_of_it(flags):
-    with pytest.raises(UsageError, match="of each training is iterate's own to give"):
+    with pytest.raises(UsageError, match="which iterate sets itself"):
         IterateConfig(vae_flags=flags)
     assert IterateConfig(run_flags=flags)
