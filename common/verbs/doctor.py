@@ -40,9 +40,9 @@ def run(args: argparse.Namespace) -> int:
     host = {"python": platform.python_version(), "platform": platform.platform(), "cores": usable_cores(),
             "fingerprint": fingerprint()}  # fmt: skip
     if args.json:
-        told = {role: not lacks for role, lacks in roles.items()}
+        playable = {role: not lacks for role, lacks in roles.items()}
         checks = [vars(each) for each in findings]
-        print(json.dumps({**host, "checks": checks, "roles": told, "ok": told[args.role]}, indent=2))
+        print(json.dumps({**host, "checks": checks, "roles": playable, "ok": playable[args.role]}, indent=2))
     else:
         print(f"Python {host['python']} at {sys.prefix}, {host['cores']} cores, {host['platform']}")
         print(f"fingerprint: {host['fingerprint']}\n")

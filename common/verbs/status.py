@@ -95,7 +95,7 @@ def print_runs(documents: Sequence[dict[str, Any]]) -> None:
         for each in statuses
     ]
     print_rows(rows, right=("generation", "steps/s"), drop_order=("steps/s", "workers", "best"))
-    print(f"{plural(len(rows), 'live run')}; `dreamfleet status RUN` tells more", file=sys.stderr)
+    print(f"{plural(len(rows), 'live run')}; `dreamfleet status RUN` shows more", file=sys.stderr)
 
 
 def _print_once(client: Client, document: dict[str, Any]) -> None:
@@ -117,14 +117,14 @@ def _watch(network: Network, name: str | None, *, as_json: bool) -> int:
 
 def _retry_until_answered(ask: Callable[[], T]) -> T:
     """What `ask` answers, once it does; that it does not is said once."""
-    told = False
+    reported = False
     while True:
         try:
             return ask()
         except ConnectionFailedError as error:
-            if not told:
+            if not reported:
                 print(f"{error}; waiting for it (Ctrl-C ends)", file=sys.stderr, flush=True)
-            told = True
+            reported = True
             sleep(REFRESH)
 
 
@@ -165,12 +165,12 @@ def _print_changes(client: Client, name: str) -> int:
     from dreamfleet.common.monitoring.status import read_status
     from dreamfleet.common.printable import one_line
 
-    told = None
+    shown = None
     for status in map(read_status, _follow_documents(client, name)):
         now = status.state, status.generation.number, status.evaluations, status.workers.present
-        if now != told:
+        if now != shown:
             print(one_line(f"{status.run}: {summarise_status(status)}"), flush=True)
-        told = now
+        shown = now
     Console().print(_PanelBuilder(client).build(status))
     return 0
 
@@ -206,7 +206,7 @@ class _PanelBuilder:
 
 
 def _with_all_workers(client: Client, status: Status) -> Status:
-    """The same with those that had no room in it, while the coordinator is there to tell of them."""
+    """The same with the rows that did not fit, as long as the coordinator answers."""
     if status.is_over or len(status.worker_list) >= status.workers.known:
         return status
     with suppress(ConnectionFailedError):

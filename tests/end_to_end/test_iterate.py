@@ -332,20 +332,20 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(proces
     ("flags", "said"),
     [
         (("--run-flags", "--population 4"), "would never end"),
-        (("--run-flags", "--generations 1 --bundle tiny"), "--bundle in --run-flags: each run has its own"),
+        (("--run-flags", "--generations 1 --bundle tiny"), "--bundle in --run-flags: iterate sets them for each run"),
         (("--run-flags", "--generations 1 --sigma0 -1"), "--sigma0 must be a positive number"),
         (("--vae-flags", "--updates 0"), "--vae-flags: --updates must be at least 1"),
         (
             ("--vae-flags", "--error-factor 4", "--mdnrnn-flags", "--z-factor 0"),
             "--mdnrnn-flags: --z-factor must be from",
         ),
-        (("--local", 0), "nobody would score"),
+        (("--local", 0), "nothing would score"),
         (("--go-on", "--run-flags", "--generations 1 --variant feedback=last"), "--go-on fits a controller"),
         (("--subspace",), "give --go-on too"),
         (("--views", 8), "--views are beside the features of --subspace"),
         (
             ("--run-flags", "--generations 1 --subspace few.npz"),
-            "--subspace in --run-flags: each run has its own",
+            "--subspace in --run-flags: iterate sets them for each run",
         ),
     ],
 )
@@ -417,7 +417,7 @@ def test_one_iteration_works_in_a_folder_and_ctrl_c_ends_all_that_it_started(pro
     assert f"another iteration works in {layout.root}: stop it first" in err
     process.popen.send_signal(signal.SIGINT)
     assert process.finish()[0] == 130
-    assert "what is finished is kept, and goes on with: " in process.last_line()
+    assert "what is finished is kept; resume with: " in process.last_line()
     assert not left(layout.root)
 
 

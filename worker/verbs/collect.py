@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
                 bar.update(before + done)
                 if stop():
                     break
-    there = len(existing_episodes(args.data))  # with those that were written as the others were told to stop
+    there = len(existing_episodes(args.data))  # with those that were written while the others stopped
     if there < total:
         raise StoppedError(
             f"stopped: {args.data} keeps {there - before} new episodes, {there} of {total} in all; the same command "

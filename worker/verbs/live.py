@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 SUMMARY = "watch what a worker scores, the best mean, or a controller: its drive, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")  # a window needs only the first
 FASTEST = 50  # pictures a second
-LONGEST = 20  # seconds of pictures in files, unless told otherwise
+LONGEST = 20  # default seconds of pictures in files
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -60,7 +60,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show until it is over, closed, or told to stop."""
+    """Show until it is over, closed, or stopped."""
     _check(args)
     os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"  # a greeting on stdout, where a stream may go
     if args.out is not None:

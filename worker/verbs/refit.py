@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         fitted.controller.save(args.out)
     r_squared = [None if math.isnan(each) else round(each, 4) for each in fitted.r_squared]
     spoken = ", ".join(
-        f"{name} {'not told' if each is None else f'{each:.2f}'}"
+        f"{name} {'unknown' if each is None else f'{each:.2f}'}"
         for name, each in zip(output_names(fitted.controller, own), r_squared, strict=False)
     )
     text = f"{args.out}: fitted on {fitted.steps} steps of {fitted.drives} drives; R² on held-out ones: {spoken}"

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--tolerance must be 0 or more, not {args.tolerance}")
     with open_run(args.runs_dir, args.run_name) as stored:
         episodes = list(replay(stored, int(found[1]), int(found[2])))
-        told = stored.fitness(int(found[1]), int(found[2]))
+        stored_fitness = stored.fitness(int(found[1]), int(found[2]))
     if not episodes:
         raise JournalError(f"candidate {args.candidate} of run {args.run_name} has no results yet")
     agree = [each.agrees(args.tolerance) for each in episodes]
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         same = all(each.same for each in episodes)
         mean = float(np.mean([each.replayed for each in episodes]))
         rows = [vars(each) for each in episodes]
-        print(json.dumps({"identical": same, "unchecked": unchecked, "fitness": mean, "stored_fitness": told,
+        print(json.dumps({"identical": same, "unchecked": unchecked, "fitness": mean, "stored_fitness": stored_fitness,
                           "episodes": rows}))  # fmt: skip
     else:
         for each in episodes:

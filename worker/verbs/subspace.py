@@ -31,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Find it, and tell how well each feature is foretold."""
+    """Find the features, and print how well each is predicted."""
     pin_thread_pools()  # of NumPy, which is not loaded yet
     if args.episodes < 5:
         raise UsageError(f"--episodes must be at least 5, not {args.episodes}: every fifth is held out")
@@ -51,9 +51,9 @@ def run(args: argparse.Namespace) -> int:
         subspace.save(args.out, {"drives": found.drives, "steps": found.steps, "r_squared": r_squared})
     width = max(map(len, subspace.names))
     rows = [f"{name:<{width}}  {each:.2f}" for name, each in zip(subspace.names, r_squared, strict=True)]
-    told_first = "what is foretold, in which steps from now, and its R² on held-out drives:"
+    heading = "what is foretold, in which steps from now, and its R² on held-out drives:"
     last = f"{args.out}: {len(rows)} features, by {found.steps} steps of {found.drives} drives"
-    text = "\n".join([told_first, *rows, last])
+    text = "\n".join([heading, *rows, last])
     print_answer(args, text, subspace=args.out, sha256=subspace.sha256, bundle=bundle.sha256, features=subspace.names,
            r_squared=r_squared, drives=found.drives, steps=found.steps)  # fmt: skip
     return 0

@@ -25,7 +25,7 @@ class IterationFolder:
 
     @property
     def lock(self) -> Path:
-        """Held by whoever works here."""
+        """The lock of the process that works here."""
         return self.root / "iteration.lock"
 
     @property

@@ -17,7 +17,7 @@ from dreamfleet.coordinator.experiments.iteration.plan import ALL, BUNDLE, DATA,
 
 FORMAT = 1
 MOST_BYTES = 256 << 20
-FIGURES: dict[str, dict[str, Any]] = {  # that later phases, or people, are told of a finished one
+FIGURES: dict[str, dict[str, Any]] = {  # of a finished phase, which later phases and summaries read
     **{phase: {"new": int, "episodes": int} for phase in DATA},
     INIT: {"sha256": str, "controller": str},
     BUNDLE: {"sha256": str, "frames": int, "quality": dict},
@@ -160,10 +160,10 @@ def _check(entry: FinishedPhase) -> None:
     """`ValueError` for an entry that cannot have been written of a phase."""
     if entry.phase not in (INIT, *ALL):
         raise ValueError(f"there is no phase {entry.phase!r:.40}")
-    told = _bad_figure(entry.figures, FIGURES.get(entry.phase, {}))
-    told = told or _bad_figure(entry.figures.get("score") or {}, SCORE if entry.figures.get("score") else {})
-    if told:
-        raise ValueError(f"phase {entry.phase_key} does not tell its {told}")
+    missing = _bad_figure(entry.figures, FIGURES.get(entry.phase, {}))
+    missing = missing or _bad_figure(entry.figures.get("score") or {}, SCORE if entry.figures.get("score") else {})
+    if missing:
+        raise ValueError(f"phase {entry.phase_key} has no valid {missing}")
 
 
 def _bad_figure(figures: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
