@@ -1,4 +1,4 @@
-"""`dreamfleet story`: what happened to a worker or a job of late."""
+"""`dreamfleet story`: recent events of a worker or a job."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the events, the newest last; how many more there are goes to stderr."""
+    """Print the events, the newest last; the number left out goes to stderr."""
     from dreamfleet.common.monitoring.client import Client
     from dreamfleet.common.monitoring.status import EventKind
 
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_known(client: Client, run: str, worker: str) -> None:
-    """`UsageError` with the names of those that are known, unless this is a worker's or a host's."""
+    """`UsageError` with the known names, unless `name` is a worker's or a host's."""
     events, _ = client.events(run)  # of those that are gone, too
     known = [*(each.worker for each in client.workers(run)), *(each.worker for each in events)]
     hosts = list(dict.fromkeys(each.partition("/")[0] for each in known))

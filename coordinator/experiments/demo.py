@@ -115,7 +115,7 @@ class Demo:
         self._console = Console()
 
     def play(self) -> None:
-        """Evolve, judge, draw, record, and say what to try next."""
+        """Evolve, judge, plot, record, and print what to try next."""
         with ExitStack() as stack:
             self._show_page(stack)
             for demo_run in self._demo_runs:
@@ -136,7 +136,7 @@ class Demo:
         self._print_next_steps(folder)
 
     def _show_page(self, stack: ExitStack) -> None:
-        """Serve a page about the runs until the stack is left; without its packages, or a port, there is none."""
+        """Serve a page about the runs until `stack` closes; none without its packages or a free port."""
         if not self._config.page or any(find_spec(package) is None for package in PAGE_PACKAGES):
             return
         where = ("--connect", self._endpoint, "--runs-dir", self._runs_dir)
@@ -158,7 +158,7 @@ class Demo:
         return dict(zip(report["seeds"], report["scores"], strict=True))
 
     def _table(self, chosen: DemoRun, drives: Mapping[int, float]) -> Table:
-        """What each stage's best look promised, what was confirmed, and what the chosen one did on unseen tracks."""
+        """Each run's best evaluation and confirmed score, and the chosen one's score on unseen tracks."""
         table = Table("run", "its best evaluation", "confirmed on fresh tracks", "on unseen tracks", box=None)
         for demo_run in self._demo_runs:
             with open_run(self._runs_dir, demo_run.run) as run:

@@ -10,7 +10,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 
-SUMMARY = "find a few features that foretell what a driver will do and earn, for a search in them (--subspace)"
+SUMMARY = "find a few features that predict a driver's actions and rewards, for a search among them (--subspace)"
 EXTRAS = ("worker",)
 DRIVES = 300
 
@@ -18,14 +18,14 @@ DRIVES = 300
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("bundle", metavar="BUNDLE", help="the world model: a file, or one that ships")
-    parser.add_argument("--data", type=Path, required=True, help="folder of the drives that it watches")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the drives that it encodes")
     parser.add_argument("--out", type=Path, required=True, help="the subspace to write, NAME.npz")
     parser.add_argument(
         "--episodes", type=int, default=DRIVES, help=f"drives at most, the folder's last ones (default {DRIVES})"
     )
     parser.add_argument(
         "--views", type=int, default=0,
-        help="beside it so many directions that foretell what the model itself will see and remember (default 0)",
+        help="add so many directions that predict what the model itself will see and remember (default 0)",
     )  # fmt: skip
     add_json_flag(parser)
 

@@ -1,4 +1,4 @@
-"""Whether a new world model takes the place of the old one, by what `inspect` measured of both.
+"""Whether a new world model replaces the old one, by the figures of `inspect` for both.
 
 Two figures, of which more is better. *Knows*: the mean, over the quantities of the simulator's truth, of the R² of a
 linear map from [z, h] on held-out drives. *Loses*: how many dreams begun shortly before real losses of the road lose it
@@ -49,7 +49,7 @@ class GateDecision:
 
 
 def judge(old: Figures, new: Figures) -> GateDecision:
-    """Hold the new model's figures to the old one's."""
+    """Compare the new model's figures with the old one's."""
     both = {name: (before, after) for name in (KNOWS, LOSES)
             if (before := old.get(name)) is not None and (after := new.get(name)) is not None}  # fmt: skip
     if not both:
