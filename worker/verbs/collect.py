@@ -31,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
     parser.add_argument(
         "--controller", nargs="+", default=[], metavar="CONTROLLER",
-        help="controllers that drive the missing episodes in turn, instead of random ones: files, runs, or shipped ones",
+        help="drive the missing episodes by these controllers, in turn: files, runs, or shipped ones (default random)",
     )  # fmt: skip
     parser.add_argument(
         "--from-run", metavar="RUN", help="drive nothing; import the rollouts that this run kept, each once"
