@@ -1,4 +1,4 @@
-"""None"""
+"""From drives to a bundle: each stage by itself, and the pipeline of all of them."""
 
 import argparse
 import json
